@@ -1,0 +1,1 @@
+"""The ground station: command line, links, missions, daemon."""

@@ -1,0 +1,69 @@
+"""The `orthoswarm` command: finds the verb, imports only that verb's module, maps errors to exit codes."""
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from orthoswarm import __version__
+from orthoswarm.errors import OrthoSwarmError
+
+# verb -> one line of help; the module is gcs_plugin.commands.<verb>, with configure(parser) and run(args) -> int.
+VERBS = {
+    "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
+}
+
+
+def _overview() -> str:
+    width = max(map(len, VERBS))
+    lines = [
+        "usage: orthoswarm [--version] VERB ...",
+        "",
+        "Georeferenced orthoimagery from swarms of uncalibrated drones.",
+        "",
+        "verbs:",
+        *(f"  {name:<{width}}  {text}" for name, text in VERBS.items()),
+        "",
+        "`orthoswarm VERB --help` explains a verb and shows an example.",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code (0 made, 1 nothing could be made, 2 wrong input, 130 interrupted)."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if args else 2
+    if args[0] == "--version":
+        print(f"orthoswarm {__version__}")
+        return 0
+    verb = args[0]
+    if verb not in VERBS:
+        print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
+        return 2
+    module = importlib.import_module(f"gcs_plugin.commands.{verb}")
+    parser = argparse.ArgumentParser(
+        prog=f"orthoswarm {verb}",
+        description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.configure(parser)
+    try:
+        parsed = parser.parse_args(args[1:])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    try:
+        return int(module.run(parsed))
+    except OrthoSwarmError as error:
+        print(f"orthoswarm: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("orthoswarm: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

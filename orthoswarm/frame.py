@@ -1,0 +1,85 @@
+"""A frame: one picture with what was recorded about where its camera was. Sources of telemetry yield frames."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """What was recorded about a camera at the moment of a picture. Evidence, not truth; None where unknown.
+
+    Attributes:
+        lat_deg: latitude, WGS 84; lon_deg: longitude.
+        height_m: height above the takeoff level (or above ground where a source knows it).
+        altitude_m: absolute altitude (sea level or ellipsoid); never used as a height.
+        yaw_rad: azimuth of the picture's up direction at nadir, clockwise from true north.
+        pitch_rad: -pi/2 looks straight down. roll_rad: > 0 right side down.
+        flight_yaw_rad: heading of the airframe, where it is recorded besides the camera's yaw.
+        position_sigma_m: one sigma of the horizontal position, where the source states it (RTK).
+        height_is_ground: True where the height is above the ground below (rangefinder), not above takeoff.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float | None = None
+    altitude_m: float | None = None
+    yaw_rad: float | None = None
+    pitch_rad: float | None = None
+    roll_rad: float | None = None
+    flight_yaw_rad: float | None = None
+    position_sigma_m: float | None = None
+    height_is_ground: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture and its fix.
+
+    Attributes:
+        image: its name in all products (path relative to the input with forward slashes; `video.mp4#000123`).
+        path: the readable picture file on this machine (for a video, the extracted picture).
+        vehicle: id of the vehicle that took it.
+        time_s: UTC epoch seconds, None if unknown.
+        fix: where the camera was, as recorded.
+        width: columns as stored in the file (EXIF rotation not applied); height: rows.
+        camera: what tells lenses of one vehicle apart (model, size, zoom); frames of equal `vehicle` and
+            `camera` share one lens.
+        fov_hint_rad: horizontal field of view from the picture's own tags, None if there is none.
+        origin: which source gave which field, for `inspect` and the report.
+    """
+
+    image: str
+    path: Path
+    vehicle: str
+    time_s: float | None
+    fix: Fix
+    width: int
+    height: int
+    camera: str = ""
+    fov_hint_rad: float | None = None
+    origin: dict[str, str] = field(default_factory=dict, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A picture that could not become a frame, or that was left out later, and why (one clear sentence)."""
+
+    image: str
+    reason: str
+    vehicle: str = ""
+    time_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Ingest:
+    """What a set of inputs yielded.
+
+    Attributes:
+        frames: sorted by vehicle, then time (then name where times are unknown).
+        rejected: every file with a picture's suffix, or picture of a video, that is no frame.
+        warnings: findings that a user should read, in plain words.
+    """
+
+    frames: list[Frame]
+    rejected: list[Rejection]
+    warnings: list[str]

@@ -1,0 +1,1 @@
+"""The default refiner: tracks, joint adjustment, map registration, ties, terrain (beyond the paper)."""

@@ -1,0 +1,32 @@
+"""Where tests find real data: ORTHOSWARM_TEST_DATA, else ../shared/data beside the checkout."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def data_root() -> Path:
+    return Path(os.environ.get("ORTHOSWARM_TEST_DATA", ROOT.parent / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def real_data():
+    """A function from a folder name of the real data to its path; skips the test where it is absent."""
+
+    def find(name: str) -> Path:
+        path = data_root() / name
+        if not path.exists():
+            pytest.skip(f"real data '{name}' is not at {path.parent}; set ORTHOSWARM_TEST_DATA")
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def golden_poses():
+    path = Path(__file__).parent / "data" / "golden_poses.json"
+    return json.loads(path.read_text())["poses"]
