@@ -1,17 +1,17 @@
 """The one decorator for compiled kernels, so that all of them are cached and typed alike."""
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, cast
 
 import numba
 
-F = TypeVar("F", bound=Callable[..., object])
+Kernel = Callable[..., Any]
 
 
-def kernel(function: F) -> F:
+def kernel(function: Kernel) -> Kernel:
     """Compile a function on arrays with numba, cached on disk, releasing the GIL.
 
     The cache lies beside the module (or in the user's cache folder where that is read-only), so only the
     first run on a machine compiles. Kernels may call each other; after an edit of a callee touch its callers too.
     """
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"})(function))
+    return cast(Kernel, numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"})(function))
