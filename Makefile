@@ -36,8 +36,8 @@ $(STAMP): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found; install it, or say make PYTHON=/path/to/python3"; exit 1; }
 	@echo "making the environment $(VENV) with $(PYTHON) (a few minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -q -c requirements.lock -e ".[dev]"
-	@$(BIN)/python -m pip install -q --no-deps $$(grep '^scm-' requirements.lock)
+	@$(BIN)/python -m pip install -qq -c requirements.lock -e ".[dev]"
+	@$(BIN)/python -m pip install -qq --no-deps $$(grep '^scm-' requirements.lock)
 	@touch $(STAMP)
 
 lock: $(STAMP)

@@ -1,6 +1,6 @@
 """Writes requirements.lock: the exact versions, in this environment, of everything the project and its extras need.
 
-    .venv/bin/python .ci/lock.py > requirements.lock
+Run as `.venv/bin/python .ci/lock.py > requirements.lock`, or `make lock`.
 """
 
 import re
