@@ -1,0 +1,371 @@
+"""The adjustment: one small robust least-squares problem over cameras, lenses, biases, drift and points.
+
+Beyond the paper (RECIPE.md steps 2 and 8): instead of a line a leg and a homography a leg, all errors that a swarm's
+records have are unknowns with priors, held together by tracks, ground heights and ties to the map.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.swarm import normal
+from orthoswarm.swarm.priors import Layout, Priors
+from orthoswarm.swarm.rig import CX, CY, K1, K2, K3, F, Ints, Rig, Tracks
+
+Array = NDArray[np.float64]
+_LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
+
+
+@dataclass(frozen=True, slots=True)
+class Ties:
+    """Points of which the map says where they lie: X + lean (Z - surface) = xy.
+
+    Attributes:
+        point: int32 (Q,), at most one tie a point. xy: float64 (Q, 2). sigma_m: float64 (Q,).
+    """
+
+    point: Ints
+    xy: Array
+    sigma_m: Array
+
+    @classmethod
+    def none(cls) -> "Ties":
+        """No ties."""
+        return cls(np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What is believed of the points' heights.
+
+    Attributes:
+        height: float64 (P,) expected Z. sigma: robust sigma; soft_sigma: a weak one that is not robust, metres.
+        surface: float64 (P,) ground height under each point, for the map's lean. lean: (2,) metres per metre.
+        c: robust scale of `sigma`.
+    """
+
+    height: Array
+    sigma: float
+    soft_sigma: float
+    surface: Array
+    lean: tuple[float, float] = (0.0, 0.0)
+    c: float = 4.0
+
+
+@dataclass(slots=True)
+class Adjustment:
+    """State of an adjustment; `step` improves it in place.
+
+    Attributes:
+        rig: cameras now. points: float64 (P, 3). common: float64 (layout.size,) values of the common unknowns (the
+            lens columns hold differences to the prior's start). tracks: observations sorted by point.
+        obs_weight: float64 (M,) robust weights of the last step. point_inverse: float64 (P, 3, 3), inverse of each
+            point's own block (its covariance with the cameras held).
+        tie_residual: float64 (Q, 2) of the last step.
+    """
+
+    rig: Rig
+    tracks: Tracks
+    priors: Priors
+    points: Array
+    free: NDArray[np.bool_]
+    layout: Layout
+    common: Array
+    start: NDArray[np.int64]
+    slot: Ints
+    bandwidth: int
+    obs_weight: Array
+    point_inverse: Array
+    tie_residual: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    cost: float = 0.0
+    gps_weight: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def begin(
+        cls, rig: Rig, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
+    ) -> "Adjustment":
+        """Set up; observations are sorted by point, cameras are ordered for a narrow band."""
+        order = np.lexsort((tracks.camera, tracks.point))
+        tracks = Tracks(tracks.camera[order], tracks.point[order], tracks.uv[order], tracks.sigma_px[order])
+        start = np.searchsorted(tracks.point, np.arange(len(points) + 1))
+        free = np.ones(len(rig), bool) if free is None else free
+        slot, width = _order(tracks, len(points), len(rig), free)
+        layout = Layout.of(priors)
+        return cls(
+            replace(rig, position=rig.position.copy(), rotation=rig.rotation.copy(), lens=rig.lens.copy()),
+            tracks,
+            priors,
+            np.array(points, float),
+            free,
+            layout,
+            np.zeros(layout.size),
+            start,
+            slot,
+            width,
+            np.zeros(len(tracks.point)),
+            np.zeros((len(points), 3, 3)),
+        )
+
+    def step(
+        self, c: float, ground: Ground, ties: Ties | None = None, tie_c: float = 9.0, damping: float = 1e-6
+    ) -> float:
+        """One Gauss-Newton step with robust scale c (squared sigmas); returns the largest camera move in metres.
+
+        Raises:
+            OrthoSwarmError: if the system is singular even with its priors (NaN in the input).
+        """
+        ties = Ties.none() if ties is None else ties
+        n, size = int(self.free.sum()), self.layout.size
+        lenses = len(self.rig.lens)
+        points, obs = len(self.points), len(self.tracks.point)
+        band = np.zeros((6 * (self.bandwidth + 1), 6 * n), order="F")
+        side, corner = np.zeros((6 * n, size)), np.zeros((size, size))
+        rhs, rhs_common = np.zeros(6 * n), np.zeros(size)
+        w_obs, w_lens = np.zeros((obs, 6, 3)), np.zeros((points, lenses, 6, 3))
+        b_point = np.zeros((points, 3))
+        lens_side, lens_corner = np.zeros((6 * n, 6 * lenses)), np.zeros((6 * lenses, 6 * lenses))
+        rhs_lens = np.zeros(6 * lenses)
+        tie_of_point = np.full(points, -1, np.int32)
+        tie_of_point[ties.point] = np.arange(len(ties.point), dtype=np.int32)
+        self.tie_residual = np.zeros((len(ties.point), 2))
+        self.cost, _ = normal.build(
+            self.rig.position,
+            self.rig.rotation,
+            self.rig.lens_id,
+            self.rig.lens,
+            self.points,
+            self.start,
+            self.tracks.camera,
+            self.tracks.uv,
+            1.0 / self.tracks.sigma_px.astype(float) ** 2,
+            self.slot,
+            c,
+            ground.height,
+            np.full(points, 1.0 / ground.sigma**2),
+            ground.c,
+            1.0 / ground.soft_sigma**2,
+            tie_of_point,
+            ties.xy,
+            1.0 / ties.sigma_m**2,
+            tie_c,
+            np.asarray(ground.lean, float),
+            ground.surface,
+            band,
+            lens_side,
+            lens_corner,
+            rhs,
+            rhs_lens,
+            w_obs,
+            w_lens,
+            self.point_inverse,
+            b_point,
+            self.obs_weight,
+            self.tie_residual,
+        )
+        k = 6 * lenses
+        side[:, :k], corner[:k, :k], rhs_common[:k] = lens_side, lens_corner, rhs_lens
+        self._add_priors(band, side, corner, rhs, rhs_common)
+        band[0] *= 1.0 + damping
+        step_camera, step_common = _solve(band, side, corner, rhs, rhs_common)
+        self._move(step_camera, step_common)
+        normal.back_substitute(
+            self.points,
+            self.start,
+            self.tracks.camera,
+            self.slot,
+            w_obs,
+            w_lens,
+            self.point_inverse,
+            b_point,
+            step_camera,
+            step_common[:k],
+            50.0,
+        )
+        return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if n else 0.0
+
+    def residuals(self) -> Array:
+        """Reprojection residuals (M, 2) in pixels now."""
+        out = np.empty((len(self.tracks.point), 2))
+        normal.residuals(
+            self.rig.position,
+            self.rig.rotation,
+            self.rig.lens_id,
+            self.rig.lens,
+            self.points,
+            self.tracks.point,
+            self.tracks.camera,
+            self.tracks.uv,
+            out,
+        )
+        return out
+
+    def group_values(self, group: int) -> tuple[Array, float, float]:
+        """Attitude bias (3,) in radians, height offset in metres and lag in seconds of a group."""
+        at = self.layout.offset[group]
+        return self.common[at : at + 3].copy(), float(self.common[at + 3]), float(self.common[at + 4])
+
+    def _move(self, step_camera: Array, step_common: Array) -> None:
+        moves = np.zeros((len(self.rig), 6))
+        index = np.flatnonzero(self.free)
+        moves[index] = step_camera.reshape(-1, 6)[self.slot[index]]
+        self.rig.position[:] += moves[:, :3]
+        self.rig.rotation[index] = self.rig.rotation[index] @ exp_rotation(moves[index, 3:])
+        self.common += step_common
+        lens = self.priors.lens + self.common[: self.layout.lens_columns].reshape(-1, 6)
+        self.rig.lens[:, F] = np.exp(lens[:, 0])
+        self.rig.lens[:, _LENS_COLUMNS[1:]] = lens[:, 1:]
+
+    def _add_priors(self, band: Array, side: Array, corner: Array, rhs: Array, rhs_common: Array) -> None:
+        p, lay = self.priors, self.layout
+        lens_weight = np.where(p.lens_sigma > 0, 1.0 / np.maximum(p.lens_sigma, 1e-12) ** 2, 1e18).ravel()
+        diagonal = np.arange(lay.lens_columns)
+        corner[diagonal, diagonal] += lens_weight
+        rhs_common[: lay.lens_columns] -= lens_weight * self.common[: lay.lens_columns]
+        i = np.flatnonzero(self.free)
+        at = 6 * self.slot[i]
+        group = p.group[i]
+        base = np.asarray(lay.offset)[group]
+        # attitude: log(R_recorded^T R) - bias
+        bias = self.common[base[:, None] + np.arange(3)]
+        r = log_rotation(np.swapaxes(p.rotation[i], 1, 2) @ self.rig.rotation[i]) - bias
+        w = _weights(p.rotation_sigma[i])
+        e2 = (r * r * w).sum(1)
+        w = w * (1.0 / (1.0 + e2 / 25.0) ** 2)[:, None]
+        for a in range(3):
+            band[0, at + 3 + a] += w[:, a]
+            rhs[at + 3 + a] -= w[:, a] * r[:, a]
+            side[at + 3 + a, base + a] -= w[:, a]
+            np.add.at(corner, (base + a, base + a), w[:, a])
+            np.add.at(rhs_common, base + a, w[:, a] * r[:, a])
+        self._add_position_priors(band, side, corner, rhs, rhs_common)
+        for g, model in enumerate(p.models):
+            o, k = lay.offset[g], lay.knots[g]
+            sigma = np.array([*model.bias_sigma, model.height_sigma, model.lag_sigma])
+            weight = np.where(sigma > 0, 1.0 / np.maximum(sigma, 1e-9) ** 2, 1e18)
+            d = np.arange(o, o + 5)
+            corner[d, d] += weight
+            rhs_common[d] -= weight * self.common[d]
+            if k:
+                _add_drift_prior(corner, rhs_common, self.common, o + 5, k, model.drift_sigma, model.drift_bend)
+
+    def _add_position_priors(self, band: Array, side: Array, corner: Array, rhs: Array, rhs_common: Array) -> None:
+        p, lay = self.priors, self.layout
+        i = np.flatnonzero(self.free)
+        at = 6 * self.slot[i]
+        base = np.asarray(lay.offset)[p.group[i]]
+        knots = np.asarray(lay.knots)[p.group[i]]
+        drift = lay.drift(self.common, p.group)[i]
+        lag = self.common[base + 4]
+        xy = self.rig.position[i, :2] - p.position[i, :2] - drift - lag[:, None] * p.velocity[i]
+        w = _weights(p.position_sigma[i])
+        e2 = (xy * xy * w[:, :2]).sum(1)
+        robust = 1.0 / (1.0 + e2 / p.position_c) ** 2
+        self.gps_weight = np.ones(len(self.rig))
+        self.gps_weight[i] = robust
+        w[:, :2] *= robust[:, None]
+        left = lay.knot_left[i]
+        fraction = lay.knot_fraction[i]
+        for a in range(2):
+            wa, ra = w[:, a], xy[:, a]
+            columns = [base + 4]
+            factors = [-p.velocity[i, a]]
+            has = knots > 0
+            columns += [base + 5 + 2 * left + a, base + 5 + 2 * (left + 1) + a]
+            factors += [np.where(has, fraction - 1.0, 0.0), np.where(has, -fraction, 0.0)]
+            columns = [np.where(has, c, base + 4) if n else c for n, c in enumerate(columns)]
+            band[0, at + a] += wa
+            rhs[at + a] -= wa * ra
+            for c, f in zip(columns, factors):
+                side[at + a, c] += wa * f
+                np.add.at(rhs_common, c, -wa * f * ra)
+                for c2, f2 in zip(columns, factors):
+                    np.add.at(corner, (c, c2), wa * f * f2)
+        rz = self.rig.position[i, 2] - p.position[i, 2] - self.common[base + 3]
+        wz = w[:, 2]
+        band[0, at + 2] += wz
+        rhs[at + 2] -= wz * rz
+        side[at + 2, base + 3] -= wz
+        np.add.at(corner, (base + 3, base + 3), wz)
+        np.add.at(rhs_common, base + 3, wz * rz)
+
+
+def _weights(sigma: Array) -> Array:
+    return np.where(np.isfinite(sigma), 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+
+
+def _add_drift_prior(corner: Array, rhs: Array, common: Array, at: int, knots: int, sigma: float, bend: float) -> None:
+    """Knots are small (sigma) and bend little (second differences, sigma `bend`)."""
+    precision = np.eye(knots) / sigma**2
+    if knots > 2:
+        second = np.diff(np.eye(knots), 2, axis=0)
+        precision += second.T @ second / bend**2
+    for a in range(2):
+        c = at + 2 * np.arange(knots) + a
+        corner[np.ix_(c, c)] += precision
+        rhs[c] -= precision @ common[c]
+
+
+def _solve(band: Array, side: Array, corner: Array, rhs: Array, rhs_common: Array) -> tuple[Array, Array]:
+    """Solve the bordered banded system; returns the cameras' and the common steps."""
+    if band.shape[1]:
+        factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+        if info != 0:
+            raise OrthoSwarmError("the adjustment is singular; check the records for NaN or repeated pictures")
+        both, _ = lapack.dpbtrs(factor, np.column_stack([side, rhs]), lower=1)
+        y, x = both[:, :-1], both[:, -1]
+        common = np.linalg.solve(corner - side.T @ y, rhs_common - side.T @ x)
+        return np.asarray(x - y @ common), np.asarray(common)
+    return np.zeros(0), np.asarray(np.linalg.solve(corner, rhs_common))
+
+
+def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
+    """Place of each free camera in the band (-1 if held) and the band's width in cameras, as narrow as it goes."""
+    index = np.flatnonzero(free)
+    local = np.full(cameras, -1, np.int64)
+    local[index] = np.arange(len(index))
+    use = free[tracks.camera]
+    cam, pt = local[tracks.camera[use]], tracks.point[use]
+    sights = csr_matrix((np.ones(len(cam), np.float32), (cam, pt)), shape=(len(index), points))
+    graph = (sights @ sights.T).tocoo()
+    best: tuple[int, NDArray[np.int64]] = (len(index), np.arange(len(index)))
+    for permutation in (np.arange(len(index)), reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)):
+        place = np.empty(len(index), np.int64)
+        place[permutation] = np.arange(len(index))
+        width = int(np.abs(place[graph.row] - place[graph.col]).max()) if graph.nnz else 0
+        if width < best[0]:
+            best = (width, place)
+    slot = np.full(cameras, -1, np.int32)
+    slot[index] = best[1]
+    return slot, min(best[0], max(len(index) - 1, 0))
+
+
+def exp_rotation(vector: Array) -> Array:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), Rodrigues' formula."""
+    angle = np.linalg.norm(vector, axis=1)
+    a = np.where(angle < 1e-8, 1.0, np.sin(angle) / np.maximum(angle, 1e-12))[:, None, None]
+    b = np.where(angle < 1e-4, 0.5, (1.0 - np.cos(angle)) / np.maximum(angle, 1e-12) ** 2)[:, None, None]
+    k = np.zeros((len(vector), 3, 3))
+    k[:, 0, 1], k[:, 0, 2], k[:, 1, 2] = -vector[:, 2], vector[:, 1], -vector[:, 0]
+    k -= np.swapaxes(k, 1, 2)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def log_rotation(rotation: Array) -> Array:
+    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
+    cosine = np.clip((np.trace(rotation, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
+    angle = np.arccos(cosine)
+    vector = np.stack(
+        [
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ],
+        axis=1,
+    )
+    scale = np.where(angle < 1e-6, 0.5, angle / np.maximum(2.0 * np.sin(angle), 1e-9))
+    return np.asarray(vector * scale[:, None])

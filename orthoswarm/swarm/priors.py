@@ -1,0 +1,103 @@
+"""What is believed of the cameras before the pictures are asked: records with sigmas, biases, drift, lens."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class GroupModel:
+    """Sigmas of what the frames of one group (a vehicle's sortie) have in common; SI and radians.
+
+    Attributes:
+        bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
+        lag_sigma: delay of the recorded position, seconds (0 switches it off).
+        drift_sigma: size of the receiver's drift, metres (0 switches it off); drift_bend: second difference of its
+            knots; knot_every: frames between knots.
+    """
+
+    bias_sigma: tuple[float, float, float] = (np.radians(1.0), np.radians(1.0), np.radians(3.0))
+    height_sigma: float = 1.0
+    lag_sigma: float = 0.5
+    drift_sigma: float = 15.0
+    drift_bend: float = 0.5
+    knot_every: int = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """Records of N cameras in G groups, and of L lenses.
+
+    Attributes:
+        position: float64 (N, 3), recorded position in the rig's frame (heights already with a sensible level).
+        position_sigma: float64 (N, 3), infinite where unknown.
+        rotation: float64 (N, 3, 3), recorded attitude. rotation_sigma: float64 (N, 3) about the camera's axes.
+        velocity: float64 (N, 2), ground velocity in m/s for the lag; zeros where time is unknown.
+        group: int32 (N,). models: one for each group.
+        lens: float64 (L, 6), start of log f, k1, k2, k3, cx, cy. lens_sigma: float64 (L, 6), 0 holds a parameter.
+        position_c: robust scale (squared sigmas) of the horizontal positions.
+    """
+
+    position: Array
+    position_sigma: Array
+    rotation: Array
+    rotation_sigma: Array
+    velocity: Array
+    group: Ints
+    models: tuple[GroupModel, ...]
+    lens: Array
+    lens_sigma: Array
+    position_c: float = 9.0
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the common unknowns stand: lens columns first, then for each group bias, height, lag, knots (east, north).
+
+    Attributes:
+        lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns.
+        knot_left: int32 (N,), index of the knot before each camera; knot_fraction: float64 (N,) of the way to the next.
+    """
+
+    lens_columns: int
+    offset: tuple[int, ...]
+    knots: tuple[int, ...]
+    size: int
+    knot_left: Ints
+    knot_fraction: Array = field(repr=False)
+
+    @classmethod
+    def of(cls, priors: Priors) -> "Layout":
+        """The layout for a set of priors."""
+        columns = 6 * len(priors.lens)
+        offset, knots = [], []
+        left = np.zeros(len(priors.group), np.int32)
+        fraction = np.zeros(len(priors.group))
+        at = columns
+        for g, model in enumerate(priors.models):
+            members = np.flatnonzero(priors.group == g)
+            k = 0
+            if model.drift_sigma > 0 and len(members):
+                k = max(2, round(len(members) / model.knot_every) + 1)
+                where = np.linspace(0.0, k - 1.0, len(members)) if len(members) > 1 else np.zeros(1)
+                left[members] = np.minimum(where.astype(np.int32), k - 2)
+                fraction[members] = where - left[members]
+            offset.append(at)
+            knots.append(k)
+            at += 5 + 2 * k
+        return cls(columns, tuple(offset), tuple(knots), at, left, fraction)
+
+    def drift(self, common: Array, group: Ints) -> Array:
+        """Drift (N, 2) of each camera for the common unknowns (size,)."""
+        out = np.zeros((len(group), 2))
+        for g, (at, k) in enumerate(zip(self.offset, self.knots)):
+            if k:
+                m = np.flatnonzero(group == g)
+                values = common[at + 5 : at + 5 + 2 * k].reshape(k, 2)
+                t = self.knot_fraction[m, None]
+                out[m] = values[self.knot_left[m]] * (1 - t) + values[self.knot_left[m] + 1] * t
+        return out
