@@ -1,0 +1,124 @@
+"""What lies in the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from orthoswarm.errors import InputError
+from orthoswarm.picture import PICTURE_SUFFIXES
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
+    | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
+)
+LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg"})
+_SIDECARS = frozenset({".txt", ".csv"})
+
+
+@dataclass(slots=True)
+class Folder:
+    """One folder with something in it.
+
+    Attributes:
+        path: of the folder. vehicle: id of the vehicle whose photos lie here.
+        pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
+    """
+
+    path: Path
+    vehicle: str
+    pictures: list[Path] = field(default_factory=list)
+    videos: list[Path] = field(default_factory=list)
+    logs: list[Path] = field(default_factory=list)
+    subtitles: list[Path] = field(default_factory=list)
+    tables: list[Path] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """All folders of the inputs, and the folder that picture names are relative to."""
+
+    root: Path
+    folders: list[Folder]
+
+    def name(self, path: Path) -> str:
+        """A file's name in all products: relative to the root, forward slashes."""
+        return os.path.relpath(path, self.root).replace(os.sep, "/")
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key in which DJI_2 comes before DJI_10; upper and lower case count alike."""
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in _DIGITS.split(name.lower()) if part)
+
+
+_DIGITS = re.compile(r"([0-9]{1,18})")
+
+
+def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
+    """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are left out.
+
+    Raises:
+        InputError: no input, or one that does not exist.
+    """
+    if not inputs:
+        raise InputError("no input was given; name a folder of photos or a video")
+    absolute = [Path(os.path.abspath(path)) for path in inputs]
+    for given, path in zip(inputs, absolute, strict=True):
+        if not path.exists():
+            raise InputError(f"{given} does not exist; check the path")
+    tops = [path if path.is_dir() else path.parent for path in absolute]
+    root = Path(os.path.commonpath(tops))
+    outside = {os.path.abspath(path) for path in exclude}
+    folders: dict[Path, Folder] = {}
+    seen: set[str] = set()
+    for path in absolute:
+        files = [path] if path.is_file() else _walk(path, outside)
+        for file in files:
+            real = os.path.realpath(file)
+            if real not in seen:
+                seen.add(real)
+                _sort_in(file, folders, explicit=path.is_file())
+    ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
+    _name_vehicles(ordered, root)
+    return Discovery(root, ordered)
+
+
+def _walk(top: Path, outside: set[str]) -> list[Path]:
+    found: list[Path] = []
+    for folder, below, files in os.walk(top):
+        below[:] = sorted(
+            name for name in below if not name.startswith(".") and os.path.join(folder, name) not in outside
+        )
+        found += [Path(folder, name) for name in sorted(files, key=natural_key) if not name.startswith(".")]
+    return found
+
+
+def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None:
+    suffix = file.suffix.lower()
+    folder = folders.get(file.parent) or Folder(file.parent, "")
+    kinds = (
+        (PICTURE_SUFFIXES, folder.pictures),
+        (VIDEO_SUFFIXES, folder.videos),
+        (LOG_SUFFIXES, folder.logs),
+        (frozenset({".srt"}), folder.subtitles),
+        (_SIDECARS, folder.tables),
+    )
+    for suffixes, where in kinds:
+        if suffix in suffixes:
+            where.append(file)
+            folders[file.parent] = folder
+            return
+    if explicit:
+        raise InputError(f"{file.name} is of no kind that can be read; name a folder of photos, a video or a log")
+
+
+def _name_vehicles(folders: list[Folder], root: Path) -> None:
+    taken: set[str] = set()
+    for folder in sorted(folders, key=lambda f: len(f.path.parts), reverse=True):
+        relative = os.path.relpath(folder.path, root).replace(os.sep, "/")
+        name = (root.name or "vehicle") if relative == "." else relative
+        while name in taken:
+            name += "_top"
+        taken.add(name)
+        folder.vehicle = name

@@ -1,0 +1,26 @@
+"""What is suspicious about an input, with a code for programs and a sentence for people."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One observation about a source.
+
+    Attributes:
+        code: stable, lower case with hyphens. message: one plain sentence, with what was done about it.
+        vehicle: whom it concerns, "" for all. note: True where it is worth knowing but nothing is wrong.
+    """
+
+    code: str
+    message: str
+    vehicle: str = ""
+    note: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.vehicle}: {self.message}" if self.vehicle else self.message
+
+
+def plural(count: int, noun: str) -> str:
+    """A count with its noun, as in 1 photo, 3 photos."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

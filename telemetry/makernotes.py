@@ -1,0 +1,50 @@
+"""DJI MakerNotes: the airframe's and the camera's attitude of models that write no XMP.
+
+The note is a directory of 12-byte entries in a byte order of its own; tags 3-11 are single floats
+held in the entry itself: speed x, y, z; aircraft pitch, yaw, roll; camera pitch, yaw, roll (degrees; true north,
+camera pitch -90 = straight down). Source: ExifTool's DJI tag table, agreed with photos that have both.
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+
+_MAX_ENTRIES = 256
+
+
+@dataclass(frozen=True, slots=True)
+class DjiNote:
+    """Attitude in degrees, speed in metres a second; None where absent."""
+
+    flight_pitch_deg: float | None = None
+    flight_yaw_deg: float | None = None
+    flight_roll_deg: float | None = None
+    camera_pitch_deg: float | None = None
+    camera_yaw_deg: float | None = None
+    camera_roll_deg: float | None = None
+    speed: tuple[float, float, float] | None = None
+
+
+def parse_dji(note: bytes) -> DjiNote | None:
+    """Attitude of a DJI maker note, None where it is no such note or says nothing. Never raises."""
+    if len(note) < 14:
+        return None
+    # Software that rewrites the EXIF may turn its byte order but leaves the note: the note's own count tells.
+    order = "<" if note[1] == 0 else ">"
+    (count,) = struct.unpack_from(order + "H", note)
+    count = min(count, _MAX_ENTRIES, (len(note) - 2) // 12)
+    floats: dict[int, float] = {}
+    is_dji = False
+    for i in range(count):
+        tag, kind, length, raw = struct.unpack_from(order + "HHI4s", note, 2 + 12 * i)
+        if tag == 1 and kind == 2:
+            is_dji = raw[:3] == b"DJI"
+        elif 3 <= tag <= 11 and kind == 11 and length == 1:
+            (value,) = struct.unpack(order + "f", raw)
+            if math.isfinite(value) and abs(value) <= 720.0:
+                floats[tag] = round(value, 4)
+    if not is_dji or not floats:
+        return None
+    speed = (floats[3], floats[4], floats[5]) if {3, 4, 5} <= floats.keys() else None
+    pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
+    return DjiNote(pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll, speed)
