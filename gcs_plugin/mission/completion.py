@@ -1,0 +1,327 @@
+"""When a vehicle has flown its mission: a state machine over the messages of one autopilot.
+
+What ArduCopter 4.7 and PX4 send at the end of a mission differs with its last item (docs/vehicles.md has the table of
+what was measured). The rules here follow from it:
+
+- `mission_state` 5 (complete) counts only after state 3 (active) was seen, armed, since the last upload or start:
+  the flag survives a clear and a new upload.
+- ArduCopter never says 5 for a mission that ends with LAND: there the disarming while LAND is current says it.
+- State 3 while disarmed is ArduCopter standing in AUTO after a flight, not a flight.
+- Leaving the mission (state 2 or 4) suspends it; disarming a suspended mission ends it without completing it.
+- Firmware without `mission_state` is judged by its mode and by MISSION_ITEM_REACHED of the last NAV item.
+
+The clock plays no part, so a simulation at any speed and a log read afterwards give the same events.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from typing import Any, Final
+
+from gcs_plugin.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.mission.items import Ending, Mission, ending_of, final_nav
+
+
+class Phase(enum.Enum):
+    """Where the mission stands."""
+
+    IDLE = "idle"
+    ACTIVE = "active"
+    SUSPENDED = "suspended"
+    COMPLETE = "complete"
+    ABORTED = "aborted"
+
+
+class MissionEvent(enum.Enum):
+    """What has just happened to the mission. COMPLETE comes exactly once for each flown mission."""
+
+    STARTED = "started"
+    SUSPENDED = "suspended"
+    RESUMED = "resumed"
+    COMPLETE = "complete"
+    ABORTED = "aborted"
+
+
+# The message types that the detector looks at; others may be fed and change nothing.
+RELEVANT: Final = frozenset({
+    "HEARTBEAT", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
+    "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT",
+})  # fmt: skip
+
+_ACTIVE, _COMPLETE, _PAUSED = 3, 5, 4
+_ON_GROUND, _IN_AIR, _TAKEOFF, _LANDING = 1, 2, 3, 4
+_ARDUCOPTER_AUTO = 3
+_PX4_AUTO_MISSION = (4 << 16) | (4 << 24)
+# How many MISSION_CURRENT still saying "active" after disarming are waited for before the flight counts as aborted:
+# the heartbeat and the 10 Hz stream cross each other on the way.
+_PATIENCE = 3
+
+
+@dataclasses.dataclass(slots=True)
+class CompletionDetector:
+    """Follows one vehicle's mission; feed it every message of the vehicle's autopilot in order of arrival.
+
+    Attributes:
+        autopilot: the vehicle's dialect.
+        phase: where the mission stands.
+        seq: the current item as the vehicle last said, None before.
+        total: number of items that it says it has, without ArduPilot's home; None where it does not say.
+        armed: None before the first heartbeat.
+    """
+
+    autopilot: Autopilot
+    phase: Phase = Phase.IDLE
+    seq: int | None = None
+    total: int | None = None
+    armed: bool | None = None
+    _commands: list[int | None] | None = None
+    _mission_mode: bool = False
+    _has_state: bool | None = None
+    _landed: int | None = None
+    _airborne: bool = False
+    _landing_seen: bool = False
+    _reached: int = -1
+    _dropped: bool = False
+    _armed_since_drop: int = 0
+    _waiting: int = 0
+    _disarmed_at_final: bool = False
+    _crashed: bool = False
+    _proofs: int = 0
+    _proofs_needed: int = 1
+    _new_total: int | None = None
+    _learned: dict[int, int] = dataclasses.field(default_factory=dict)
+    _learned_count: int = 0
+
+    def uploaded(self, mission: Mission | None) -> None:
+        """A new mission lies in the vehicle (None: it is not known which). What was seen before no longer counts."""
+        self._commands = None if mission is None else [item.command for item in mission.items]
+        self._learned.clear()
+        self._learned_count = 0
+        self.total = None if mission is None else len(mission) - self._first_seq
+        self._new_total = None
+        self._restart(hot=bool(self.armed))
+
+    def rebooted(self) -> list[MissionEvent]:
+        """The vehicle has started anew: a mission that was under way has ended without completing."""
+        under_way = self.phase in (Phase.ACTIVE, Phase.SUSPENDED)
+        self._restart(hot=False)
+        self.armed, self.seq, self._landed = None, None, None
+        if not under_way:
+            return []
+        self.phase = Phase.ABORTED
+        return [MissionEvent.ABORTED]
+
+    def feed(self, message: Message) -> list[MissionEvent]:
+        """Take one message; returns what it means for the mission, mostly nothing."""
+        match message.get_type():
+            case "HEARTBEAT":
+                return self._heartbeat(message) if is_autopilot(message) else []
+            case "MISSION_CURRENT":
+                return self._current(message)
+            case "MISSION_ITEM_REACHED":
+                return self._item_reached(int(message.seq))
+            case "EXTENDED_SYS_STATE":
+                return self._extended(int(message.landed_state))
+            case "STATUSTEXT":
+                self._crashed |= str(message.text).startswith("Crash")
+            case "MISSION_COUNT":
+                if message.mission_type == dialect.MAV_MISSION_TYPE_MISSION:
+                    self._learned, self._learned_count = {}, int(message.count)
+            case "MISSION_ITEM_INT":
+                self._learn(message)
+            case "MISSION_REQUEST" | "MISSION_REQUEST_INT":  # some ground station is uploading
+                if message.mission_type == dialect.MAV_MISSION_TYPE_MISSION:
+                    self.uploaded(None)
+        return []
+
+    @property
+    def final_seq(self) -> int | None:
+        """Sequence number of the last item that is flown, None where nothing is known about the mission."""
+        if self._commands is not None:
+            return final_nav(self._commands, self._first_seq)
+        if self.total:
+            return self.total if self.autopilot is Autopilot.ARDUPILOT else self.total - 1
+        return None
+
+    @property
+    def ending(self) -> Ending:
+        """How the mission ends, as far as it is known."""
+        return Ending.UNKNOWN if self._commands is None else ending_of(self._commands, self._first_seq)
+
+    def state(self) -> dict[str, Any]:
+        """Everything it knows as JSON values, so that a restarted program can go on where it stopped."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values["autopilot"], values["phase"] = self.autopilot.value, self.phase.value
+        values["_learned"] = [[seq, command] for seq, command in self._learned.items()]
+        return values
+
+    @classmethod
+    def from_state(cls, values: Mapping[str, Any]) -> "CompletionDetector":
+        """The detector that `state` described."""
+        restored = dict(values)
+        restored["autopilot"], restored["phase"] = Autopilot(values["autopilot"]), Phase(values["phase"])
+        restored["_learned"] = {int(seq): int(command) for seq, command in values["_learned"]}
+        return cls(**restored)
+
+    @property
+    def _first_seq(self) -> int:
+        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
+
+    @property
+    def _at_final(self) -> bool:
+        final = self.final_seq
+        return final is not None and self.seq is not None and self.seq >= final
+
+    def _restart(self, *, hot: bool) -> None:
+        """Forget the flight. `hot`: in the air, where a late packet of the old mission may still say "active"."""
+        self.phase = Phase.IDLE
+        self._reached, self._waiting, self._proofs, self._armed_since_drop = -1, 0, 0, 0
+        self._dropped = self._disarmed_at_final = self._crashed = self._landing_seen = False
+        self._proofs_needed = 2 if hot else 1
+
+    def _end(self, phase: Phase, event: MissionEvent) -> list[MissionEvent]:
+        self.phase, self._waiting, self._proofs = phase, 0, 0
+        self._dropped = self._disarmed_at_final = False
+        return [event]
+
+    def _complete(self) -> list[MissionEvent]:
+        return self._end(Phase.COMPLETE, MissionEvent.COMPLETE)
+
+    def _abort(self) -> list[MissionEvent]:
+        return self._end(Phase.ABORTED, MissionEvent.ABORTED)
+
+    # --- what each message says ---
+
+    def _heartbeat(self, message: Message) -> list[MissionEvent]:
+        was, self.armed = self.armed, bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        mode = int(message.custom_mode)
+        self._mission_mode = mode == (_ARDUCOPTER_AUTO if self.autopilot is Autopilot.ARDUPILOT else _PX4_AUTO_MISSION)
+        events: list[MissionEvent] = []
+        if self.armed and was is False:
+            if self._waiting:  # how the last flight ended was never heard
+                events += self._abort()
+            if self.phase in (Phase.COMPLETE, Phase.ABORTED):
+                self._restart(hot=False)
+            self._airborne = self._landing_seen = self._crashed = False
+        if self.armed and self._dropped:
+            self._armed_since_drop += 1
+            if self._armed_since_drop >= 2:  # it goes on flying: somebody set the mission back, it has not landed
+                self._dropped = False
+        if not self.armed and was is not False:
+            events += self._disarmed()
+        if self._has_state is False:
+            events += self._judge(_ACTIVE if self._mission_mode else _PAUSED)
+        return events
+
+    def _disarmed(self) -> list[MissionEvent]:
+        if self.phase is Phase.SUSPENDED or (self.phase is Phase.ACTIVE and self._crashed):
+            return self._abort()
+        if self.phase is not Phase.ACTIVE:
+            return []
+        if self.ending is Ending.LAND and (self._at_final or self._dropped):
+            return self._complete()
+        self._waiting = _PATIENCE
+        self._disarmed_at_final = self._at_final
+        return []
+
+    def _current(self, message: Message) -> list[MissionEvent]:
+        self._follow_total(int(getattr(message, "total", 0)))
+        state, seq = int(getattr(message, "mission_state", 0)), int(message.seq)
+        was_final = self._at_final
+        self.seq = seq
+        if was_final and not self._at_final and self.phase is Phase.ACTIVE:
+            self._dropped, self._armed_since_drop = True, 0
+        if state:
+            self._has_state = True
+            return self._judge(state)
+        self._has_state = bool(self._has_state)
+        return [] if self._has_state else self._judge(_ACTIVE if self._mission_mode else _PAUSED)
+
+    def _judge(self, state: int) -> list[MissionEvent]:
+        """What a mission state means in the present phase."""
+        if state == _COMPLETE:
+            final = self.final_seq
+            proven = self.phase is Phase.SUSPENDED and final is not None and self._reached >= final
+            return self._complete() if self.phase is Phase.ACTIVE or proven else []
+        if self.phase is Phase.ACTIVE and self.armed is False:
+            return self._still_waiting(state)
+        if state == _ACTIVE and self.armed:
+            return self._flying()
+        self._proofs = 0
+        if state != _ACTIVE and self.phase is Phase.ACTIVE and state > 0:
+            self.phase = Phase.SUSPENDED
+            return [MissionEvent.SUSPENDED]
+        return []
+
+    def _flying(self) -> list[MissionEvent]:
+        if self.phase is Phase.ACTIVE:
+            return []
+        if self.phase is Phase.SUSPENDED:
+            self.phase = Phase.ACTIVE
+            return [MissionEvent.RESUMED]
+        # After an end in the air a mission counts as flown again only once it is back before its last item.
+        needed = self._proofs_needed if self.phase is Phase.IDLE else 2
+        self._proofs = 0 if self.phase is not Phase.IDLE and self._at_final else self._proofs + 1
+        if self._proofs < needed:
+            return []
+        self._restart(hot=False)
+        self.phase = Phase.ACTIVE
+        return [MissionEvent.STARTED]
+
+    def _still_waiting(self, state: int) -> list[MissionEvent]:
+        """Disarmed while active: the vehicle's next words say whether that was the end or a crash."""
+        if state != _ACTIVE:
+            return self._abort()
+        landed = self._landing_seen or self._landed is None
+        unknown_landing = self.ending is Ending.UNKNOWN and self._disarmed_at_final and landed
+        if unknown_landing and not self._at_final:  # back at the first item: ArduCopter's way after LAND
+            return self._complete()
+        self._waiting -= 1
+        return self._abort() if self._waiting <= 0 else []
+
+    def _item_reached(self, seq: int) -> list[MissionEvent]:
+        if self.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
+            return []
+        self._reached = max(self._reached, seq)
+        final = self.final_seq
+        done = self._has_state is False and self.phase is Phase.ACTIVE and final is not None and seq >= final
+        return self._complete() if done and self.ending is not Ending.NEVER else []
+
+    def _extended(self, landed: int) -> list[MissionEvent]:
+        if landed == 0:
+            return []
+        self._landed = landed
+        self._airborne |= landed in (_IN_AIR, _TAKEOFF, _LANDING)
+        self._landing_seen |= landed == _LANDING and self._at_final
+        down = landed == _ON_GROUND and self._airborne and self.phase is Phase.ACTIVE
+        if down and self.ending is Ending.LAND and self._at_final and not self._crashed:
+            return self._complete()
+        return []
+
+    # --- what is in the vehicle ---
+
+    def _follow_total(self, total: int) -> None:
+        """Notice that somebody else has put another mission into the vehicle (its number of items has changed)."""
+        known = self.total is not None and total == self.total
+        if self.autopilot is Autopilot.PX4 and self._commands is not None:
+            known |= len(self._commands) - total in (0, 1)  # versions differ in what they count
+        if not 0 < total < 0xFFFF or known:
+            self._new_total = None
+        elif self.total is None:
+            self.total = total
+        elif total != self._new_total:  # once may be a late packet
+            self._new_total = total
+        else:
+            self._commands = None
+            self.total, self._new_total = total, None
+            self._restart(hot=bool(self.armed))
+
+    def _learn(self, message: Message) -> None:
+        """Take the commands from a download by any ground station, where nobody has told them."""
+        if message.mission_type != dialect.MAV_MISSION_TYPE_MISSION or self._commands is not None:
+            return
+        self._learned[int(message.seq)] = int(message.command)
+        count = self._learned_count
+        if count and len(self._learned) == count and max(self._learned) == count - 1:
+            self._commands = [self._learned[seq] for seq in range(count)]
+            self.total = count - self._first_seq

@@ -1,0 +1,180 @@
+"""A mission as an autopilot stores it: a list of items, and what kind of item it ends with."""
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gcs_plugin.mavlink import Autopilot, Message, command_name, dialect
+
+FRAME_GLOBAL = int(dialect.MAV_FRAME_GLOBAL)
+FRAME_MISSION = int(dialect.MAV_FRAME_MISSION)
+FRAME_RELATIVE = int(dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT)
+FRAME_TERRAIN = int(dialect.MAV_FRAME_GLOBAL_TERRAIN_ALT)
+
+WAYPOINT = int(dialect.MAV_CMD_NAV_WAYPOINT)
+LOITER_UNLIM = int(dialect.MAV_CMD_NAV_LOITER_UNLIM)
+RTL = int(dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH)
+LAND = int(dialect.MAV_CMD_NAV_LAND)
+TAKEOFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
+VTOL_LAND = int(dialect.MAV_CMD_NAV_VTOL_LAND)
+DELAY = int(dialect.MAV_CMD_NAV_DELAY)
+JUMP = int(dialect.MAV_CMD_DO_JUMP)
+CHANGE_SPEED = int(dialect.MAV_CMD_DO_CHANGE_SPEED)
+TRIGGER_DISTANCE = int(dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST)
+
+_NAV_LAST = int(dialect.MAV_CMD_NAV_LAST)
+# The _INT frames of MISSION_ITEM_INT mean the same as the plain ones; autopilots answer with the plain ones.
+PLAIN_FRAME = {5: 0, 6: 3, 11: 10}
+DEG_E7 = 1e7
+
+
+@dataclass(frozen=True, slots=True)
+class MissionItem:
+    """One item as it travels; its place in the list is its sequence number.
+
+    Attributes:
+        command: MAV_CMD.
+        frame: MAV_FRAME of x, y, z.
+        params: param1 to param4, NaN where the command leaves the choice to the vehicle.
+        x: latitude in 1e-7 degrees for a command with a place, else param5.
+        y: longitude in 1e-7 degrees for a command with a place, else param6.
+        z: altitude in metres of the frame, else param7.
+    """
+
+    command: int
+    frame: int = FRAME_RELATIVE
+    params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    x: int = 0
+    y: int = 0
+    z: float = 0.0
+    autocontinue: bool = True
+
+    @classmethod
+    def at(
+        cls,
+        command: int,
+        lat_deg: float,
+        lon_deg: float,
+        height_m: float,
+        params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+        frame: int = FRAME_RELATIVE,
+    ) -> "MissionItem":
+        """An item at a place; the height is above the takeoff level unless the frame says otherwise."""
+        return cls(command, frame, params, round(lat_deg * DEG_E7), round(lon_deg * DEG_E7), height_m)
+
+    @classmethod
+    def do(cls, command: int, *params: float) -> "MissionItem":
+        """An item without a place: up to four parameters, the rest 0."""
+        first, second, third, fourth = (*params, 0.0, 0.0, 0.0, 0.0)[:4]
+        return cls(command, FRAME_MISSION, (first, second, third, fourth))
+
+    @property
+    def is_nav(self) -> bool:
+        """True for NAV commands: those that the vehicle flies, and reports as reached."""
+        return self.command < _NAV_LAST
+
+    @property
+    def has_place(self) -> bool:
+        """True where x, y, z are latitude, longitude and altitude."""
+        entry = dialect.enums["MAV_CMD"].get(self.command)
+        return bool(entry is not None and entry.has_location and self.frame != FRAME_MISSION)
+
+    @property
+    def lat_deg(self) -> float:
+        """Latitude in degrees of an item with a place."""
+        return self.x / DEG_E7
+
+    @property
+    def lon_deg(self) -> float:
+        """Longitude in degrees of an item with a place."""
+        return self.y / DEG_E7
+
+    @property
+    def name(self) -> str:
+        """The command in words."""
+        return command_name(self.command)
+
+    def message(self, seq: int, system: int, component: int) -> Message:
+        """The MISSION_ITEM_INT that carries it to a vehicle."""
+        return dialect.MAVLink_mission_item_int_message(
+            system, component, seq, self.frame, self.command, 0, int(self.autocontinue), *self.params,
+            self.x, self.y, self.z, dialect.MAV_MISSION_TYPE_MISSION,
+        )  # fmt: skip
+
+    @classmethod
+    def of(cls, message: Message) -> "MissionItem":
+        """The item in a MISSION_ITEM_INT, or in a MISSION_ITEM with its degrees in floats."""
+        x, y = message.x, message.y
+        if message.get_type() == "MISSION_ITEM":
+            placed = message.frame != FRAME_MISSION and dialect.enums["MAV_CMD"].get(message.command) is not None
+            scale = DEG_E7 if placed and dialect.enums["MAV_CMD"][message.command].has_location else 1.0
+            x, y = round(_finite(x) * scale), round(_finite(y) * scale)
+        params = (float(message.param1), float(message.param2), float(message.param3), float(message.param4))
+        return cls(message.command, message.frame, params, int(x), int(y), float(message.z), bool(message.autocontinue))
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+class Ending(enum.Enum):
+    """How a mission ends; it decides how its completion looks (see `completion`)."""
+
+    RTL = "rtl"
+    LAND = "land"
+    WAYPOINT = "waypoint"
+    NEVER = "never"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Mission:
+    """A mission for one vehicle, item by item as it goes on the wire.
+
+    Attributes:
+        autopilot: the dialect that it is built for.
+        items: all items; for ArduPilot item 0 is home (the vehicle overwrites it), for PX4 it is flown.
+        name: for messages to the user.
+    """
+
+    autopilot: Autopilot
+    items: tuple[MissionItem, ...]
+    name: str = ""
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    @property
+    def first_seq(self) -> int:
+        """Sequence number of the first item that is flown: 1 on ArduPilot, 0 on PX4."""
+        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
+
+    @property
+    def final_seq(self) -> int | None:
+        """Sequence number of the last NAV item, None without one."""
+        return final_nav([item.command for item in self.items], self.first_seq)
+
+    @property
+    def ending(self) -> Ending:
+        """How it ends."""
+        return ending_of([item.command for item in self.items], self.first_seq)
+
+
+def final_nav(commands: Sequence[int | None], first_seq: int) -> int | None:
+    """Sequence number of the last NAV command at or behind first_seq, None without one."""
+    for seq in range(len(commands) - 1, first_seq - 1, -1):
+        command = commands[seq]
+        if command is not None and command < _NAV_LAST:
+            return seq
+    return None
+
+
+def ending_of(commands: Sequence[int | None], first_seq: int) -> Ending:
+    """How a list of commands ends; UNKNOWN where the last ones are not known."""
+    last = final_nav(commands, first_seq)
+    if last is None or any(command is None for command in commands[last:]):
+        return Ending.UNKNOWN
+    return {
+        RTL: Ending.RTL, LAND: Ending.LAND, VTOL_LAND: Ending.LAND, LOITER_UNLIM: Ending.NEVER,
+    }.get(commands[last] or 0, Ending.WAYPOINT)  # fmt: skip
