@@ -1,0 +1,169 @@
+"""Coarse registration to the map without a network (RECIPE.md step 4): orientation fields of small mosaics, one FFT."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from orthoswarm.placement import MapWindow
+from orthoswarm.swarm.rig import Rig
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+Complex = NDArray[np.complex64]
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A window of consecutive pictures found on the map.
+
+    Attributes:
+        first: first picture, last: last picture (inclusive).
+        shift: (2,) east, north: what has to be added to the cameras, metres.
+        peak: correlation. ratio: second peak / peak (small is sure).
+    """
+
+    first: int
+    last: int
+    shift: tuple[float, float]
+    peak: float
+    ratio: float
+
+
+def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Complex:
+    """Double-angle orientation field (gx + i gy)^2 / |g|^2 * |g| / (|g| + median |g|), 0 where not valid.
+
+    An edge keeps its value when light and dark change places.
+    """
+    gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
+    g = gx + 1j * gy
+    size = np.abs(g)
+    middle = float(np.median(size[inner])) if inner.any() else 1.0
+    return np.asarray(np.where(inner, g * g / (np.maximum(size, 1e-3) * (size + max(middle, 1e-3))), 0), np.complex64)
+
+
+def correlate(moving: Complex, fixed: Complex, reach: int, blur: float = 0.0) -> tuple[float, float, float, float]:
+    """Best shift of a field (h, w) in a larger one (h + 2 reach, w + 2 reach), normalised by the energies.
+
+    Returns:
+        Column and row of the shift from the centre (sub-pixel), peak, ratio of second peak to peak.
+    """
+    shape = tuple(int(fft.next_fast_len(n)) for n in fixed.shape)
+    weight = (moving != 0).astype(np.float32)
+    f_fixed = fft.fft2(fixed, shape)
+    product = fft.ifft2(f_fixed * np.conj(fft.fft2(moving, shape))).real
+    # energies of both under the overlap: a mask as a second complex channel saves one transform
+    energy_fixed = fft.irfft2(fft.rfft2(np.abs(fixed) ** 2, shape) * np.conj(fft.rfft2(weight, shape)), shape)
+    energy = float((np.abs(moving) ** 2).sum())
+    n = 2 * reach + 1
+    floor = 0.05 * float(energy_fixed[:n, :n].max()) + 1e-6
+    score = product[:n, :n] / np.sqrt(np.maximum(energy_fixed[:n, :n], floor) * max(energy, 1e-6))
+    if blur:
+        score = cv2.GaussianBlur(score.astype(np.float32), (0, 0), blur)
+    r, c = np.unravel_index(int(score.argmax()), score.shape)
+    peak = float(score[r, c])
+    rest = score.copy()
+    rest[max(0, r - 4) : r + 5, max(0, c - 4) : c + 5] = 0
+    ratio = float(rest.max()) / max(peak, 1e-9)
+    dc, dr = 0.0, 0.0
+    if 0 < r < n - 1 and 0 < c < n - 1:
+        dc = _vertex(score[r, c - 1], peak, score[r, c + 1])
+        dr = _vertex(score[r - 1, c], peak, score[r + 1, c])
+    return c + dc - reach, r + dr - reach, peak, ratio
+
+
+def _vertex(left: float, middle: float, right: float) -> float:
+    bend = left - 2.0 * middle + right
+    return 0.0 if bend >= -1e-9 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
+
+
+def strip_mosaic(
+    rig: Rig, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], float, float] | None:
+    """Nearest-nadir grey mosaic of some pictures on a level plane.
+
+    Args:
+        small: reduced picture i; its scale is taken from its width.
+
+    Returns:
+        Grey (rows, columns), validity, west and north edges; None where nothing is seen.
+    """
+    corners, homographies = [], []
+    for i in index:
+        camera = rig.camera(int(i), np.zeros(2))
+        quad = camera.corners(ground_z)
+        if (
+            not np.isfinite(quad).all()
+            or np.abs(quad - camera.nadir).max() > 4 * abs(camera.position[2] - ground_z) + 50
+        ):
+            continue
+        corners.append(quad)
+        homographies.append((int(i), camera))
+    if not corners:
+        return None
+    low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
+    west, north = np.floor(low[0] / gsd_m) * gsd_m, np.ceil(high[1] / gsd_m) * gsd_m
+    width, height = int(np.ceil((high[0] - west) / gsd_m)), int(np.ceil((north - low[1]) / gsd_m))
+    if width * height > 4_000_000:
+        return None
+    out = np.zeros((height, width), np.float32)
+    best = np.full((height, width), np.inf, np.float32)
+    to_grid = np.array([[1 / gsd_m, 0, -west / gsd_m - 0.5], [0, -1 / gsd_m, north / gsd_m - 0.5], [0, 0, 1.0]])
+    for (i, camera), quad in zip(homographies, corners):
+        picture = small(i)
+        scale = camera.lens.width / picture.shape[1]
+        up = np.array([[scale, 0, 0.5 * scale - 0.5], [0, scale, 0.5 * scale - 0.5], [0, 0, 1.0]])
+        pixels = np.c_[quad, np.ones(4)] @ to_grid.T
+        c0, r0 = np.maximum(np.floor(pixels[:, :2].min(0)).astype(int), 0)
+        c1, r1 = np.minimum(np.ceil(pixels[:, :2].max(0)).astype(int) + 1, [width, height])
+        if c1 <= c0 or r1 <= r0:
+            continue
+        shift = np.array([[1, 0, -c0], [0, 1, -r0], [0, 0, 1.0]])
+        h = shift @ to_grid @ camera.homography(ground_z) @ up
+        warped = cv2.warpPerspective(picture.astype(np.float32) + 1, h, (int(c1 - c0), int(r1 - r0)))
+        nadir = to_grid @ np.array([*camera.nadir, 1.0])
+        d2 = (np.arange(c0, c1) - nadir[0])[None, :] ** 2 + (np.arange(r0, r1) - nadir[1])[:, None] ** 2
+        view = best[r0:r1, c0:c1]
+        wins = (warped >= 1) & (d2 < view)
+        view[wins] = d2[wins]
+        out[r0:r1, c0:c1][wins] = warped[wins] - 1
+    return out, np.isfinite(best), float(west), float(north)
+
+
+def register(
+    rig: Rig,
+    index: NDArray[np.integer],
+    small: Callable[[int], Gray],
+    basemap: MapWindow,
+    origin: Array,
+    ground_z: float,
+    reach_m: float = 60.0,
+    gsd_m: float = 2.0,
+) -> Match | None:
+    """Find the mosaic of some consecutive pictures on the map; None where either has nothing to show."""
+    mosaic = strip_mosaic(rig, index, small, ground_z, gsd_m)
+    if mosaic is None:
+        return None
+    gray, valid, west, north = mosaic
+    reach = int(np.ceil(reach_m / gsd_m))
+    rows, cols = gray.shape
+    bounds = (
+        origin[0] + west - reach * gsd_m,
+        origin[1] + north - (rows + reach) * gsd_m,
+        origin[0] + west + (cols + reach) * gsd_m,
+        origin[1] + north + reach * gsd_m,
+    )
+    ground, known = basemap.gray(bounds, gsd_m)
+    ground, known = ground[: rows + 2 * reach, : cols + 2 * reach], known[: rows + 2 * reach, : cols + 2 * reach]
+    if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < 0.1:
+        return None
+    moving = orientation_field(cv2.GaussianBlur(gray, (0, 0), 0.7), valid)
+    fixed = orientation_field(cv2.GaussianBlur(ground, (0, 0), 0.7), known)
+    if np.count_nonzero(moving) < 400:
+        return None
+    dc, dr, peak, ratio = correlate(moving, fixed, reach)
+    return Match(int(index[0]), int(index[-1]), (dc * gsd_m, -dr * gsd_m), peak, ratio)

@@ -1,0 +1,151 @@
+"""One vehicle's dense flight up to the map: records, calibration, tracks, relative adjustment (RECIPE.md 1 to 3)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.camera import fov_rad
+from orthoswarm.frame import Frame
+from orthoswarm.geo import LocalGrid
+from orthoswarm.swarm.adjust import Adjustment, Ground, log_rotation
+from orthoswarm.swarm.calibrate import Calibration, calibrate
+from orthoswarm.swarm.legs import split_legs
+from orthoswarm.swarm.pictures import Pictures
+from orthoswarm.swarm.priors import GroupModel, Priors
+from orthoswarm.swarm.records import Records, read_records
+from orthoswarm.swarm.rig import Rig, Tracks
+from orthoswarm.swarm.tracks import follow, predicted_homography
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+RELATIVE_SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
+
+
+@dataclass(slots=True)
+class Flight:
+    """A vehicle's frames with everything that was found out about them so far.
+
+    Attributes:
+        frames: in order. records: what they recorded (headings already corrected). leg: int32 (N,).
+        pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
+        survived: float64 (N,), share of tracks that survived into each picture.
+        warnings: findings in plain words.
+    """
+
+    frames: Sequence[Frame]
+    records: Records
+    leg: NDArray[np.int32]
+    pictures: Pictures
+    calibration: Calibration
+    adjustment: Adjustment
+    survived: Array
+    warnings: list[str]
+
+
+def open_flight(
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: Callable[[Frame], Gray], fov_start: float
+) -> Flight:
+    """Track a vehicle's pictures and set up its adjustment; nothing is solved yet."""
+    records = read_records(frames, grid, origin)
+    leg = split_legs(records.position, records.time_s if records.timed else None)
+    pictures = Pictures(frames, read)
+    calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
+    records = records.with_yaw(records.yaw + calibration.yaw_offset)
+    tracks, survived = _track(records, pictures, calibration)
+    adjustment = _begin(records, pictures, calibration, tracks)
+    return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))
+
+
+def relative_adjustment(flight: Flight, schedule: Sequence[float] = RELATIVE_SCHEDULE) -> None:
+    """Adjust without a map: the ground is level within a few metres at height 0."""
+    adj = flight.adjustment
+    for k, c in enumerate(schedule):
+        adj.step(c, level_ground(len(adj.points), 3.0 if k < 2 else 2.0, 1e3 if k < 2 else 4.0))
+
+
+def level_ground(points: int, sigma: float = 2.0, c: float = 4.0) -> Ground:
+    """All points near height 0."""
+    zero = np.zeros(points)
+    return Ground(zero, sigma, 20.0, zero, c=c)
+
+
+def attitude_scatter(flight: Flight) -> Array:
+    """Robust scatter (3,) in radians of recorded attitude minus bias about the adjusted one."""
+    adj = flight.adjustment
+    bias = adj.group_values(0)[0]
+    r = log_rotation(np.swapaxes(adj.priors.rotation, 1, 2) @ adj.rig.rotation) - bias
+    return np.asarray(1.4826 * np.median(np.abs(r - np.median(r, axis=0)), axis=0))
+
+
+def _track(records: Records, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:
+    rotation, steps = records.rotation(), records.steps()
+    width, height = pictures.size
+    f = calibration.focal_px
+    matrix = np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
+    reach = 0.8 * height / f * calibration.height_m
+
+    def prediction(i: int) -> Array | None:
+        if i == 0 or np.hypot(*steps[i, :2]) > reach:
+            return None
+        step = np.array([steps[i, 0], steps[i, 1], 0.0])
+        return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
+
+    return follow(len(rotation), pictures.gray, prediction)
+
+
+def _begin(records: Records, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
+    n = len(records.position)
+    width, height = pictures.size
+    position = records.position.copy()
+    position[:, 2] = _height_prior(records, calibration)
+    rotation = records.rotation()
+    lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
+    rig = Rig(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
+    horizontal = np.where(np.isfinite(records.position_sigma), np.maximum(records.position_sigma, 0.02), 1.5)
+    z_sigma = 0.15 if calibration.trusted_height else 0.5
+    tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
+    yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
+    model = GroupModel(
+        height_sigma=1.0 if calibration.trusted_height else 30.0,
+        lag_sigma=0.5 if records.timed else 0.3,
+        drift_sigma=15.0 if not np.isfinite(records.position_sigma).all() else 0.0,
+    )
+    priors = Priors(
+        position,
+        np.column_stack([horizontal, horizontal, np.full(n, z_sigma)]),
+        rotation,
+        np.column_stack([tilt, tilt, yaw]),
+        records.velocity(),
+        np.zeros(n, np.int32),
+        (model,),
+        np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
+        np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
+    )
+    return Adjustment.begin(rig, tracks, priors, first_points(rig, tracks))
+
+
+def first_points(rig: Rig, tracks: Tracks) -> Array:
+    """Where the rays of each track meet the level ground, averaged: float64 (P, 3)."""
+    ground = rig.to_ground(tracks.camera, tracks.uv, np.zeros(len(tracks.camera)))
+    ok = np.isfinite(ground).all(1)
+    count = np.maximum(np.bincount(tracks.point[ok], minlength=tracks.count), 1)
+    xy = [np.bincount(tracks.point[ok], ground[ok, a], minlength=tracks.count) / count for a in range(2)]
+    return np.column_stack([*xy, np.zeros(tracks.count)])
+
+
+def _height_prior(records: Records, calibration: Calibration) -> Array:
+    """Heights over the ground: the vehicle's median where it flew level, else its smoothed record."""
+    z = records.position[:, 2]
+    if not calibration.trusted_height:
+        return np.full(len(z), calibration.height_m)
+    smooth = np.array([np.median(z[max(0, i - 10) : i + 11]) for i in range(len(z))])
+    low, high = np.percentile(smooth, [5, 95])
+    return np.full(len(z), float(np.median(z))) if high - low < 2.0 else smooth
+
+
+def fov_deg(flight: Flight) -> float:
+    """The vehicle's field of view now, degrees."""
+    return float(np.degrees(fov_rad(float(flight.adjustment.rig.lens[0, 0]), flight.pictures.size[0])))

@@ -1,0 +1,112 @@
+"""Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE.md step 4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.placement import MapWindow
+from orthoswarm.swarm.coarse import Match, register
+from orthoswarm.swarm.flight import Flight
+
+Array = NDArray[np.float64]
+
+WINDOW = 25
+CONSENSUS_M = 6.0
+TRUSTED_RATIO = 0.85
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseFit:
+    """How a vehicle lies on the map after correlation.
+
+    Attributes:
+        correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
+        confidence: share of the windows that agree.
+    """
+
+    correction: Array
+    matches: list[Match]
+    inlier: NDArray[np.bool_]
+    confidence: float
+
+
+def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 60.0) -> CoarseFit | None:
+    """Register windows of each leg; None where no consensus is found."""
+    rig = flight.adjustment.rig
+    matches = [
+        m
+        for index in _windows(flight.leg)
+        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m)) is not None
+    ]
+    if not matches:
+        return None
+    inlier = _consensus(matches)
+    if inlier.sum() < (1 if len(matches) == 1 else 2) or inlier.mean() < 0.34:
+        return None
+    if len(matches) == 1 and matches[0].ratio > 0.7:
+        return None
+    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.mean()))
+
+
+def shift_cameras(flight: Flight, correction: Array) -> None:
+    """Move cameras and points by a correction (N, 2), and the drift with them, so that the records still agree."""
+    adj = flight.adjustment
+    adj.rig.position[:, :2] += correction
+    n = len(adj.points)
+    count = np.maximum(np.bincount(adj.tracks.point, minlength=n), 1)
+    for a in range(2):
+        adj.points[:, a] += np.bincount(adj.tracks.point, correction[adj.tracks.camera, a], minlength=n) / count
+    lay = adj.layout
+    for g, (at, knots) in enumerate(zip(lay.offset, lay.knots)):
+        members = np.flatnonzero(adj.priors.group == g)
+        if knots and len(members):
+            where = lay.knot_left[members] + lay.knot_fraction[members]
+            for a in range(2):
+                columns = at + 5 + 2 * np.arange(knots) + a
+                adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
+
+
+def _windows(leg: NDArray[np.int32]) -> list[NDArray[np.int64]]:
+    """Runs of about WINDOW pictures of one leg each; short legs are one window."""
+    out: list[NDArray[np.int64]] = []
+    for k in range(int(leg.max()) + 1 if len(leg) else 0):
+        members = np.flatnonzero(leg == k)
+        parts = max(1, round(len(members) / WINDOW))
+        out += [p for p in np.array_split(members, parts) if len(p) >= 3]
+    return out or ([np.arange(len(leg))] if len(leg) else [])
+
+
+def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
+    """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
+    t = np.array([0.5 * (m.first + m.last) for m in matches])
+    s = np.array([m.shift for m in matches])
+    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), 0.02, 1.0)
+    n = len(matches)
+    best, best_score = np.zeros(n, bool), -1.0
+    for i in range(n):
+        for j in range(i, n):
+            slope = (s[j] - s[i]) / (t[j] - t[i]) if j > i and t[j] > t[i] else np.zeros(2)
+            if np.hypot(*slope) > 0.5:
+                continue
+            error = np.hypot(*(s - s[i] - slope * (t - t[i])[:, None]).T)
+            inside = error < CONSENSUS_M
+            score = float((weight * inside * (1.0 - 0.5 * error / CONSENSUS_M)).sum())
+            if score > best_score:
+                best, best_score = inside, score
+    return best
+
+
+def _smooth(matches: Sequence[Match], inlier: NDArray[np.bool_], count: int) -> Array:
+    """Correction of each picture: medians of three neighbouring windows, linear between, constant beyond."""
+    chosen = [m for m, ok in zip(matches, inlier) if ok]
+    t = np.array([0.5 * (m.first + m.last) for m in chosen])
+    s = np.array([m.shift for m in chosen])
+    order = np.argsort(t, kind="stable")
+    t, s = t[order], s[order]
+    calm = np.array([np.median(s[max(0, i - 1) : i + 2], axis=0) if len(s) > 2 else s[i] for i in range(len(s))])
+    if len(s) > 2:
+        calm[[0, -1]] = 0.5 * (calm[[0, -1]] + s[[0, -1]])
+    i = np.arange(count, dtype=float)
+    return np.column_stack([np.interp(i, t, calm[:, a]) for a in range(2)])

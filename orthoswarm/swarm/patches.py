@@ -1,0 +1,75 @@
+"""Small rectified patches of pictures, and their comparison by gradients (light and season change, edges stay)."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.kernels import kernel
+from orthoswarm.swarm.rig import project_point
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+
+@kernel
+def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: ignore[no-untyped-def]
+    """A north-up patch of the level plane at z about (x, y), bilinear, into out (2 half + 1, 2 half + 1) float32.
+
+    Row 0 is north. Returns the share of its pixels that the picture (uint8) sees; the others are NaN.
+    """
+    rows, cols = gray.shape
+    size = 2 * half + 1
+    seen = 0
+    for r in range(size):
+        for c in range(size):
+            u, v = project_point(position, rotation, lens, x + (c - half) * gsd, y - (r - half) * gsd, z)
+            if u >= 0.0 and v >= 0.0 and u < cols - 1.0 and v < rows - 1.0:
+                ui, vi = int(u), int(v)
+                fu, fv = np.float32(u - ui), np.float32(v - vi)
+                low = gray[vi, ui] * (1 - fu) + gray[vi, ui + 1] * fu
+                high = gray[vi + 1, ui] * (1 - fu) + gray[vi + 1, ui + 1] * fu
+                out[r, c] = low * (1 - fv) + high * fv
+                seen += 1
+            else:
+                out[r, c] = np.nan
+    return seen / (size * size)
+
+
+def gradient_field(gray: Floats) -> Floats:
+    """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
+    gx = cv2.Scharr(gray, cv2.CV_32F, 1, 0)
+    gy = cv2.Scharr(gray, cv2.CV_32F, 0, 1)
+    size = np.sqrt(gx * gx + gy * gy)
+    valid = np.isfinite(size)
+    middle = float(np.median(size[valid])) if valid.any() else 1.0
+    scale = np.where(valid, 1.0 / (size + max(middle, 1e-3)), 0.0).astype(np.float32)
+    field = np.stack([gx, gy], axis=-1) * scale[..., None]
+    return np.nan_to_num(field, copy=False, nan=0.0)
+
+
+def match(template: Floats, window: Floats, exclude: int = 4) -> tuple[float, float, float, float]:
+    """Where a template field lies in a larger window field, by normalised vector correlation.
+
+    Args:
+        template: float32 (n, n, 2). window: float32 (n + 2 s, n + 2 s, 2).
+        exclude: the second peak is sought farther than this from the first, pixels.
+
+    Returns:
+        Column and row of the shift from the window's centre (sub-pixel), the peak, the second peak.
+    """
+    score = cv2.matchTemplate(window, template, cv2.TM_CCORR_NORMED)
+    _, peak, _, (c, r) = cv2.minMaxLoc(score)
+    rows, cols = score.shape
+    rest = score.copy()
+    rest[max(0, r - exclude) : r + exclude + 1, max(0, c - exclude) : c + exclude + 1] = -1.0
+    second = float(rest.max())
+    if not (0 < c < cols - 1 and 0 < r < rows - 1):
+        return 0.0, 0.0, 0.0, 1.0
+    dc = _vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
+    dr = _vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
+    return c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, float(peak), second
+
+
+def _vertex(left: float, middle: float, right: float) -> float:
+    bend = left - 2.0 * middle + right
+    return 0.0 if bend >= -1e-9 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))

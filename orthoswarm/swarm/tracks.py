@@ -1,0 +1,250 @@
+"""Following corners through one vehicle's pictures (RECIPE.md step 1): spread by cells, predicted by the records.
+
+Optical flow between consecutive pictures, started from the recorded attitude and the flown step; each window is
+turned and scaled as the prediction says, so that chains survive corners.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.swarm import klt
+from orthoswarm.swarm.rig import Tracks
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+CELL_PX = 80
+BORDER_PX = 9
+FLOW_SIGMA_PX = 0.35
+
+
+@dataclass(slots=True)
+class _Live:
+    """Tracks alive in the last picture: pixel, id, age in pictures."""
+
+    uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    age: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(slots=True)
+class Tracker:
+    """Follows corners picture by picture; feed it in order, then take the tracks.
+
+    Attributes:
+        scale: full-resolution pixels per pixel of the pictures that are fed.
+    """
+
+    scale: float = 1.0
+    _live: _Live = field(default_factory=_Live)
+    _gray: Gray | None = None
+    _half: Gray | None = None
+    _next: int = 0
+    _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
+
+    def add(self, index: int, gray: Gray, predicted: Array | None) -> float:
+        """Follow all live tracks into the next picture and start new ones in empty cells.
+
+        Args:
+            index: of the picture (the camera of the observations).
+            gray: uint8 (rows, columns).
+            predicted: 3x3 homography from the last picture's pixels to this one's, None to start afresh.
+
+        Returns:
+            Share of the live tracks that survived (1 if there were none).
+        """
+        half = np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        survived = 1.0
+        if predicted is None or self._gray is None or self._gray.shape != gray.shape:
+            self._live = _Live()
+        elif len(self._live.ident):
+            survived = self._follow(gray, half, predicted)
+        self._start(gray)
+        self._log.append((index, self._live.ident.copy(), self._live.uv.copy()))
+        self._gray, self._half = gray, half
+        return survived
+
+    def tracks(self, min_observations: int = 3) -> Tracks:
+        """All tracks with enough observations, as observations in full-resolution pixels."""
+        if not self._log:
+            return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
+        camera = np.concatenate([np.full(len(ident), i, np.int32) for i, ident, _ in self._log])
+        ident = np.concatenate([ident for _, ident, _ in self._log])
+        uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
+        keep = np.bincount(ident, minlength=self._next)[ident] >= min_observations
+        _, point = np.unique(ident[keep], return_inverse=True)
+        uv = (uv[keep] + 0.5) * self.scale - 0.5
+        sigma = np.full(len(point), FLOW_SIGMA_PX * self.scale, np.float32)
+        return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
+
+    def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
+        before, live = len(self._live.ident), self._live
+        guess = _apply(predicted, live.uv)
+        good, found = self._flow(gray, half, predicted, guess)
+        inside = _inside(guess, gray.shape, 0.0)
+        if good.sum() < max(6, 0.3 * inside.sum()):
+            shift = _global_shift(self._gray, gray, predicted)
+            if shift is not None:
+                moved = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ predicted
+                good2, found2 = self._flow(gray, half, moved, _apply(moved, live.uv))
+                if good2.sum() > good.sum():
+                    good, found = good2, found2
+        self._live = _oldest_per_cell(_Live(found[good], live.ident[good], live.age[good] + 1), gray.shape)
+        return float(good.sum()) / max(before, 1)
+
+    def _flow(
+        self, gray: Gray, half: Gray, predicted: Array, guess: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Flow of the live tracks from the guess, gated."""
+        found, ok = np.empty_like(guess), np.zeros(len(guess), bool)
+        klt.track(self._gray, self._half, gray, half, self._live.uv, guess, _backward(predicted, guess), found, ok)
+        return _gate(guess, found, ok, gray.shape), found
+
+    def _start(self, gray: Gray) -> None:
+        """New corners: the strongest of each empty cell."""
+        rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
+        if rows == 0 or cols == 0:
+            return
+        top, left = (gray.shape[0] - rows * CELL_PX) // 2, (gray.shape[1] - cols * CELL_PX) // 2
+        taken = np.zeros((rows, cols), bool)
+        r = ((self._live.uv[:, 1] - top) // CELL_PX).astype(int).clip(0, rows - 1)
+        c = ((self._live.uv[:, 0] - left) // CELL_PX).astype(int).clip(0, cols - 1)
+        taken[r, c] = True
+        uv = corners(gray, ~taken, top, left)
+        if len(uv):
+            ident = np.arange(self._next, self._next + len(uv))
+            self._next += len(uv)
+            self._live = _Live(
+                np.concatenate([self._live.uv, uv]),
+                np.concatenate([self._live.ident, ident]),
+                np.concatenate([self._live.age, np.zeros(len(uv), np.int64)]),
+            )
+
+
+def corners(gray: Gray, empty: NDArray[np.bool_], top: int = 0, left: int = 0) -> NDArray[np.float32]:
+    """The strongest corner (minimum eigenvalue) of each wanted cell: float32 (K, 2), column and row.
+
+    Cells without texture give none. Only the rows of cells that are wanted are computed.
+    """
+    found: list[tuple[float, float]] = []
+    floor = 1e-4
+    for row in np.flatnonzero(empty.any(1)):
+        y0 = top + int(row) * CELL_PX
+        a, b = max(y0 - 3, 0), min(y0 + CELL_PX + 3, gray.shape[0])
+        for first, last in _runs(empty[row]):
+            x0, x1 = left + first * CELL_PX, left + last * CELL_PX
+            c, d = max(x0 - 3, 0), min(x1 + 3, gray.shape[1])
+            score = cv2.cornerMinEigenVal(gray[a:b, c:d], 5, ksize=3)[y0 - a : y0 - a + CELL_PX, x0 - c : x1 - c]
+            _mask_border(score, y0, x0, gray.shape)
+            cells = score.reshape(CELL_PX, last - first, CELL_PX).transpose(1, 0, 2).reshape(last - first, -1)
+            best = cells.argmax(1)
+            for n, k in enumerate(best):
+                if cells[n, k] > floor:
+                    found.append((x0 + n * CELL_PX + int(k) % CELL_PX, y0 + int(k) // CELL_PX))
+    return np.array(found, np.float32).reshape(-1, 2)
+
+
+def _runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist())
+
+
+def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int, ...]) -> None:
+    b = BORDER_PX
+    score[: max(0, b - y0)] = 0
+    score[:, : max(0, b - x0)] = 0
+    below, right = y0 + score.shape[0] - (shape[0] - b), x0 + score.shape[1] - (shape[1] - b)
+    if below > 0:
+        score[-below:] = 0
+    if right > 0:
+        score[:, -right:] = 0
+
+
+def _apply(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    p = np.c_[uv, np.ones(len(uv))] @ homography.T
+    return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
+
+
+def _backward(homography: Array, uv: NDArray[np.float32]) -> Array:
+    """Derivatives (K, 2, 2) of the inverse homography at pixels (K, 2) of the later picture."""
+    h = np.linalg.inv(homography)
+    p = np.c_[uv, np.ones(len(uv))] @ h.T
+    z = p[:, 2:3]
+    out = np.empty((len(uv), 2, 2))
+    for a in range(2):
+        out[:, a] = (h[a, :2] - p[:, a : a + 1] / z * h[2, :2]) / z
+    return out
+
+
+def _inside(uv: NDArray[np.float32], shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+    h, w = shape[:2]
+    return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)
+
+
+def _gate(
+    guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Keep flows that agree with the others: 5 px from the median residual, which is 12 px from the guess at most."""
+    good = ok & _inside(found, shape, 3.0)
+    if good.sum() < 3:
+        return np.zeros_like(good)
+    residual = found - guess
+    centre = np.median(residual[good], axis=0)
+    if np.hypot(*centre) > 12.0:
+        return np.zeros_like(good)
+    return np.asarray(good & (np.hypot(*(residual - centre).T) < 5.0))
+
+
+def _global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[float, float] | None:
+    """What the prediction lacks, from phase correlation of the quarter-size pictures; None where unclear."""
+    if previous is None:
+        return None
+    warped = cv2.warpPerspective(previous, predicted, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
+    small = [
+        cv2.resize(g, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32) for g in (warped, gray)
+    ]
+    window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
+    (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
+    return (4.0 * dx, 4.0 * dy) if response > 0.05 else None
+
+
+def _oldest_per_cell(live: _Live, shape: tuple[int, ...]) -> _Live:
+    """One track a cell, the one followed longest: spread matters more than strength."""
+    cols = shape[1] // CELL_PX + 1
+    cell = (live.uv[:, 1] // CELL_PX).astype(np.int64) * cols + (live.uv[:, 0] // CELL_PX).astype(np.int64)
+    order = np.lexsort((live.ident, -live.age))
+    _, first = np.unique(cell[order], return_index=True)
+    keep = np.sort(order[first])
+    return _Live(live.uv[keep], live.ident[keep], live.age[keep])
+
+
+def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
+    """The homography of flat ground from one picture's pixels to the next one's, from their records.
+
+    Args:
+        before: (3, 3) rotation of the earlier camera, camera to ground; after: of the later one.
+        height_m: height of the earlier camera above the ground.
+        step: (3,) its movement in metres, east, north, up.
+        matrix: 3x3 calibration matrix.
+    """
+    upward = before[2]  # the ground's normal in the earlier camera's axes
+    relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
+    return np.asarray(matrix @ relative @ np.linalg.inv(matrix))
+
+
+def follow(
+    count: int,
+    read: Callable[[int], Gray],
+    prediction: Callable[[int], Array | None],
+    scale: float = 1.0,
+) -> tuple[Tracks, NDArray[np.float64]]:
+    """Track through pictures 0..count-1; returns the tracks and the share that survived into each picture."""
+    tracker = Tracker(scale)
+    survived = np.ones(count)
+    for i in range(count):
+        survived[i] = tracker.add(i, read(i), prediction(i))
+    return tracker.tracks(), survived
