@@ -1,0 +1,104 @@
+"""Work gives the same results, in the same order, whatever the number of workers."""
+
+import os
+import time
+
+import pytest
+
+from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.workers import Processes, Serial, cores, peak_rss_mb, single_threaded, workers
+
+
+def square(n):
+    time.sleep(0.002 * (n % 3))  # later items overtake earlier ones
+    return n * n
+
+
+def where(_):
+    end = time.perf_counter() + 0.05
+    while time.perf_counter() < end:
+        pass
+    return os.getpid()
+
+
+def threads(_):
+    import cv2
+
+    return os.environ["OMP_NUM_THREADS"], cv2.getNumThreads()
+
+
+def refuse(n):
+    if n == 3:
+        raise ValueError("three")
+    return n
+
+
+def die(n):
+    if n >= 0:
+        os._exit(9)
+
+
+def test_results_do_not_depend_on_the_number_of_workers():
+    items = list(range(40))
+    expected = [n * n for n in items]
+    assert list(Serial().map(square, items)) == expected
+    with Processes(3) as three:
+        assert list(three.map(square, iter(items))) == expected
+        assert list(three.map(square, [])) == []
+
+
+def test_the_caller_works_too_and_the_others_are_measured():
+    with Processes(2) as two:
+        pids = set(two.map(where, range(60)))
+        used = two.usage()
+    assert os.getpid() in pids and len(pids) == 2
+    assert used.cpu_s > 0.05 and used.peak_rss_mb > 10
+
+
+def test_items_are_taken_as_they_are_needed():
+    taken = []
+
+    def items():
+        for n in range(100):
+            taken.append(n)
+            yield n
+
+    with Processes(2) as two:
+        results = two.map(square, items())
+        assert next(results) == 0
+        assert len(taken) < 20
+        results.close()
+
+
+def test_an_error_comes_at_its_items_turn():
+    with Processes(2) as two:
+        results = two.map(refuse, range(8))
+        assert [next(results) for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(ValueError, match="three"):
+            next(results)
+
+
+def test_a_killed_worker_is_one_clear_error():
+    me = os.getpid()
+    with Processes(2) as two:
+        pid = next(p for p in two.map(where, range(40)) if p != me)
+        assert pid != me
+        pool = two._started()
+        future = pool.submit(die, 1)
+        with pytest.raises(OrthoSwarmError, match="fewer --workers"):
+            two._account(future)
+
+
+def test_each_process_keeps_to_one_thread():
+    with Processes(2) as two:
+        assert {cv for _, cv in two.map(threads, range(4))} == {1}
+
+
+def test_helpers(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    single_threaded()
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert isinstance(workers(1), Serial)
+    assert workers(4).count == 4
+    assert workers().count == cores() >= 1
+    assert peak_rss_mb() > 10
