@@ -1,0 +1,175 @@
+"""Settling one vehicle on the map: ties, lean, links, and the absolute adjustment (RECIPE.md steps 5 to 8)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.placement import MapWindow
+from orthoswarm.swarm.adjust import Adjustment, Ties
+from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.loadedmap import LoadedMap
+from orthoswarm.swarm.onmap import shift_cameras
+from orthoswarm.swarm.rig import Tracks
+from orthoswarm.swarm.surface import Surface, fit_surface
+from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, one_per_cell, sights, vote_lean
+
+Array = NDArray[np.float64]
+
+TIE_SIGMA_M = 0.35
+LINK_SIGMA_PX = 0.7
+
+
+@dataclass(slots=True)
+class Settled:
+    """What settling found, besides the cameras in the flight's adjustment.
+
+    Attributes:
+        surface: the ground, with the map's lean. ties: the last round's. matches: the matches they come from.
+        roofs: matches of raised points and their heights, for a vote over several vehicles.
+        ground: the map at working resolution. links: observations added between legs.
+    """
+
+    surface: Surface
+    ties: Ties
+    matches: MapMatches
+    roofs: tuple[MapMatches, Array]
+    ground: LoadedMap
+    links: int
+
+
+def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
+    """The map under a vehicle's pictures, with a margin for the search."""
+    rig = flight.adjustment.rig
+    height = float(np.median(rig.position[:, 2]))
+    reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(rig.lens[0, 0]) + 40.0
+    low, high = rig.position[:, :2].min(0) - reach, rig.position[:, :2].max(0) + reach
+    return LoadedMap.load(basemap, origin, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), gsd_m)
+
+
+def tie_round(
+    flight: Flight, surface: Surface, ground: LoadedMap, cell_m: float, reach_m: float, half_m: float = 10.0
+) -> MapMatches:
+    """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`."""
+    adj = flight.adjustment
+    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    height = adj.points[:, 2] - surface.height(adj.points[:, :2])
+    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
+    half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
+    return match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+
+
+def accepted(matches: MapMatches, peak: float = 0.2, ratio: float = 0.75) -> MapMatches:
+    """Matches with a clear peak."""
+    return matches.take((matches.peak > peak) & (matches.ratio < ratio))
+
+
+def mode_shift(shift: Array) -> Array:
+    """Most agreed shift (2,) of ties (Q, 2): most neighbours within 0.7 m, then reweighted."""
+    if len(shift) == 0:
+        return np.zeros(2)
+    d2 = ((shift[:, None, :] - shift[None, :, :]) ** 2).sum(-1)
+    centre = shift[int((d2 < 0.7**2).sum(1).argmax())]
+    for scale in (0.5, 0.5, 0.35, 0.25, 0.25):
+        w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
+        centre = (shift * w[:, None]).sum(0) / w.sum()
+    return np.asarray(centre)
+
+
+def as_ties(matches: MapMatches, points: Array) -> Ties:
+    """Ties for the adjustment: where the map shows each point now."""
+    sigma = np.full(len(matches.point), TIE_SIGMA_M)
+    return Ties(matches.point, points[matches.point, :2] + matches.shift, sigma)
+
+
+def roof_round(flight: Flight, surface: Surface, ground: LoadedMap) -> tuple[MapMatches, Array]:
+    """Raised points found on the map, and their heights over the ground."""
+    adj = flight.adjustment
+    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    height = adj.points[:, 2] - surface.height(adj.points[:, :2])
+    usable = (seen.camera >= 0) & (seen.count >= 6) & (seen.mean_weight > 0.5) & (height > 4.0) & (height < 40.0)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), 30.0)
+    half, reach = max(8, round(7.5 / ground.gsd_m)), max(8, round(11.0 / ground.gsd_m))
+    found = match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+    found = accepted(found, 0.2, 0.85)
+    return found, height[found.point]
+
+
+def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
+    """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
+    adj = flight.adjustment
+    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), cell_m)
+    candidates = np.flatnonzero(flight.leg >= 0)
+    if len(np.unique(flight.leg[candidates])) < 2:
+        return 0
+    camera, point, uv, _ = link_legs(
+        adj.rig, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
+    )
+    if len(camera):
+        extend(flight, camera, point, uv, LINK_SIGMA_PX)
+    return len(camera)
+
+
+def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float) -> None:
+    """Add observations to a flight's adjustment, keeping its state."""
+    old = flight.adjustment
+    tracks = Tracks(
+        np.concatenate([old.tracks.camera, camera]),
+        np.concatenate([old.tracks.point, point]),
+        np.concatenate([old.tracks.uv, uv]),
+        np.concatenate([old.tracks.sigma_px, np.full(len(camera), sigma_px, np.float32)]),
+    )
+    new = Adjustment.begin(old.rig, tracks, old.priors, old.points, old.free)
+    new.common[:] = old.common
+    flight.adjustment = new
+
+
+def settle(
+    flight: Flight, basemap: MapWindow, origin: Array, surface: Surface, lean: tuple[float, float] | None
+) -> Settled:
+    """Two rounds of ties and links; the flight must lie within some metres of the map already.
+
+    Args:
+        flight: after the coarse registration.
+        basemap: the map. origin: (2,) of the local frame.
+        surface: ground after the relative adjustment.
+        lean: the map's lean where it is known from other vehicles, None to vote.
+    """
+    ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
+    matches = accepted(tie_round(flight, surface, ground, 50.0, 14.0))
+    shift_cameras(flight, np.broadcast_to(mode_shift(matches.shift), (len(flight.frames), 2)).copy())
+    matches = replace(matches, shift=matches.shift - mode_shift(matches.shift))
+    ties = as_ties(matches, flight.adjustment.points)
+    for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
+        if k in (1, 3):
+            surface = fit_surface(flight.adjustment, surface)
+    roofs = roof_round(flight, surface, ground)
+    voted = (
+        vote_lean(roofs[0], roofs[1], mode_shift(ties.xy - flight.adjustment.points[ties.point, :2]))
+        if lean is None
+        else lean
+    )
+    surface = replace(surface, lean=voted or (0.0, 0.0))
+    links = add_links(flight, map_gsd(flight, basemap))
+    flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    matches = accepted(tie_round(flight, surface, ground, 30.0, 5.0))
+    ties = as_ties(matches, flight.adjustment.points)
+    for k, c in enumerate((9.0, 6.0, 6.0, 6.0, 6.0, 6.0)):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
+        if k in (0, 2, 4):
+            surface = fit_surface(flight.adjustment, surface)
+    return Settled(surface, ties, matches, roofs, ground, links)
+
+
+def map_gsd(flight: Flight, basemap: MapWindow) -> float:
+    """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
+    rig = flight.adjustment.rig
+    picture = float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
+    return float(np.clip(max(picture, basemap.native_gsd_m), 0.25, 2.0)) if picture < 0.4 else max(0.5, picture)
