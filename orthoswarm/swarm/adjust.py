@@ -119,17 +119,55 @@ class Adjustment:
         Raises:
             OrthoSwarmError: if the system is singular even with its priors (NaN in the input).
         """
-        ties = Ties.none() if ties is None else ties
-        n, size = int(self.free.sum()), self.layout.size
-        lenses = len(self.rig.lens)
-        points, obs = len(self.points), len(self.tracks.point)
-        band = np.zeros((6 * (self.bandwidth + 1), 6 * n), order="F")
-        side, corner = np.zeros((6 * n, size)), np.zeros((size, size))
-        rhs, rhs_common = np.zeros(6 * n), np.zeros(size)
-        w_obs, w_lens = np.zeros((obs, 6, 3)), np.zeros((points, lenses, 6, 3))
-        b_point = np.zeros((points, 3))
-        lens_side, lens_corner = np.zeros((6 * n, 6 * lenses)), np.zeros((6 * lenses, 6 * lenses))
-        rhs_lens = np.zeros(6 * lenses)
+        system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
+        system.band[0] *= 1.0 + damping
+        step_camera, step_common = _solve(system)
+        self._move(step_camera, step_common)
+        normal.back_substitute(
+            self.points,
+            self.start,
+            self.tracks.camera,
+            self.slot,
+            system.w_obs,
+            system.w_lens,
+            self.point_inverse,
+            system.b_point,
+            step_camera,
+            step_common[: self.layout.lens_columns],
+            50.0,
+        )
+        return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if len(step_camera) else 0.0
+
+    def covariance(
+        self, cameras: NDArray[np.integer], c: float, ground: Ground, ties: Ties | None = None, tie_c: float = 9.0
+    ) -> tuple[Array, Array]:
+        """Covariances at the present state; the points are eliminated, not held.
+
+        Args:
+            cameras: (K,) free cameras. c, ground, ties, tie_c: as for `step`.
+
+        Returns:
+            float64 (K, 6, 6) of position and rotation about the camera's axes, and (size, size) of the common unknowns.
+        """
+        system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
+        factor = _factor(system.band)
+        y = _back(factor, system.side)
+        inverse = np.linalg.inv(system.corner - system.side.T @ y)
+        rows = (6 * self.slot[cameras][:, None] + np.arange(6)).ravel()
+        unit = np.zeros((system.band.shape[1], len(rows)), order="F")
+        unit[rows, np.arange(len(rows))] = 1.0
+        solved = _back(factor, unit)
+        out = np.empty((len(cameras), 6, 6))
+        for k in range(len(cameras)):
+            own = rows[6 * k : 6 * k + 6]
+            out[k] = solved[own, 6 * k : 6 * k + 6] + y[own] @ inverse @ y[own].T
+        return out, inverse
+
+    def _assemble(self, c: float, ground: Ground, ties: Ties, tie_c: float) -> "_System":
+        n, size, lenses = int(self.free.sum()), self.layout.size, len(self.rig.lens)
+        k, points = 6 * lenses, len(self.points)
+        system = _System.empty(n, size, lenses, points, len(self.tracks.point), self.bandwidth)
+        lens_side, lens_corner, rhs_lens = np.zeros((6 * n, k)), np.zeros((k, k)), np.zeros(k)
         tie_of_point = np.full(points, -1, np.int32)
         tie_of_point[ties.point] = np.arange(len(ties.point), dtype=np.int32)
         self.tie_residual = np.zeros((len(ties.point), 2))
@@ -155,38 +193,21 @@ class Adjustment:
             tie_c,
             np.asarray(ground.lean, float),
             ground.surface,
-            band,
+            system.band,
             lens_side,
             lens_corner,
-            rhs,
+            system.rhs,
             rhs_lens,
-            w_obs,
-            w_lens,
+            system.w_obs,
+            system.w_lens,
             self.point_inverse,
-            b_point,
+            system.b_point,
             self.obs_weight,
             self.tie_residual,
         )
-        k = 6 * lenses
-        side[:, :k], corner[:k, :k], rhs_common[:k] = lens_side, lens_corner, rhs_lens
-        self._add_priors(band, side, corner, rhs, rhs_common)
-        band[0] *= 1.0 + damping
-        step_camera, step_common = _solve(band, side, corner, rhs, rhs_common)
-        self._move(step_camera, step_common)
-        normal.back_substitute(
-            self.points,
-            self.start,
-            self.tracks.camera,
-            self.slot,
-            w_obs,
-            w_lens,
-            self.point_inverse,
-            b_point,
-            step_camera,
-            step_common[:k],
-            50.0,
-        )
-        return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if n else 0.0
+        system.side[:, :k], system.corner[:k, :k], system.rhs_common[:k] = lens_side, lens_corner, rhs_lens
+        self._add_priors(system.band, system.side, system.corner, system.rhs, system.rhs_common)
+        return system
 
     def residuals(self) -> Array:
         """Reprojection residuals (M, 2) in pixels now."""
@@ -310,17 +331,52 @@ def _add_drift_prior(corner: Array, rhs: Array, common: Array, at: int, knots: i
         rhs[c] -= precision @ common[c]
 
 
-def _solve(band: Array, side: Array, corner: Array, rhs: Array, rhs_common: Array) -> tuple[Array, Array]:
+@dataclass(frozen=True, slots=True)
+class _System:
+    """Reduced normal equations: banded cameras, a border of common unknowns, and what gives the points back."""
+
+    band: Array
+    side: Array
+    corner: Array
+    rhs: Array
+    rhs_common: Array
+    w_obs: Array
+    w_lens: Array
+    b_point: Array
+
+    @classmethod
+    def empty(cls, free: int, common: int, lenses: int, points: int, observations: int, bandwidth: int) -> "_System":
+        return cls(
+            np.zeros((6 * (bandwidth + 1), 6 * free), order="F"),
+            np.zeros((6 * free, common)),
+            np.zeros((common, common)),
+            np.zeros(6 * free),
+            np.zeros(common),
+            np.zeros((observations, 6, 3)),
+            np.zeros((points, lenses, 6, 3)),
+            np.zeros((points, 3)),
+        )
+
+
+def _factor(band: Array) -> Array:
+    factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+    if info != 0:
+        raise OrthoSwarmError("the adjustment is singular; check the records for NaN or repeated pictures")
+    return np.asarray(factor)
+
+
+def _back(factor: Array, right: Array) -> Array:
+    return np.asarray(lapack.dpbtrs(factor, right, lower=1)[0])
+
+
+def _solve(system: _System) -> tuple[Array, Array]:
     """Solve the bordered banded system; returns the cameras' and the common steps."""
-    if band.shape[1]:
-        factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
-        if info != 0:
-            raise OrthoSwarmError("the adjustment is singular; check the records for NaN or repeated pictures")
-        both, _ = lapack.dpbtrs(factor, np.column_stack([side, rhs]), lower=1)
-        y, x = both[:, :-1], both[:, -1]
-        common = np.linalg.solve(corner - side.T @ y, rhs_common - side.T @ x)
-        return np.asarray(x - y @ common), np.asarray(common)
-    return np.zeros(0), np.asarray(np.linalg.solve(corner, rhs_common))
+    if not system.band.shape[1]:
+        return np.zeros(0), np.asarray(np.linalg.solve(system.corner, system.rhs_common))
+    both = _back(_factor(system.band), np.column_stack([system.side, system.rhs]))
+    y, x = both[:, :-1], both[:, -1]
+    common = np.linalg.solve(system.corner - system.side.T @ y, system.rhs_common - system.side.T @ x)
+    return np.asarray(x - y @ common), np.asarray(common)
 
 
 def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
