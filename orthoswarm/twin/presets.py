@@ -1,0 +1,97 @@
+"""What sets of data can be made: presets, kinds of noise, and every knob."""
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from orthoswarm.errors import InputError
+from orthoswarm.twin.flight import FlightPlan, Motion
+from orthoswarm.twin.record import Noise
+
+NOISES: dict[str, Noise] = {
+    "none": Noise(position_m=0.0, drift_per_photo_m=0.0),
+    "paper": Noise(),
+    "hard": Noise(
+        heading_bias_deg=3.0, tilt_bias_deg=1.0, angle_deg=0.07, outlier_share=0.02, lag_s=(0.1, 0.5), height_m=0.15,
+        height_offset_m=1.0,
+    ),
+    "drift": Noise(position_m=0.4, drift_per_photo_m=0.0, follows_plan=True, height_m=0.1),
+}  # fmt: skip
+"""The paper's noise; harder than it; a receiver's drift that the autopilot follows; none."""
+
+
+@dataclass(frozen=True, slots=True)
+class TwinSpec:
+    """All that determines a set of data.
+
+    Attributes:
+        preset: name of the preset that it began with.
+        seed: of everything that is drawn.
+        disaster: none, debris, water or haze.
+        noise_name: kind of noise; noise: its values.
+        plan: the flight. motion: how calmly it is flown.
+        relief_m: ground relief, +- metres (procedural city only).
+        lens_k: true radial distortion k1, k2 of all lenses.
+        lean: size of the map's lean, metres per metre of height; lean_deg: its azimuth, both drawn if None.
+        map_gsd_m: pixel of the basemap. reference_gsd_m: of the reference.
+        lat_deg: where the procedural city lies; lon_deg.
+        quality: of the JPEGs.
+        every: render only every n-th picture of each vehicle (records and truth stay those of the full flight).
+        ground: orthoimage and surface model of a real place instead of the city, None for the city.
+        margin_m: ground beyond the outermost legs.
+        cars: share of the places for cars that are taken.
+    """
+
+    preset: str = "debris"
+    seed: int = 1
+    disaster: str = "debris"
+    noise_name: str = "paper"
+    noise: Noise = field(default_factory=Noise)
+    plan: FlightPlan = field(default_factory=FlightPlan)
+    motion: Motion = field(default_factory=Motion)
+    relief_m: float = 0.0
+    lens_k: tuple[float, float] = (0.0, 0.0)
+    lean: float | None = None
+    lean_deg: float | None = None
+    map_gsd_m: float = 0.4
+    reference_gsd_m: float = 0.3
+    lat_deg: float = 30.57
+    lon_deg: float = 103.2
+    quality: int = 92
+    every: int = 1
+    ground: tuple[str, str, str] | None = None
+    margin_m: float = 290.0
+    cars: float = 0.5
+
+    def parameters(self) -> dict[str, Any]:
+        """All values, for the manifest."""
+        return asdict(self)
+
+
+_TINY = FlightPlan(columns=2, photos=20, legs=2, spacing_m=12.0, leg_spacing_m=80.0, width=320, height=240, height_m=90.0)
+PRESETS: dict[str, TwinSpec] = {
+    "tiny": TwinSpec(preset="tiny", disaster="none", plan=_TINY, margin_m=170.0),
+    "debris": TwinSpec(preset="debris", disaster="debris"),
+    "water": TwinSpec(preset="water", disaster="water"),
+    "haze": TwinSpec(preset="haze", disaster="haze"),
+    "clear": TwinSpec(preset="clear", disaster="none"),
+    # 96 x 339 pictures over 6.35 square kilometres, as in the paper's scaling experiment
+    "full": TwinSpec(
+        preset="full", disaster="debris",
+        plan=FlightPlan(columns=12, rows=8, photos=339, legs=4, spacing_m=4.5, leg_spacing_m=48.0, speed_m_s=9.0),
+    ),
+}  # fmt: skip
+
+
+def spec(preset: str, *, seed: int = 1, noise: str = "paper", **changes: Any) -> TwinSpec:
+    """A preset with a seed, a kind of noise, and further fields of TwinSpec replaced.
+
+    Raises:
+        InputError: for a preset or a kind of noise that does not exist.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"there is no preset '{preset}'; choose one of: {', '.join(PRESETS)}")
+    if noise not in NOISES:
+        raise InputError(f"there is no noise '{noise}'; choose one of: {', '.join(NOISES)}")
+    base = PRESETS[preset]
+    motion = replace(base.motion, drift_m=18.0) if noise == "drift" else base.motion
+    return replace(base, **{"seed": seed, "noise_name": noise, "noise": NOISES[noise], "motion": motion, **changes})
