@@ -1,0 +1,1 @@
+"""Files that other programs open: COG, MBTiles, KMZ, GeoPackage, a folder for OpenDroneMap."""

@@ -1,0 +1,233 @@
+"""Cloud-optimised GeoTIFFs, written in one pass from a source of windows: memory does not grow with the picture.
+
+Layout as the OGC's COG standard (21-026) and GDAL's driver have it: header, all directories (full resolution first),
+then tiles from the coarsest overview to full resolution. Tile positions are filled in at the end, which is possible
+because the length of every table is known at the beginning. Transparent tiles take no room (offset and size 0).
+"""
+
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm import __version__
+from orthoswarm.export.partial import written_whole
+from orthoswarm.geo import GroundGrid
+
+Bytes = NDArray[np.uint8]
+TILE_PX = 512
+_LEVEL = 1  # zlib: higher levels gain some percent on photographs and take several times longer
+# GDAL's hints for readers; the last line's blank leaves room to say YES there.
+_STRUCTURE = (
+    b"LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\n"
+    b"BLOCK_TRAILER=LAST_4_BYTES_REPEATED\nKNOWN_INCOMPATIBLE_EDITION=NO\n "
+)
+
+
+class Source(Protocol):
+    """What a COG is made of; mosaic.canvas.Canvas is one."""
+
+    grid: GroundGrid
+
+    def read_reduced(self, factor: int, row0: int, row1: int, col0: int, col1: int) -> Bytes:
+        """Colours uint8 (rows, columns, 4) of a window of the picture reduced by a power of two."""
+
+
+def write_cog(
+    source: Source,
+    path: Path,
+    *,
+    window: tuple[int, int, int, int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    threads: int = 2,
+) -> None:
+    """Write a source as a COG: RGBA uint8, deflate, tiles of 512, overviews by powers of two.
+
+    Args:
+        source: where the pixels come from.
+        path: the file; appears when it is complete.
+        window: rows and columns (row0, row1, col0, col1) to write, the first ones multiples of TILE_PX; None for all.
+        progress: called with tiles written and tiles in all.
+        threads: how many tiles are compressed at once.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    row0, row1, col0, col1 = window or (0, source.grid.height, 0, source.grid.width)
+    row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
+    levels = _levels(row1 - row0, col1 - col0)
+    with written_whole(path) as part, part.open("w+b") as file:
+        tables = _write_directories(file, source.grid, (row0, col0), levels)
+        done, total = 0, sum(level.tiles for level in levels)
+        for level, table in reversed(list(zip(levels, tables, strict=True))):
+            for i, data in enumerate(_compressed(source, (row0, col0), level, threads)):
+                if data:
+                    table.offsets[i], table.sizes[i] = file.tell() + 4, len(data)
+                    file.write(struct.pack("<I", len(data)) + data + data[-4:])
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+        for table in tables:
+            table.fill_in(file)
+
+
+class _Level:
+    """One resolution: the picture reduced by a factor."""
+
+    def __init__(self, factor: int, rows: int, cols: int) -> None:
+        self.factor = factor
+        self.rows, self.cols = -(-rows // factor), -(-cols // factor)
+        self.tile_rows, self.tile_cols = -(-self.rows // TILE_PX), -(-self.cols // TILE_PX)
+        self.tiles = self.tile_rows * self.tile_cols
+
+
+def _levels(rows: int, cols: int) -> list[_Level]:
+    levels = [_Level(1, rows, cols)]
+    while max(levels[-1].rows, levels[-1].cols) > TILE_PX:
+        levels.append(_Level(2 * levels[-1].factor, rows, cols))
+    return levels
+
+
+class _Table:
+    """Where the tiles of one level are; its room in the file is known before they are written."""
+
+    def __init__(self, count: int) -> None:
+        self.offsets = np.zeros(count, "<u8")
+        self.sizes = np.zeros(count, "<u4")
+        self.offsets_at = self.sizes_at = 0
+
+    def fill_in(self, file: BinaryIO) -> None:
+        file.seek(self.offsets_at)
+        file.write(self.offsets.tobytes())
+        file.seek(self.sizes_at)
+        file.write(self.sizes.tobytes())
+
+
+def _compressed(source: Source, first: tuple[int, int], level: _Level, threads: int) -> Iterator[bytes]:
+    """The level's tiles in row order, compressed; empty where transparent."""
+    pending: deque[Future[bytes]] = deque()
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for r in range(level.tile_rows):
+            for c in range(level.tile_cols):
+                pending.append(pool.submit(_deflate, _tile(source, first, level, r, c)))
+                while len(pending) > 2 * threads:
+                    yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def _tile(source: Source, first: tuple[int, int], level: _Level, r: int, c: int) -> Bytes:
+    """One full tile; beyond the picture it is transparent."""
+    row, col = r * TILE_PX, c * TILE_PX
+    rows, cols = min(TILE_PX, level.rows - row), min(TILE_PX, level.cols - col)
+    top, left = first[0] // level.factor + row, first[1] // level.factor + col
+    part = source.read_reduced(level.factor, top, top + rows, left, left + cols)
+    if part.shape[:2] == (TILE_PX, TILE_PX):
+        return part
+    tile = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
+    tile[:rows, :cols] = part
+    return tile
+
+
+def _deflate(tile: Bytes) -> bytes:
+    """Horizontal differences (TIFF predictor 2) and zlib; nothing for a transparent tile."""
+    if not tile[..., 3].any():
+        return b""
+    tile = tile.copy()
+    tile[tile[..., 3] == 0] = 0
+    tile[:, 1:] = tile[:, 1:] - tile[:, :-1]
+    return zlib.compress(tile.tobytes(), _LEVEL)
+
+
+# -- BigTIFF ------------------------------------------------------------------------------------------------------
+
+_SHORT, _LONG, _DOUBLE, _ASCII, _LONG8 = 3, 4, 12, 2, 16
+_FORMATS = {_SHORT: "H", _LONG: "I", _DOUBLE: "d", _LONG8: "Q"}
+
+
+def _write_directories(file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level]) -> list[_Table]:
+    """Header and directories, with room for the tile tables; the file is left at the first tile's place."""
+    ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
+    ghost += bytes(-len(ghost) % 16)
+    at = 16 + len(ghost)
+    file.write(struct.pack("<2sHHHQ", b"II", 43, 8, 0, at) + ghost)
+    tables = []
+    for i, level in enumerate(levels):
+        table = _Table(level.tiles)
+        tags = _tags(level, grid if i == 0 else None, first)
+        block = _directory(at, tags, table, last=i == len(levels) - 1)
+        file.write(block)
+        at += len(block)
+        tables.append(table)
+    return tables
+
+
+def _tags(level: _Level, grid: GroundGrid | None, first: tuple[int, int]) -> dict[int, tuple[int, bytes | list[float]]]:
+    """Tag -> type and values; the full resolution (grid given) also says where it lies."""
+    tags: dict[int, tuple[int, bytes | list[float]]] = {
+        254: (_LONG, [0 if grid else 1]),  # a reduced picture
+        256: (_LONG, [level.cols]),
+        257: (_LONG, [level.rows]),
+        258: (_SHORT, [8] * 4),
+        259: (_SHORT, [8]),  # deflate
+        262: (_SHORT, [2]),  # RGB
+        277: (_SHORT, [4]),
+        284: (_SHORT, [1]),  # bands side by side
+        317: (_SHORT, [2]),  # horizontal differences
+        322: (_LONG, [TILE_PX]),
+        323: (_LONG, [TILE_PX]),
+        338: (_SHORT, [2]),  # the fourth band is alpha, not multiplied in
+        339: (_SHORT, [1] * 4),
+    }
+    if grid is not None:
+        west, north = grid.west + first[1] * grid.gsd_m, grid.north - first[0] * grid.gsd_m
+        tags[305] = (_ASCII, f"OrthoSwarm {__version__}".encode() + b"\0")
+        tags[33550] = (_DOUBLE, [grid.gsd_m, grid.gsd_m, 0.0])
+        tags[33922] = (_DOUBLE, [0.0, 0.0, 0.0, west, north, 0.0])
+        # GeoTIFF keys: projected, pixel is area, the CRS by its EPSG code, metres.
+        tags[34735] = (_SHORT, [1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, grid.epsg, 3076, 0, 1, 9001])
+    return tags
+
+
+def _directory(at: int, tags: dict[int, tuple[int, bytes | list[float]]], table: _Table, *, last: bool) -> bytes:
+    """One directory at a place in the file, with the values that do not fit into its entries after it."""
+    count = len(tags) + 2
+    values_at = at + 8 + 20 * count + 8
+    entries: list[bytes] = []
+    values = bytearray()
+
+    def add(tag: int, kind: int, number: int, data: bytes) -> int:
+        """Write an entry; gives where its data lies in the file."""
+        nonlocal entries
+        head = struct.pack("<HHQ", tag, kind, number)
+        if len(data) <= 8:
+            place = at + 8 + 20 * len(entries) + 12
+            entries.append(head + data.ljust(8, b"\0"))
+            return place
+        values.extend(bytes(-len(values) % 8))
+        place = values_at + len(values)
+        values.extend(data)
+        entries.append(head + struct.pack("<Q", place))
+        return place
+
+    pending = {**tags, 324: (_LONG8, b""), 325: (_LONG, b"")}
+    for tag in sorted(pending):
+        kind, content = pending[tag]
+        if tag == 324:
+            table.offsets_at = add(tag, _LONG8, len(table.offsets), table.offsets.tobytes())
+        elif tag == 325:
+            table.sizes_at = add(tag, _LONG, len(table.sizes), table.sizes.tobytes())
+        elif isinstance(content, bytes):
+            add(tag, kind, len(content), content)
+        else:
+            data = struct.pack(f"<{len(content)}{_FORMATS[kind]}", *content)
+            add(tag, kind, len(content), data)
+    values.extend(bytes(-len(values) % 8))
+    following = 0 if last else values_at + len(values)
+    return struct.pack("<Q", count) + b"".join(entries) + struct.pack("<Q", following) + bytes(values)
