@@ -161,7 +161,7 @@ class Adjustment:
         for k in range(len(cameras)):
             own = rows[6 * k : 6 * k + 6]
             out[k] = solved[own, 6 * k : 6 * k + 6] + y[own] @ inverse @ y[own].T
-        return out, inverse
+        return out, np.asarray(inverse, np.float64)
 
     def _assemble(self, c: float, ground: Ground, ties: Ties, tie_c: float) -> "_System":
         n, size, lenses = int(self.free.sum()), self.layout.size, len(self.rig.lens)

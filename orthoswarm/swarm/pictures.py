@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,6 +66,9 @@ class Pictures:
     def drop(self) -> None:
         """Let go of the working-scale pictures (the reduced ones stay)."""
         self._cache.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cache": OrderedDict()}
 
     def _load(self, i: int) -> Gray:
         try:

@@ -1,0 +1,183 @@
+"""The default refiner: one vehicle is the unit, a batch is a loop over it (DESIGN.md section 4, RECIPE.md).
+
+Solo pass of each vehicle -> lean voted over all of them -> second pass with neighbours held -> one terrain.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.frame import Frame
+from orthoswarm.geo import LocalGrid
+from orthoswarm.picture import read_gray
+from orthoswarm.placement import MapWindow, Solution, Terrain
+from orthoswarm.swarm.adjust import Ties
+from orthoswarm.swarm.flight import Flight, open_flight
+from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
+from orthoswarm.swarm.settle import settle
+from orthoswarm.swarm.sigma import frame_sigmas
+from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
+from orthoswarm.swarm.surface import Surface, fit_surface
+from orthoswarm.swarm.ties import MapMatches
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How the refiner works.
+
+    Attributes:
+        fov_start_rad: field of view to start from where the tags hint at none.
+        work_width: pictures wider than this are reduced for the refinement.
+    """
+
+    fov_start_rad: float = float(np.radians(80.0))
+    work_width: int = 960
+
+
+class Run(Protocol):
+    """How tasks are run: serially, in processes, on a cluster; results come in the order of the items."""
+
+    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+        """Yield function(item) for each item."""
+
+
+def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+    """Run tasks one after the other in this process."""
+    return map(function, items)
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Products of the refinement of a batch: the same vehicles before and after the map; state is in `fine`."""
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None
+
+
+def read_frame(frame: Frame) -> NDArray[np.uint8]:
+    """A frame's grey picture."""
+    return read_gray(frame.path)
+
+
+def local_origin(grid: LocalGrid, frames: Iterable[Frame]) -> Array:
+    """Origin (2,) of the local frame: the middle of the fixes, on a multiple of 16 m so that pixel grids agree."""
+    fixes = np.array([(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
+    return np.asarray(np.round(np.median(grid.to_grid(fixes[:, 0], fixes[:, 1]), axis=0) / 16.0) * 16.0)
+
+
+def solo(
+    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
+) -> VehicleState:
+    """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
+    watch = Stopwatch()
+    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
+    start = float(np.median(hints)) if hints else options.fov_start_rad
+    flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
+    watch.lap("tracks")
+    surface = _relative(flight)
+    adj = flight.adjustment
+    belief = surface.belief(adj.points)
+    coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
+    coarse = replace(
+        adj.rig, position=adj.rig.position.copy(), rotation=adj.rig.rotation.copy(), lens=adj.rig.lens.copy()
+    )
+    watch.lap("relative")
+    none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    state = VehicleState(
+        frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
+        (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
+    )  # fmt: skip
+    if basemap is not None:
+        _onto_map(state, basemap, origin, watch)
+    flight.pictures.drop()
+    state.timings = watch.seconds
+    return state
+
+
+def _relative(flight: Flight) -> Surface:
+    """The adjustment without a map, its ground fitted as soon as the points allow."""
+    surface = Surface()
+    for k, c in enumerate((1e4, 1e4, 100.0, 100.0, 9.0, 9.0)):
+        first = k < 2
+        flight.adjustment.step(
+            c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 4.0)
+        )
+        if k >= 3:
+            surface = fit_surface(flight.adjustment, surface)
+    return surface
+
+
+def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
+    flight = state.flight
+    fit = coarse_fit(flight, basemap, origin) or coarse_fit(flight, basemap, origin, 150.0)
+    watch.lap("coarse registration")
+    if fit is None:
+        flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
+        return
+    shift_cameras(flight, fit.correction)
+    settled = settle(flight, basemap, origin, state.surface, None)
+    state.surface, state.ties, state.matches, state.roofs = (
+        settled.surface,
+        settled.ties,
+        settled.matches,
+        settled.roofs,
+    )
+    state.on_map, state.confidence = True, fit.confidence
+    watch.lap("ties and absolute")
+    adj = flight.adjustment
+    state.sigma_m, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), state.ties, 6.0, 0.05)
+    watch.lap("sigma")
+
+
+def refine_all(
+    vehicles: Mapping[str, Sequence[Frame]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    options: Options | None = None,
+    run: Run = serial,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Refined:
+    """Refine a batch of vehicles.
+
+    Args:
+        vehicles: id -> frames in order of time. basemap: the map on the area's grid, or None.
+        grid: the area's grid. options: see Options. run: how tasks are run. progress: called with stage, done, all.
+
+    Raises:
+        OrthoSwarmError: if there is nothing to refine.
+    """
+    if not vehicles:
+        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
+    task = partial(solo, epsg=grid.epsg, origin=origin, basemap=basemap, options=options or Options())
+    states = []
+    for n, state in enumerate(run(task, list(vehicles.values()))):
+        states.append(state)
+        if progress:
+            progress("fine" if basemap else "coarse", n + 1, len(vehicles))
+    terrain = common_terrain(states)
+    return Refined(
+        [to_solution(s, origin, terrain, coarse=True) for s in states],
+        [to_solution(s, origin, terrain) for s in states],
+        _shifted(terrain, origin),
+    )
+
+
+def common_terrain(states: Sequence[VehicleState]) -> Terrain | None:
+    """One surface over all vehicles for rendering, in the local frame."""
+    return states[0].surface.terrain() if states else None
+
+
+def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:
+    if terrain is None:
+        return None
+    return replace(terrain, west=terrain.west + float(origin[0]), south=terrain.south + float(origin[1]))

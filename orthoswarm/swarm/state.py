@@ -1,0 +1,126 @@
+"""What the refiner keeps of a vehicle between its passes, and its conversion to a Solution."""
+
+from dataclasses import dataclass, field, replace
+from time import process_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.camera import fov_rad
+from orthoswarm.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
+from orthoswarm.swarm.adjust import Ties
+from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.rig import CX, CY, WIDTH, F, Rig
+from orthoswarm.swarm.surface import Surface
+from orthoswarm.swarm.ties import MapMatches
+
+Array = NDArray[np.float64]
+
+ENOUGH_OBSERVATIONS = 8
+LEG_TIES = 3
+
+
+@dataclass(slots=True)
+class VehicleState:
+    """One vehicle between passes; everything is picklable, decoded pictures are let go.
+
+    Attributes:
+        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used.
+        surface: its ground. ties, matches: of the last round (empty without a map).
+        roofs: raised points on the map and their heights. dense: extra ground points (K, 3) and sigmas (K,).
+        on_map: True if it lies on the map. sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
+        fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
+    """
+
+    vehicle: str
+    flight: Flight
+    coarse: Rig
+    surface: Surface
+    ties: Ties
+    matches: MapMatches
+    roofs: tuple[MapMatches, Array]
+    dense: tuple[Array, Array]
+    on_map: bool
+    confidence: float
+    sigma_m: Array
+    coarse_sigma_m: Array
+    fov_sigma_deg: float
+    timings: dict[str, float] = field(default_factory=dict)
+
+
+class Stopwatch:
+    """CPU seconds by name, added up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = process_time()
+
+    def lap(self, name: str) -> None:
+        """Add the CPU time since the last lap to a name."""
+        now = process_time()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
+    """Well fitting observations of each camera: int64 (N,)."""
+    adj = flight.adjustment
+    return np.bincount(adj.tracks.camera[adj.obs_weight > 0.3], minlength=len(adj.rig))
+
+
+def to_solution(state: VehicleState, origin: Array, terrain: Terrain | None, *, coarse: bool = False) -> Solution:
+    """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
+    flight = state.flight
+    rig = state.coarse if coarse else flight.adjustment.rig
+    stage: Stage = "coarse" if coarse or not state.on_map else "fine"
+    rig = full_resolution(rig, flight)
+    sigma = state.coarse_sigma_m if coarse else state.sigma_m
+    weak = observations_per_camera(flight) < ENOUGH_OBSERVATIONS
+    placed = [
+        PlacedFrame(frame, rig.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
+        for i, frame in enumerate(flight.frames)
+        if i not in flight.pictures.damaged
+    ]
+    dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
+    lens = flight.adjustment.rig.lens[0]
+    return Solution(
+        state.vehicle,
+        placed,
+        dropped,
+        leg_states(state),
+        float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
+        state.fov_sigma_deg,
+        terrain,
+        0.0,
+        state.surface.lean,
+        state,
+        list(flight.warnings),
+        dict(state.timings),
+    )
+
+
+def full_resolution(rig: Rig, flight: Flight) -> Rig:
+    """A rig whose lenses are in pixels of the stored pictures instead of working pixels."""
+    frame = flight.frames[0]
+    scale = frame.width / flight.pictures.size[0]
+    lens = rig.lens.copy()
+    lens[:, [F, CX, CY]] *= scale
+    lens[:, WIDTH], lens[:, WIDTH + 1] = frame.width, frame.height
+    return replace(rig, lens=lens)
+
+
+def leg_states(state: VehicleState) -> list[Leg]:
+    """How the map held each leg: matched with enough agreeing ties of its own, else carried by the others."""
+    flight = state.flight
+    out = []
+    for k in range(int(flight.leg.max()) + 1 if len(flight.leg) else 0):
+        members = np.flatnonzero(flight.leg == k)
+        mine = flight.leg[state.matches.camera] == k
+        residual = flight.adjustment.tie_residual
+        agree = mine & (np.hypot(*residual.T) < 1.2) if len(residual) == len(mine) else mine
+        share = float(agree.sum()) / max(int(mine.sum()), 1)
+        matched = state.on_map and int(agree.sum()) >= LEG_TIES and share > 0.4
+        how: LegState = "matched" if matched else ("carried" if state.on_map else "failed")
+        sigma = float(np.median(state.sigma_m[members]))
+        out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))
+    return out
