@@ -1,0 +1,99 @@
+"""Tracks from pairwise matches: points of many photos joined into one, by union-find."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.kernels import kernel
+from orthoswarm.swarm.features import Features
+from orthoswarm.swarm.pairs import Pair
+from orthoswarm.swarm.rig import Tracks
+
+Ints = NDArray[np.int32]
+
+MAX_LENGTH = 20
+
+
+def build_tracks(features: Sequence[Features], pairs: Sequence[Pair], max_length: int = MAX_LENGTH) -> Tracks:
+    """Tracks of length 2 to `max_length` through all photos.
+
+    The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
+    one wrong match cannot glue two places together.
+
+    Args:
+        features: of each photo; the camera of an observation is the index here.
+        pairs: trusted matches.
+        max_length: longest track; longer ones stay in pieces.
+
+    Returns:
+        Tracks with positions in full pictures, ordered by camera, then point.
+    """
+    offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
+    photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
+    same = [f.same_point() for f in features]
+    joins: list[NDArray[np.int64]] = []
+    for pair in sorted(pairs, key=lambda p: (-len(p), p.first, p.second)):
+        a = offset[pair.first] + same[pair.first][pair.match[:, 0]]
+        b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
+        joins.append(np.stack([a, b], axis=1))
+    edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
+    root = _union(edges, photo, len(photo), max_length)
+    return _tracks(root, photo, features)
+
+
+def _tracks(root: NDArray[np.int64], photo: Ints, features: Sequence[Features]) -> Tracks:
+    _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
+    node = np.flatnonzero(count[inverse] >= 2)
+    uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
+    sigma = np.concatenate([f.sigma_px for f in features]) if len(features) else np.zeros(0, np.float32)
+    _, point = np.unique(inverse[node], return_inverse=True)
+    return Tracks(
+        camera=photo[node],
+        point=point.reshape(-1).astype(np.int32),
+        uv=uv[node].astype(np.float64),
+        sigma_px=sigma[node].astype(np.float32),
+    )
+
+
+@kernel
+def _find(parent, x):  # type: ignore[no-untyped-def]
+    while parent[x] != x:
+        parent[x] = parent[parent[x]]
+        x = parent[x]
+    return x
+
+
+@kernel
+def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
+    """Root of each node after joining along the edges in order; members of a root form a linked list."""
+    parent = np.arange(count)
+    following = np.full(count, -1)
+    tail = np.arange(count)
+    size = np.ones(count, np.int64)
+    for e in range(len(edges)):
+        a, b = _find(parent, edges[e, 0]), _find(parent, edges[e, 1])
+        if a == b or size[a] + size[b] > max_length:
+            continue
+        clash = False
+        x = a
+        while x >= 0 and not clash:
+            y = b
+            while y >= 0:
+                if photo[x] == photo[y]:
+                    clash = True
+                    break
+                y = following[y]
+            x = following[x]
+        if clash:
+            continue
+        if a > b:
+            a, b = b, a
+        parent[b] = a
+        following[tail[a]] = b
+        tail[a] = tail[b]
+        size[a] += size[b]
+    root = np.empty(count, np.int64)
+    for x in range(count):
+        root[x] = _find(parent, x)
+    return root

@@ -1,0 +1,52 @@
+"""Segments: runs of photos over which attitude bias and altitude offset stay the same."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+GAP_S = 180.0
+JUMP_M = 5.0
+TILT_JUMP_RAD = float(np.radians(1.5))
+
+
+def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, pitch_rad: Array) -> Ints:
+    """Number of the segment of each photo, int32 (N,), from 0 in order of first appearance.
+
+    A segment ends at a pause of more than 180 s (landing, battery), at a jump of the recorded height of more than 5 m
+    and at a jump of the recorded tilt of more than 1.5 degrees (the gimbal was turned). A jump that the very next photo
+    takes back is one wrong tag and ends nothing.
+
+    Args:
+        group: integers (N,), vehicle and lens; photos of a group stand in order of time.
+        time_s: float64 (N,), NaN where unknown.
+        height_m: float64 (N,), height or altitude, NaN where unknown.
+        pitch_rad: float64 (N,), NaN where unknown.
+    """
+    segment = np.zeros(len(group), np.int32)
+    used = 0
+    for g in dict.fromkeys(group.tolist()):
+        rows = np.flatnonzero(group == g)
+        cut = np.zeros(len(rows), bool)
+        cut[1:] = np.diff(time_s[rows]) > GAP_S
+        cut |= _jumps(height_m[rows], JUMP_M) | _jumps(pitch_rad[rows], TILT_JUMP_RAD)
+        number = np.cumsum(cut)
+        segment[rows] = used + number
+        used += int(number[-1]) + 1
+    return segment
+
+
+def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
+    """Where a sequence leaves its level by more than the limit and does not return at once."""
+    jump = np.zeros(len(value), bool)
+    known = np.flatnonzero(np.isfinite(value))
+    v = value[known]
+    level = 0
+    for k in range(1, len(v)):
+        if abs(v[k] - v[level]) <= limit:
+            level = k
+        elif k + 1 == len(v) or abs(v[k + 1] - v[level]) > limit:
+            jump[known[k]] = True
+            level = k
+    return jump
