@@ -173,9 +173,9 @@ def _noise_at(noise, x, y):  # type: ignore[no-untyped-def]
 @kernel
 def _water_color(noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
     """Moving water: an even tone with waves and glints that no two pictures share."""
-    wave = _noise_at(noise, x * 3.0 + motion[0], y * 3.0 + motion[1])
-    swell = _noise_at(noise, x * 0.9 + motion[2], y * 0.9 + motion[3])
-    glint = 150.0 * max(0.0, wave + 0.5 * swell - 0.62)
+    wave = _noise_at(noise, x * 17.0 + motion[0], y * 17.0 + motion[1])
+    swell = _noise_at(noise, x * 1.3 + motion[2], y * 1.3 + motion[3])
+    glint = 420.0 * max(0.0, wave + 0.7 * swell - 0.66)
     for i in range(3):
         rgb[i] = min(255.0, rgb[i] + 5.0 * wave + 4.0 * swell + glint)
 
