@@ -1,0 +1,117 @@
+"""Reading the mission out of a vehicle: MISSION_REQUEST_LIST, COUNT, REQUEST_INT and ITEM_INT, one after the other."""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.mavlink import Message, dialect
+from gcs_plugin.mission.exchange import Exchange, RoundTrip
+from gcs_plugin.mission.items import MissionItem
+from gcs_plugin.mission.refusal import ACCEPTED, DENIED
+
+_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
+_BUSY_S: Final = 1.0
+
+
+@dataclass(slots=True)
+class MissionDownload(Exchange):
+    """Asks for one item at a time (PX4 hands them out in order only) and asks again until it has them all.
+
+    Attributes:
+        patience_s: silence after which it gives up.
+        items: what the vehicle holds, None until all of it is here.
+    """
+
+    patience_s: float = 30.0
+    items: list[MissionItem] | None = field(default=None, init=False)
+    _count: int | None = field(default=None, init=False)
+    _got: dict[int, MissionItem] = field(default_factory=dict, init=False)
+    _trip: RoundTrip = field(default_factory=RoundTrip, init=False)
+    _asked_at: float = field(default=0.0, init=False)
+    _asked_again: bool = field(default=False, init=False)
+    _heard_at: float = field(default=0.0, init=False)
+    _refused: int = field(default=ACCEPTED, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Ask for the list."""
+        self._heard_at = now
+        return self._restart(now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Take MISSION_COUNT, items and refusals."""
+        kind = message.get_type()
+        if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
+            return []
+        if not self._for_us(message) or getattr(message, "mission_type", _MISSION) != _MISSION:
+            return []
+        if kind == "MISSION_COUNT":
+            return self._counted(int(message.count), now)
+        if kind in ("MISSION_ITEM_INT", "MISSION_ITEM"):
+            return self._received(message, now)
+        if kind == "MISSION_ACK" and message.type != ACCEPTED:
+            # Busy with an upload, or it has forgotten that we are reading: begin again a little later.
+            self._refused, self._count = int(message.type), None
+            self.deadline = now + _BUSY_S
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Ask again for what did not come."""
+        if self.outcome is not None or now < self.deadline:
+            return []
+        if now - self._heard_at > self.patience_s:
+            why = ", another ground station is using it" if self._refused == DENIED else ""
+            self._end(False, f"vehicle {self.vehicle.system} did not hand out its mission{why}; check the link")
+            return []
+        self._trip.missed()
+        return self._ask(now, again=True)
+
+    def rebooted(self, now: float) -> list[Message]:
+        """Begin again: the vehicle no longer knows that we are reading."""
+        return self._restart(now)
+
+    @property
+    def progress(self) -> float:
+        """Share of the items that are here."""
+        if self.outcome is not None:
+            return 1.0
+        return len(self._got) / self._count if self._count else 0.0
+
+    def _restart(self, now: float) -> list[Message]:
+        self._count = None
+        self._got.clear()
+        return self._ask(now, again=False)
+
+    def _ask(self, now: float, *, again: bool) -> list[Message]:
+        self._asked_at, self._asked_again = now, again
+        self.deadline = now + self._trip.wait_s
+        to = self.vehicle
+        if self._count is None:
+            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, _MISSION)]
+        seq = next(seq for seq in range(self._count) if seq not in self._got)
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, _MISSION)]
+
+    def _heard(self, now: float) -> None:
+        self._heard_at = now
+        if not self._asked_again:
+            self._trip.answered(now - self._asked_at)
+
+    def _counted(self, count: int, now: float) -> list[Message]:
+        if self._count == count and self._got:  # a copy of the first answer
+            return []
+        self._heard(now)
+        self._count = count
+        self._got.clear()
+        return self._ask(now, again=False) if count else self._finish()
+
+    def _received(self, message: Message, now: float) -> list[Message]:
+        seq = int(message.seq)
+        if self._count is None or seq >= self._count or seq in self._got:
+            return []
+        self._heard(now)
+        self._got[seq] = MissionItem.of(message)
+        return self._ask(now, again=False) if len(self._got) < self._count else self._finish()
+
+    def _finish(self) -> list[Message]:
+        self.items = [self._got[seq] for seq in range(self._count or 0)]
+        self._end(True, f"{len(self.items)} items were read from vehicle {self.vehicle.system}")
+        to = self.vehicle
+        return [dialect.MAVLink_mission_ack_message(to.system, to.component, ACCEPTED, _MISSION)]

@@ -1,0 +1,107 @@
+"""A dialogue with one vehicle as a state machine: messages and the time go in, messages come out.
+
+Whoever drives an exchange (the fleet, a test with a clock of its own) calls `start` once, `feed` for each message of
+the vehicle's autopilot, and `tick` at `deadline` at the latest, sends what comes back, and stops when `outcome` is set.
+Times are seconds of any clock that does not go backwards. Nothing here waits, so one thread serves a hundred vehicles.
+"""
+
+import abc
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message
+
+NEVER: Final = float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A MAVLink node: a system id and a component id."""
+
+    system: int
+    component: int = AUTOPILOT_COMPONENT
+
+
+# The usual address of a ground station; ArduPilot's failsafe watches system 255 unless it is told otherwise.
+GROUND_STATION: Final = Address(255, 190)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How an exchange ended.
+
+    Attributes:
+        ok: True if what was asked for is true in the vehicle now.
+        text: one sentence for the user.
+    """
+
+    ok: bool
+    text: str
+
+
+@dataclass(slots=True)
+class Exchange(abc.ABC):
+    """The common part of all dialogues.
+
+    Attributes:
+        vehicle: who is talked to.
+        own: who we are; replies to others are not ours.
+        outcome: None until it has ended.
+        deadline: when `tick` wants to be called next.
+    """
+
+    vehicle: Address
+    own: Address = GROUND_STATION
+    outcome: Outcome | None = field(default=None, init=False)
+    deadline: float = field(default=NEVER, init=False)
+
+    @abc.abstractmethod
+    def start(self, now: float) -> list[Message]:
+        """Begin; returns what is to be sent."""
+
+    @abc.abstractmethod
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Take a message of the vehicle; returns what is to be sent."""
+
+    @abc.abstractmethod
+    def tick(self, now: float) -> list[Message]:
+        """Let time pass; returns what is to be sent."""
+
+    def rebooted(self, now: float) -> list[Message]:
+        """The vehicle has started anew; returns what is to be sent. Most dialogues just go on asking."""
+        return []
+
+    @property
+    def progress(self) -> float:
+        """How far it is, 0 to 1."""
+        return 0.0 if self.outcome is None else 1.0
+
+    def _for_us(self, message: Message) -> bool:
+        return message.target_system in (self.own.system, BROADCAST) and message.target_component in (
+            self.own.component,
+            BROADCAST,
+        )
+
+    def _end(self, ok: bool, text: str) -> None:
+        self.outcome, self.deadline = Outcome(ok, text), NEVER
+
+
+@dataclass(slots=True)
+class RoundTrip:
+    """How long to wait for an answer before asking again: a few times what answers took, longer after silence.
+
+    Attributes:
+        wait_s: the time to wait now.
+    """
+
+    wait_s: float = 0.7
+    _smooth_s: float | None = None
+
+    def answered(self, took_s: float) -> None:
+        """An answer came to a question that was asked once."""
+        self._smooth_s = took_s if self._smooth_s is None else 0.8 * self._smooth_s + 0.2 * took_s
+        self.wait_s = min(2.0, max(0.2, 4.0 * self._smooth_s))
+
+    def missed(self) -> None:
+        """No answer came in time."""
+        self.wait_s = min(2.0, 1.4 * self.wait_s)

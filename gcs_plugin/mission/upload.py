@@ -1,0 +1,259 @@
+"""Putting a mission into a vehicle, and making sure that it is there.
+
+The vehicle leads: MISSION_COUNT makes it ask for one item after the other, in its own time, and it acknowledges at the
+end (https://mavlink.io/en/services/mission.html). Every one of these messages may be lost, doubled or late, so neither
+an acknowledgement nor its absence is believed: the mission is read back and compared. ArduPilot's store is not atomic;
+after a refusal or a time-out it holds a mixture of the old and the new mission, which must never pass for a success.
+
+What the acknowledgements mean in practice (measured): 13 (invalid sequence) answers a duplicate and is not the end; 1
+(error) answers a copy of the last item although the mission is stored, and PX4 while it is busy; 14 (denied) says that
+another ground station is uploading; 15 (cancelled) that the vehicle has waited too long.
+"""
+
+import enum
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.compare import difference
+from gcs_plugin.mission.download import MissionDownload
+from gcs_plugin.mission.exchange import Exchange
+from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.refusal import (
+    ACCEPTED,
+    CANCELLED,
+    DENIED,
+    ERROR,
+    INVALID_SEQUENCE,
+    NO_SPACE,
+    Refusal,
+    explain,
+)
+
+_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
+
+# Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): silence of a few of these means more than loss.
+_COUNT_AGAIN_S: Final = 1.0
+_SILENCE_S: Final = 4.0
+_LAST_SILENCE_S: Final = 3.0
+_AFTER_REFUSAL_S: Final = 0.3
+_DENIED_AGAIN_S: Final = 1.5
+_DOUBT_S: Final = 1.5
+# How often a store may differ after a whole upload before that is reported.
+_MIXTURES: Final = 4
+# Copies of one request within this time are the network's; a vehicle that misses an item waits longer.
+_SAME_REQUEST_S: Final = 0.03
+
+
+class Stage(enum.Enum):
+    """What the upload is waiting for."""
+
+    COUNT = "announced"
+    ITEMS = "sending"
+    PAUSE = "waiting"
+    VERIFY = "reading back"
+    DONE = "done"
+
+
+@dataclass(slots=True)
+class MissionUpload(Exchange):
+    """One upload; its outcome is ok only if the vehicle was seen to hold this mission and nothing else.
+
+    Attributes:
+        mission: what to upload.
+        patience_s: silence after which it gives up.
+        attempts: how often it begins anew (time-outs of the vehicle, reboots, a store that differs).
+        stage: what it is doing.
+        refusal: the vehicle's refusal in words, where the outcome is one.
+    """
+
+    mission: Mission = field(kw_only=True)
+    patience_s: float = field(default=30.0, kw_only=True)
+    attempts: int = field(default=12, kw_only=True)
+    stage: Stage = field(default=Stage.PAUSE, init=False)
+    refusal: Refusal | None = field(default=None, init=False)
+    _begun: int = field(default=0, init=False)
+    _heard_at: float = field(default=0.0, init=False)
+    _served: int = field(default=-1, init=False)
+    _answered: dict[int, float] = field(default_factory=dict, init=False)
+    _refused: Refusal | None = field(default=None, init=False)
+    _doubt: Refusal | None = field(default=None, init=False)
+    _denied: Refusal | None = field(default=None, init=False)
+    _mixed: str = field(default="", init=False)
+    _mixtures: int = field(default=0, init=False)
+    _touched: bool = field(default=False, init=False)
+    _reading: MissionDownload | None = field(default=None, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Announce the mission."""
+        self._heard_at = now
+        return self._announce(now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Take requests, acknowledgements and, while reading back, items."""
+        kind = message.get_type()
+        if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
+            return []
+        if not self._for_us(message) or getattr(message, "mission_type", _MISSION) != _MISSION:
+            return []
+        if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+            return self._requested(int(message.seq), now)
+        if kind == "MISSION_ACK":
+            return self._acknowledged(int(message.type), message, now)
+        if self._reading is not None:
+            return self._read(self._reading.feed(message, now), now)
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Repeat, begin anew, or give up."""
+        if self.outcome is not None or now < self.deadline:
+            return []
+        if self._reading is not None:
+            return self._read(self._reading.tick(now), now)
+        if now - self._heard_at > self.patience_s:
+            self.refusal = self._denied
+            if self._denied:
+                self._fail(f"denied the upload: {self._denied.reason}")
+            else:
+                self._fail("did not answer; check the link and its system id")
+            return []
+        if self._doubt is not None:
+            return self._nack(self._doubt, now)
+        if self.stage is Stage.ITEMS and self._served == len(self.mission) - 1:
+            return self._verify(now)
+        if self.stage is Stage.COUNT:
+            self.deadline = now + _COUNT_AGAIN_S
+            return [self._count_message()]
+        return self._announce(now)
+
+    def rebooted(self, now: float) -> list[Message]:
+        """Begin anew: a vehicle that restarts has forgotten the upload, and perhaps keeps half of it."""
+        return [] if self.outcome is not None else self._announce(now)
+
+    @property
+    def progress(self) -> float:
+        """Share of the work that is done; sending and reading back count half each."""
+        if self.outcome is not None:
+            return 1.0
+        if self._reading is not None:
+            return 0.5 + 0.5 * self._reading.progress
+        return 0.5 * (self._served + 1) / max(1, len(self.mission))
+
+    # --- sending ---
+
+    def _count_message(self) -> Message:
+        to = self.vehicle
+        return dialect.MAVLink_mission_count_message(to.system, to.component, len(self.mission), _MISSION)
+
+    def _announce(self, now: float) -> list[Message]:
+        self._begun += 1
+        if self._begun > self.attempts:
+            self._fail(self._mixed or f"did not take the mission in {self.attempts} attempts; check the link")
+            return []
+        self.stage, self._served, self._reading, self._doubt = Stage.COUNT, -1, None, None
+        self._answered.clear()
+        self.deadline = now + _COUNT_AGAIN_S
+        return [self._count_message()]
+
+    def _pause(self, now: float, wait_s: float) -> list[Message]:
+        self.stage, self._reading, self._doubt, self.deadline = Stage.PAUSE, None, None, now + wait_s
+        return []
+
+    def _requested(self, seq: int, now: float) -> list[Message]:
+        if seq >= len(self.mission) or self.stage is Stage.PAUSE or (self.stage is Stage.COUNT and seq > 0):
+            return []  # for another upload, or late from one before
+        self._heard_at, self._touched, self._denied, self._doubt = now, True, None, None
+        if now - self._answered.get(seq, -1.0) < _SAME_REQUEST_S:
+            return []
+        self._answered[seq] = now
+        if self._reading is None:
+            self.stage = Stage.ITEMS
+            if seq <= self._served + 1:  # a vehicle asks in order; what lies further ahead is a late copy
+                self._served = max(self._served, seq)
+            self.deadline = now + (_LAST_SILENCE_S if self._served == len(self.mission) - 1 else _SILENCE_S)
+        return [self.mission.items[seq].message(seq, self.vehicle.system, self.vehicle.component)]
+
+    def _acknowledged(self, code: int, message: Message, now: float) -> list[Message]:
+        if code != DENIED:
+            self._heard_at = now
+        all_sent = self._served == len(self.mission) - 1
+        if self._reading is not None:
+            if code == CANCELLED:  # it had still been waiting for an item
+                return self._announce(now)
+            return self._read(self._reading.feed(message, now), now)
+        if self.stage is Stage.PAUSE or code == INVALID_SEQUENCE:
+            return []
+        if self.stage is Stage.COUNT:
+            return self._answered_count(code, now)
+        if code == ACCEPTED:
+            return self._verify(now) if all_sent else []
+        if code == CANCELLED:
+            return self._announce(now)
+        refusal = explain(code, self.mission, self._served)
+        if code == ERROR:
+            # About this item, or about a copy of something: further requests, or what is stored, will tell.
+            self._doubt = refusal
+            if all_sent:
+                return self._verify(now)
+            self.deadline = now + _DOUBT_S
+            return []
+        return self._nack(refusal, now)
+
+    def _answered_count(self, code: int, now: float) -> list[Message]:
+        """An acknowledgement before the first request: about the count, or a late one from an upload before."""
+        if code in (NO_SPACE, DENIED):
+            return self._nack(explain(code, self.mission, None), now)
+        if code == ERROR:
+            return self._pause(now, _COUNT_AGAIN_S)
+        return self._verify(now) if code == ACCEPTED and not self.mission.items else []
+
+    def _nack(self, refusal: Refusal, now: float) -> list[Message]:
+        if refusal.code == DENIED:
+            self._denied = refusal
+            self._begun -= self.stage is Stage.COUNT  # waiting for another ground station is no attempt
+            return self._pause(now, _DENIED_AGAIN_S)
+        if self._refused is not None and (self._refused.code, self._refused.item) == (refusal.code, refusal.item):
+            self.refusal = refusal
+            self._fail(f"refused the mission: {refusal.reason}")
+            return []
+        self._refused, self._doubt = refusal, None
+        # Once may be a late acknowledgement of an upload before; twice is an answer.
+        return self._pause(now, _AFTER_REFUSAL_S)
+
+    # --- reading back ---
+
+    def _verify(self, now: float) -> list[Message]:
+        self.stage = Stage.VERIFY
+        self._reading = MissionDownload(self.vehicle, self.own, patience_s=self.patience_s)
+        return self._read(self._reading.start(now), now)
+
+    def _read(self, messages: list[Message], now: float) -> list[Message]:
+        reading = self._reading
+        assert reading is not None
+        self.deadline = reading.deadline
+        if reading.outcome is None:
+            return messages
+        self._heard_at = now
+        if reading.items is None:
+            self._fail("has the mission, perhaps: it could not be read back; upload again before flying")
+            return messages
+        wrong = difference(self.mission, reading.items)
+        if wrong is None:
+            self.stage = Stage.DONE
+            self._end(True, f"vehicle {self.vehicle.system} holds the mission: {len(self.mission)} items, read back")
+            return messages
+        if self._doubt is not None:
+            return messages + self._nack(self._doubt, now)
+        self._mixtures += 1
+        self._mixed = f"holds another mission than was sent: {wrong.text}; upload again before flying"
+        if self._mixtures >= _MIXTURES:
+            self._fail(self._mixed)
+        else:
+            self._pause(now, _AFTER_REFUSAL_S)
+        return messages
+
+    def _fail(self, text: str) -> None:
+        self.stage = Stage.DONE
+        mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and "upload again" not in text
+        warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
+        self._end(False, f"vehicle {self.vehicle.system} {text}{warning}")

@@ -1,0 +1,83 @@
+"""A bad radio link in memory: packets are lost, doubled and late, reproducibly, in a time of its own."""
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from random import Random
+from typing import Generic, TypeVar
+
+Cargo = TypeVar("Cargo")
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What a link does to packets, each on its own.
+
+    Attributes:
+        loss: share of packets that vanish, 0 to 1.
+        duplicate: share of packets that arrive twice.
+        delay_s: least and greatest delay; packets overtake each other within it.
+        silent: intervals (from, to) in seconds in which nothing gets through.
+        seed: equal seeds give equal faults.
+    """
+
+    loss: float = 0.0
+    duplicate: float = 0.0
+    delay_s: tuple[float, float] = (0.0, 0.0)
+    silent: tuple[tuple[float, float], ...] = ()
+    seed: int = 0
+
+    @property
+    def any(self) -> bool:
+        """True if the link does anything at all."""
+        return bool(self.loss or self.duplicate or self.delay_s[1] or self.silent)
+
+
+@dataclass(slots=True)
+class Channel(Generic[Cargo]):
+    """One direction of a link.
+
+    Attributes:
+        faults: what it does.
+        lost: packets that vanished; sent: packets that were put in.
+    """
+
+    faults: Faults
+    lost: int = 0
+    sent: int = 0
+    _random: Random = field(init=False)
+    _queue: list[tuple[float, int, Cargo]] = field(default_factory=list)
+    _order: "itertools.count[int]" = field(default_factory=itertools.count)
+
+    def __post_init__(self) -> None:
+        """Seed the faults."""
+        self._random = Random(self.faults.seed)
+
+    def put(self, cargo: Cargo, now: float) -> None:
+        """Send a packet."""
+        self.sent += 1
+        faults, random = self.faults, self._random
+        if random.random() < faults.loss or any(start <= now < end for start, end in faults.silent):
+            self.lost += 1
+            return
+        for _ in range(2 if random.random() < faults.duplicate else 1):
+            arrival = now + random.uniform(*faults.delay_s)
+            heapq.heappush(self._queue, (arrival, next(self._order), cargo))
+
+    def take(self, now: float) -> list[Cargo]:
+        """The packets that have arrived by now, in order of arrival."""
+        arrived: list[Cargo] = []
+        while self._queue and self._queue[0][0] <= now:
+            arrived.append(heapq.heappop(self._queue)[2])
+        return arrived
+
+    def drain(self, now: float, deliver: Callable[[Cargo], None]) -> None:
+        """Hand each packet that has arrived to a function."""
+        for cargo in self.take(now):
+            deliver(cargo)
+
+    @property
+    def next_arrival(self) -> float:
+        """When the next packet arrives, infinity if none is under way."""
+        return self._queue[0][0] if self._queue else float("inf")
