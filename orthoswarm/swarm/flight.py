@@ -16,6 +16,7 @@ from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.records import Records, read_records
 from orthoswarm.swarm.rig import Rig, Tracks
+from orthoswarm.swarm.sights import Sights, sights
 from orthoswarm.swarm.tracks import follow, predicted_homography
 
 Array = NDArray[np.float64]
@@ -43,6 +44,15 @@ class Flight:
     adjustment: Adjustment
     survived: Array
     warnings: list[str]
+
+    def rig(self) -> Rig:
+        """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
+        return self.adjustment.rig.take(slice(0, len(self.frames)))
+
+    def sights(self) -> Sights:
+        """Summaries of the points' observations; pictures are chosen among the vehicle's own."""
+        adj = self.adjustment
+        return sights(adj.rig, adj.tracks, adj.points, adj.obs_weight, np.arange(len(adj.rig)) < len(self.frames))
 
 
 def open_flight(

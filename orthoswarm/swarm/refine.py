@@ -18,12 +18,16 @@ from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow, Solution, Terrain
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight, open_flight
+from orthoswarm.swarm.groundwork import dense_points
+from orthoswarm.swarm.levels import level_network
+from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
-from orthoswarm.swarm.settle import settle
+from orthoswarm.swarm.settle import resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
-from orthoswarm.swarm.surface import Surface, fit_surface
-from orthoswarm.swarm.ties import MapMatches
+from orthoswarm.swarm.surface import Surface, fit_surface, ground_points
+from orthoswarm.swarm.terrain import fit_terrain
+from orthoswarm.swarm.ties import MapMatches, vote_lean
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -163,18 +167,119 @@ def refine_all(
     for n, state in enumerate(run(task, list(vehicles.values()))):
         states.append(state)
         if progress:
-            progress("fine" if basemap else "coarse", n + 1, len(vehicles))
+            progress("solo", n + 1, len(vehicles))
+    coarse = [to_solution(s, origin, None, coarse=True) for s in states]
+    states = _second_passes(states, basemap, origin, run, progress)
     terrain = common_terrain(states)
-    return Refined(
-        [to_solution(s, origin, terrain, coarse=True) for s in states],
-        [to_solution(s, origin, terrain) for s in states],
-        _shifted(terrain, origin),
+    return Refined(coarse, [to_solution(s, origin, terrain) for s in states], _shifted(terrain, origin))
+
+
+def _second_passes(
+    states: list[VehicleState],
+    basemap: MapWindow | None,
+    origin: Array,
+    run: Run,
+    progress: Callable[[str, int, int], None] | None,
+) -> list[VehicleState]:
+    """All vehicles again, on a common level and lean, each with its neighbours held as the solo pass left them."""
+    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
+    lean = pooled_lean(states)
+    items = [
+        (state, neighbours_of(state, states), float(correction))
+        for state, correction in zip(states, network.correction_m, strict=True)
+    ]
+    task = partial(second_pass, basemap=basemap, origin=origin, lean=lean)
+    out = []
+    for n, state in enumerate(run(task, items)):
+        out.append(state)
+        if progress:
+            progress("joint", n + 1, len(states))
+    return out
+
+
+def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
+    """The other vehicles whose paths come within sight of this one's."""
+    own = state.flight.adjustment.rig.position
+    reach = 1.5 * float(np.median(own[:, 2]))
+    low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
+    out = []
+    for other in states:
+        xy = other.flight.adjustment.rig.position[:, :2]
+        if other is not state and ((xy > low) & (xy < high)).all(1).any():
+            out.append(other)
+    return out
+
+
+def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
+    """The map's lean by vote over the roofs of all vehicles that lie on it; zero where they do not agree."""
+    mapped = [s for s in states if s.on_map]
+    if not mapped:
+        return (0.0, 0.0)
+    shifts = [s.roofs[0].shift - s.ground_shift for s in mapped]
+    roofs = [s.roofs[0] for s in mapped]
+    joint = MapMatches(
+        np.concatenate([r.point for r in roofs]),
+        np.concatenate([r.camera for r in roofs]),
+        np.concatenate(shifts),
+        np.concatenate([r.peak for r in roofs]),
+        np.concatenate([r.ratio for r in roofs]),
     )
+    return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
+
+
+def second_pass(
+    item: tuple[VehicleState, list[VehicleState], float],
+    *,
+    basemap: MapWindow | None,
+    origin: Array,
+    lean: tuple[float, float],
+) -> VehicleState:
+    """One vehicle again: common level and lean, links into held neighbours, fresh ties; then denser ground."""
+    state, others, correction = item
+    watch = Stopwatch()
+    flight = state.flight
+    state.surface = replace(state.surface, lean=lean, level_m=state.surface.level_m + correction)
+    held = held_cameras(state, others)
+    if held is not None:
+        link_to_held(flight, held, working_gsd(flight))
+    watch.lap("links to neighbours")
+    if state.on_map and basemap is not None:
+        again = resettle(flight, basemap, origin, state.surface, state.ties)
+        state.surface, state.ties, state.matches = again
+    else:
+        for _ in range(4):
+            flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
+    watch.lap("second adjustment")
+    adj = flight.adjustment
+    ties = state.ties if state.on_map else None
+    sigma, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, 0.05)
+    state.sigma_m = sigma[: len(flight.frames)]
+    release(flight)
+    watch.lap("sigma")
+    state.dense = dense_points(flight, state.surface)
+    watch.lap("denser terrain")
+    flight.pictures.drop()
+    for other in others:
+        other.flight.pictures.drop()
+    for name, seconds in watch.seconds.items():
+        state.timings[name] = state.timings.get(name, 0.0) + seconds
+    return state
 
 
 def common_terrain(states: Sequence[VehicleState]) -> Terrain | None:
-    """One surface over all vehicles for rendering, in the local frame."""
-    return states[0].surface.terrain() if states else None
+    """One surface over all vehicles for rendering, in the local frame; None where there are too few points."""
+    if not states:
+        return None
+    own = [ground_points(s.flight.adjustment) for s in states]
+    points = np.concatenate([p for p, _ in own] + [s.dense[0] for s in states])
+    sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
+    if len(points) < 60:
+        return states[0].surface.terrain()
+    path = np.concatenate([s.flight.adjustment.rig.position for s in states])
+    reach = 1.1 * float(np.median(path[:, 2]))
+    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
+    fit = fit_terrain(points, sigma, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+    return fit.rendering(float(np.median([s.surface.lift_m for s in states])))
 
 
 def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:

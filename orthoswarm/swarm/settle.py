@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Adjustment, Ties
 from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.groundwork import with_lift
 from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.onmap import shift_cameras
 from orthoswarm.swarm.rig import Tracks
+from orthoswarm.swarm.sights import one_per_cell
 from orthoswarm.swarm.surface import Surface, fit_surface
-from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, one_per_cell, sights, vote_lean
+from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, vote_lean
 
 Array = NDArray[np.float64]
 
@@ -27,20 +29,21 @@ class Settled:
     Attributes:
         surface: the ground, with the map's lean. ties: the last round's. matches: the matches they come from.
         roofs: matches of raised points and their heights, for a vote over several vehicles.
-        ground: the map at working resolution. links: observations added between legs.
+        ground_shift: (2,) what ground points were off by when the roofs were matched.
+        links: observations added between legs.
     """
 
     surface: Surface
     ties: Ties
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
-    ground: LoadedMap
+    ground_shift: Array
     links: int
 
 
 def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
     """The map under a vehicle's pictures, with a margin for the search."""
-    rig = flight.adjustment.rig
+    rig = flight.rig()
     height = float(np.median(rig.position[:, 2]))
     reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(rig.lens[0, 0]) + 40.0
     low, high = rig.position[:, :2].min(0) - reach, rig.position[:, :2].max(0) + reach
@@ -52,7 +55,7 @@ def tie_round(
 ) -> MapMatches:
     """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`."""
     adj = flight.adjustment
-    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    seen = flight.sights()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
     usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
     leg = flight.leg[np.maximum(seen.camera, 0)]
@@ -87,7 +90,7 @@ def as_ties(matches: MapMatches, points: Array) -> Ties:
 def roof_round(flight: Flight, surface: Surface, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Raised points found on the map, and their heights over the ground."""
     adj = flight.adjustment
-    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    seen = flight.sights()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
     usable = (seen.camera >= 0) & (seen.count >= 6) & (seen.mean_weight > 0.5) & (height > 4.0) & (height < 40.0)
     leg = flight.leg[np.maximum(seen.camera, 0)]
@@ -101,7 +104,7 @@ def roof_round(flight: Flight, surface: Surface, ground: LoadedMap) -> tuple[Map
 def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
     """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
     adj = flight.adjustment
-    seen = sights(adj.rig, adj.tracks, adj.points, adj.obs_weight)
+    seen = flight.sights()
     usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), cell_m)
@@ -149,27 +152,44 @@ def settle(
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
         if k in (1, 3):
-            surface = fit_surface(flight.adjustment, surface)
+            surface = with_lift(flight, fit_surface(flight.adjustment, surface))
     roofs = roof_round(flight, surface, ground)
-    voted = (
-        vote_lean(roofs[0], roofs[1], mode_shift(ties.xy - flight.adjustment.points[ties.point, :2]))
-        if lean is None
-        else lean
-    )
+    ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
+    voted = vote_lean(roofs[0], roofs[1], ground_shift) if lean is None else lean
     surface = replace(surface, lean=voted or (0.0, 0.0))
-    links = add_links(flight, map_gsd(flight, basemap))
+    links = add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    surface, ties, matches = _second_round(flight, ground, surface, 6)
+    return Settled(surface, ties, matches, roofs, ground_shift, links)
+
+
+def resettle(
+    flight: Flight, basemap: MapWindow, origin: Array, surface: Surface, ties: Ties
+) -> tuple[Surface, Ties, MapMatches]:
+    """Fresh ties and four iterations, for a flight that lies on the map already (level or lean may have moved)."""
+    for _ in range(2):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)
+
+
+def _second_round(flight: Flight, ground: LoadedMap, surface: Surface, rounds: int) -> tuple[Surface, Ties, MapMatches]:
     matches = accepted(tie_round(flight, surface, ground, 30.0, 5.0))
     ties = as_ties(matches, flight.adjustment.points)
-    for k, c in enumerate((9.0, 6.0, 6.0, 6.0, 6.0, 6.0)):
-        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
-        if k in (0, 2, 4):
-            surface = fit_surface(flight.adjustment, surface)
-    return Settled(surface, ties, matches, roofs, ground, links)
+    for k in range(rounds):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
+        if k % 2 == 0:
+            surface = with_lift(flight, fit_surface(flight.adjustment, surface))
+    return surface, ties, matches
+
+
+def working_gsd(flight: Flight) -> float:
+    """Pixel for comparing pictures with each other: about their own."""
+    rig = flight.rig()
+    return 1.07 * float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
 
 
 def map_gsd(flight: Flight, basemap: MapWindow) -> float:
     """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
-    rig = flight.adjustment.rig
+    rig = flight.rig()
     picture = float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
     return float(np.clip(max(picture, basemap.native_gsd_m), 0.25, 2.0)) if picture < 0.4 else max(0.5, picture)

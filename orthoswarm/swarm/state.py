@@ -27,7 +27,9 @@ class VehicleState:
     Attributes:
         vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used.
         surface: its ground. ties, matches: of the last round (empty without a map).
-        roofs: raised points on the map and their heights. dense: extra ground points (K, 3) and sigmas (K,).
+        roofs: raised points on the map and their heights;
+            ground_shift: float64 (2,) what ground points were off by then.
+        dense: extra ground points (K, 3) and sigmas (K,).
         on_map: True if it lies on the map. sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -46,6 +48,7 @@ class VehicleState:
     coarse_sigma_m: Array
     fov_sigma_deg: float
     timings: dict[str, float] = field(default_factory=dict)
+    ground_shift: Array = field(default_factory=lambda: np.zeros(2))
 
 
 class Stopwatch:
