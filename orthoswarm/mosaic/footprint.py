@@ -1,0 +1,153 @@
+"""What a camera sees of the ground: convex footprints, the limit of sane view angles, and frames that are absurd."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.camera import Camera, Lens
+
+Array = NDArray[np.float64]
+
+MAX_OFF_NADIR_RAD = np.radians(75.0)
+"""Ground seen at a flatter angle is left out: there a pixel is smeared over more than 15 times its size at nadir."""
+MAX_MAGNIFICATION = 16.0
+"""A frame whose pixel at nadir is this many times the map's is no picture of this flight (an altitude gone wrong)."""
+
+
+def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
+    """The median ground pixel at nadir, metres: height over the ground / focal length.
+
+    Raises:
+        ValueError: if no camera is above the ground.
+    """
+    heights = np.array([c.position[2] for c in cameras], float) - ground_z_m
+    focal = np.array([c.lens.focal_px for c in cameras], float)
+    if not (heights > 0).any():
+        raise ValueError("no camera is above the ground")
+    return float(np.median(heights[heights > 0] / focal[heights > 0]))
+
+
+def rejection(camera: Camera, ground_z_m: float, gsd_m: float) -> str | None:
+    """Why a frame cannot be drawn on a map of a ground pixel, one clause; None if it can.
+
+    Args:
+        camera: where its camera is.
+        ground_z_m: height of the ground below.
+        gsd_m: the map's ground pixel.
+    """
+    numbers = (*camera.position, *camera.rotation.ravel(), camera.lens.focal_px)
+    if not np.isfinite(numbers).all() or camera.lens.focal_px <= 0:
+        return "its pose is not a number"
+    height = float(camera.position[2]) - ground_z_m
+    if height <= 0.0:
+        return f"its camera is not above the ground (height {height:.1f} m)"
+    if height / camera.lens.focal_px > MAX_MAGNIFICATION * gsd_m:
+        return f"it is {height:.0f} m above the ground, far higher than the others: the altitude must be wrong"
+    if len(footprint(camera, ground_z_m)) == 0:
+        return "it looks at the horizon or above, and not at the ground"
+    return None
+
+
+def _border(lens: Lens, per_side: int, inset_px: float) -> Array:
+    """Undistorted normalised points (4 per_side, 2) around the picture, clockwise from the upper left."""
+    w, h = lens.width - 1.0 - inset_px, lens.height - 1.0 - inset_px
+    t = np.arange(per_side) / per_side
+    i = inset_px
+    along_x, along_y = i + (w - i) * t, i + (h - i) * t
+    u = np.concatenate([along_x, np.full(per_side, w), along_x[::-1] + (w - i) / per_side, np.full(per_side, i)])
+    v = np.concatenate([np.full(per_side, i), along_y, np.full(per_side, h), along_y[::-1] + (h - i) / per_side])
+    xy = (np.stack([u, v], -1) - np.array(lens.principal_point)) / lens.focal_px
+    return xy if lens.is_pinhole else lens.undistort(xy)
+
+
+def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) -> Array:
+    """The ground that a camera sees on a level plane, a closed polygon float64 (K, 2), K = 0 if none.
+
+    Without distortion it is exact and convex, clipped where the view is flatter than MAX_OFF_NADIR_RAD allows
+    (along a straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border is
+    densified, 8 points a side, and the polygon may be slightly concave.
+
+    Args:
+        camera: where it is.
+        ground_z_m: the plane's height.
+        inset_px: how far inside the outermost pixel centres; -0.5 is the picture's very edge.
+    """
+    height = float(camera.position[2]) - ground_z_m
+    xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ camera.rotation.T
+    rays = _clip(rays, float(np.cos(MAX_OFF_NADIR_RAD)))
+    if len(rays) < 3 or height <= 0:
+        return np.empty((0, 2))
+    return np.asarray(camera.position[:2] + rays[:, :2] * (height / -rays[:, 2:]))
+
+
+def _clip(rays: Array, least: float) -> Array:
+    """The part of a closed polygon of rays (K, 3) that goes down by at least so much per unit of depth."""
+    down = -rays[:, 2] - least
+    if (down >= 0).all():
+        return rays
+    kept = []
+    for i in range(len(rays)):
+        j = (i + 1) % len(rays)
+        if down[i] >= 0:
+            kept.append(rays[i])
+        if (down[i] >= 0) != (down[j] >= 0):
+            kept.append(rays[i] + (rays[j] - rays[i]) * (down[i] / (down[i] - down[j])))
+    return np.array(kept).reshape(-1, 3)
+
+
+def reach(camera: Camera, ground_z_m: float = 0.0) -> float:
+    """Greatest distance from the nadir point at which the ground is drawn, metres."""
+    return float(np.tan(MAX_OFF_NADIR_RAD)) * (float(camera.position[2]) - ground_z_m)
+
+
+def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> Array:
+    """Boxes float64 (N, 4), west, south, east, north, that hold what each camera sees of ground between two heights.
+
+    West > east where a camera sees nothing.
+    """
+    boxes = np.full((len(cameras), 4), np.nan)
+    limit = float(np.cos(MAX_OFF_NADIR_RAD))
+    groups: dict[Lens, list[int]] = {}
+    for i, camera in enumerate(cameras):
+        groups.setdefault(camera.lens, []).append(i)
+    for lens, index in groups.items():
+        xy = _border(lens, 1 if lens.is_pinhole else 8, 0.0)
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], 1)
+        rotation = np.stack([cameras[i].rotation for i in index])
+        position = np.stack([cameras[i].position for i in index]).astype(float)
+        down = rays @ rotation.transpose(0, 2, 1)  # (n, K, 3)
+        level = (-down[..., 2] >= limit).all(1)
+        for z in (z_low, z_high):
+            drop = (position[:, 2] - z)[:, None, None] / np.maximum(-down[..., 2:], limit)
+            ground = position[:, None, :2] + down[..., :2] * drop
+            for j in np.nonzero(~level)[0]:
+                oblique = footprint(cameras[index[j]], z)
+                ground[j] = oblique[np.arange(len(xy)) % len(oblique)] if len(oblique) else np.nan
+                if len(oblique) > len(xy):  # clipping adds a corner
+                    ground[j, :2] = oblique.min(0), oblique.max(0)
+            low, high = ground.min(1), ground.max(1)
+            if not lens.is_pinhole:  # the border bows out between the points
+                low, high = low - 0.01 * (high - low), high + 0.01 * (high - low)
+            old = boxes[index]
+            boxes[index] = np.concatenate([np.fmin(old[:, :2], low), np.fmax(old[:, 2:], high)], 1)
+    return np.where(np.isnan(boxes), np.array([np.inf, np.inf, -np.inf, -np.inf]), boxes)
+
+
+def half_planes(polygon: Array) -> Array:
+    """The convex polygon (K, 2) as rows (a, b, c) with a x + b y <= c inside, float64 (K, 3), either winding."""
+    following = np.roll(polygon, -1, 0)
+    edge = following - polygon
+    area = float((polygon[:, 0] * following[:, 1] - following[:, 0] * polygon[:, 1]).sum())
+    normal = np.stack([edge[:, 1], -edge[:, 0]], 1) * (1.0 if area > 0 else -1.0)
+    return np.asarray(np.concatenate([normal, (normal * polygon).sum(1, keepdims=True)], 1))
+
+
+def convex(polygon: Array) -> Array:
+    """The convex hull (K, 2) of points, counter-clockwise."""
+    import cv2
+
+    origin = polygon.mean(0)
+    hull = cv2.convexHull((polygon - origin).astype(np.float32), clockwise=False)[:, 0]
+    return np.asarray(np.asarray(hull, np.float64) + origin)

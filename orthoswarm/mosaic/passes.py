@@ -1,0 +1,199 @@
+"""The two passes of the renderer as functions of one picklable argument, so that they can run in any process.
+
+A label task owns one tile; sample tasks write disjoint pixels (their own labels) of tiles that they may share.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.geo import GroundGrid
+from orthoswarm.mosaic.labels import label_tile, label_windows
+from orthoswarm.mosaic.lattice import Shots, heights
+from orthoswarm.mosaic.reduce import reduced
+from orthoswarm.mosaic.sample import sample
+from orthoswarm.mosaic.tiles import Key, TileStore
+from orthoswarm.picture import PictureError
+from orthoswarm.placement import Terrain
+
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int32]
+Read = Callable[[Path], Bytes]
+
+THUMBNAIL = (12, 16)
+"""Rows and columns of a picture's thumbnail."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where tiles are: their folder, their side, and the grid under them."""
+
+    folder: Path
+    tile_px: int
+    grid: GroundGrid
+
+    def store(self) -> TileStore:
+        """The tiles, mapped in small number: tasks walk from tile to tile."""
+        return TileStore(self.folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
+
+    def corner(self, key: Key) -> tuple[float, float]:
+        """West and north of a tile."""
+        side = self.tile_px * self.grid.gsd_m
+        return self.grid.west + key[1] * side, self.grid.north - key[0] * side
+
+    def shape(self, key: Key) -> tuple[int, int]:
+        """Rows and columns of a tile that lie in the grid."""
+        return (
+            min(self.tile_px, self.grid.height - key[0] * self.tile_px),
+            min(self.tile_px, self.grid.width - key[1] * self.tile_px),
+        )
+
+    def heights(self, key: Key, terrain: Terrain) -> NDArray[np.float32]:
+        """A tile's lattice of heights."""
+        return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where in a tile a frame won: rows row0 to row1, columns col0 to col1, and how many pixels."""
+
+    key: Key
+    row0: int
+    row1: int
+    col0: int
+    col1: int
+    pixels: int
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTask:
+    """Label a tile.
+
+    Attributes:
+        place: where. key: the tile.
+        ids: int32 (K,), indices of the candidate frames. shots: their cameras.
+        terrain: the ground there.
+        again: int32, frames that turned out to be unreadable: only their pixels are labelled anew.
+    """
+
+    place: Place
+    key: Key
+    ids: Ints
+    shots: Shots
+    terrain: Terrain
+    again: Ints
+
+
+def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
+    """Label a tile in its file (frame index + 1); gives what each frame won, frames in order."""
+    place, store = task.place, task.place.store()
+    rows, cols = place.shape(task.key)
+    local = np.zeros((rows, cols), np.int32)
+    old = store.get(task.key) if len(task.again) else None
+    if old is not None:
+        owner = old.plane[:rows, :cols]
+        lost = np.isin(owner, task.again + 1)
+        local[~lost] = -1
+        old.rgba[:rows, :cols][lost] = 0
+        owner[lost] = 0
+    marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
+    lattice = place.heights(task.key, task.terrain)
+    label_tile(local, task.shots, marks, lattice, *place.corner(task.key), place.grid.gsd_m)
+    boxes = label_windows(local, len(task.ids))
+    won = np.nonzero(boxes[:, 4])[0]
+    if len(won):
+        tile = store.get(task.key, create=True)
+        assert tile is not None
+        mine = local > 0
+        tile.plane[:rows, :cols][mine] = (task.ids + 1)[local[mine] - 1]
+    return [(int(task.ids[k]), Window(task.key, *map(int, boxes[k]))) for k in won]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A picture to sample.
+
+    Attributes:
+        index: of its frame. path: its file.
+        gain: float32 (3,), factor of its colours. factor: how much to reduce it first.
+        windows: where it won.
+    """
+
+    index: int
+    path: Path
+    gain: NDArray[np.float32]
+    factor: int
+    windows: list[Window]
+
+
+@dataclass(frozen=True, slots=True)
+class SampleTask:
+    """Read pictures and colour what they won.
+
+    Attributes:
+        place: where. pictures: what to read. shots: their cameras, in the same order.
+        terrain: the ground by tile. read: reads a picture.
+    """
+
+    place: Place
+    pictures: list[Shot]
+    shots: Shots
+    terrain: dict[Key, Terrain]
+    read: Read
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """What became of a picture: its thumbnail, or the reason why it could not be used."""
+
+    index: int
+    thumbnail: Bytes | None
+    reason: str | None = None
+
+
+def sample_pass(task: SampleTask) -> list[Sampled]:
+    """Colour the pixels of some frames in the tiles' files, each picture read once."""
+    place, store = task.place, task.place.store()
+    lattices = {key: place.heights(key, terrain) for key, terrain in task.terrain.items()}
+    about = {key: task.shots.about(*place.corner(key)) for key in task.terrain}
+    results = []
+    for k, shot in enumerate(task.pictures):
+        lens = task.shots.lens[k]
+        try:
+            picture = _read(task.read, shot.path, task.shots.size[k])
+        except OrthoSwarmError as error:
+            results.append(Sampled(shot.index, None, str(error)))
+            continue
+        small, factor = reduced(picture, shot.factor)
+        for w in shot.windows:
+            tile = store.get(w.key)
+            assert tile is not None
+            position, rotation = about[w.key]
+            window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
+            sample(
+                tile.rgba, tile.plane, shot.index + 1, window, position[k], rotation[k], lens, lattices[w.key],
+                place.grid.gsd_m, small, factor, shot.gain,
+            )  # fmt: skip
+        results.append(Sampled(shot.index, thumbnail(small)))
+    return results
+
+
+def _read(read: Read, path: Path, size: Ints) -> Bytes:
+    picture = read(path)
+    if picture.shape[:2] != (size[1], size[0]):
+        raise PictureError(
+            f"{path.name} is {picture.shape[1]}x{picture.shape[0]} pixels and not {size[0]}x{size[1]} as it was; "
+            "do not change pictures while they are mapped"
+        )
+    return np.ascontiguousarray(picture[..., :3])
+
+
+def thumbnail(picture: Bytes) -> Bytes:
+    """The means of a picture's parts, uint8 (12, 16, 3)."""
+    import cv2
+
+    return np.asarray(cv2.resize(picture, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA))
