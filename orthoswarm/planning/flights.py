@@ -1,0 +1,94 @@
+"""One flight from its legs: way out, legs with the ways between, way home, in grid metres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.planning.motion import Motion, length, turns
+from orthoswarm.planning.routes import Router
+
+Array = NDArray[np.float64]
+
+_SAME_M = 0.05
+
+
+@dataclass(frozen=True)
+class Flight:
+    """The path of one sortie.
+
+    Attributes:
+        home: float64 (2,), where it takes off.
+        climb_m: height to climb to at home.
+        points: float64 (n, 3), waypoints: easting, northing, height above takeoff.
+        camera: int8 (n,): 1 at a leg's first point, -1 at its last, else 0.
+        returns: the last point is above home, and the vehicle comes down there.
+    """
+
+    home: Array
+    climb_m: float
+    points: Array
+    camera: NDArray[np.int8]
+    returns: bool
+
+    def track(self) -> Array:
+        """The whole path from the ground on, (n, 3)."""
+        up = [[*self.home, 0.0], [*self.home, self.climb_m]]
+        down = [[*self.home, 0.0]] if self.returns else np.empty((0, 3))
+        return np.concatenate([up, self.points, down])
+
+    def time_s(self, motion: Motion) -> float:
+        """Seconds from takeoff to the end."""
+        return float(motion.times(self.track())[-1])
+
+    @property
+    def length_m(self) -> float:
+        """Horizontal metres flown."""
+        return length(self.track())
+
+    @property
+    def turns(self) -> int:
+        """Changes of direction by more than ten degrees."""
+        return turns(self.track())
+
+    @property
+    def items(self) -> int:
+        """Mission items that it needs: waypoints, camera commands, home, takeoff, speed and the end."""
+        return len(self.points) + int(np.count_nonzero(self.camera)) + 4
+
+
+def make_flight(legs: Array, home: Array, altitude_m: float, layer_m: float, router: Router, returns: bool) -> Flight:
+    """The flight over a row of legs.
+
+    Args:
+        legs: float64 (n, 2, 2) in flying order.
+        home: float64 (2,).
+        altitude_m: height of the legs and of the ways between them.
+        layer_m: how much higher the way out and the way home are.
+        router: finds ways around obstacles.
+        returns: fly back above home at the end.
+    """
+    points: list[Array] = []
+    camera: list[int] = []
+
+    def add(path: Array, height: float, mark: int = 0) -> None:
+        for point in path:
+            points.append(np.array([*point, height]))
+            camera.append(mark)
+
+    far = float(np.hypot(*(legs[0, 0] - home))) > _SAME_M
+    high = altitude_m + layer_m
+    if far:
+        add(router.path(home, legs[0, 0])[1:-1], high)
+        if layer_m > 0.0:
+            add(legs[:1, 0], high)
+    for k, (start, end) in enumerate(legs):
+        if k:
+            add(router.path(legs[k - 1, 1], start)[1:-1], altitude_m)
+        add(start[None], altitude_m, 1)
+        add(end[None], altitude_m, -1)
+    if returns:
+        if layer_m > 0.0:
+            add(legs[-1:, 1], high)
+        add(router.path(legs[-1, 1], home)[1:], high)
+    return Flight(home, high if far else altitude_m, np.array(points), np.array(camera, np.int8), returns)
