@@ -10,6 +10,8 @@ from orthoswarm.errors import OrthoSwarmError
 
 # verb -> one line of help; the module is gcs_plugin.commands.<verb>, with configure(parser) and run(args) -> int.
 VERBS = {
+    "mosaic": "make a georeferenced orthoimage from drone photos",
+    "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
     "twin": "make a set of photos, map and truth of a digital twin city",
     "evaluate": "measure an orthoimage against a reference, and poses against truth",
     "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",

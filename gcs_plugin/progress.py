@@ -1,0 +1,50 @@
+"""Progress bars with the time left, on stderr; silent where stderr is no terminal, but for a line per stage."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Any
+
+
+class ProgressBars:
+    """One bar a stage; call it with what is being done, how many are done, how many there are."""
+
+    def __init__(self) -> None:
+        self._bars: Any = None
+        self._tasks: dict[str, Any] = {}
+        self._shown = 0.0
+
+    def __enter__(self) -> "ProgressBars":
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            self._bars = Progress(
+                TextColumn("{task.description:<24}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(elapsed_when_finished=True),
+                console=Console(stderr=True),
+                refresh_per_second=4,
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show progress."""
+        if self._bars is None:
+            if done >= total > 0 and what not in self._tasks:
+                self._tasks[what] = True
+                print(f"{what}: {total}", file=sys.stderr, flush=True)
+            return
+        now = time.monotonic()
+        if what not in self._tasks:
+            self._tasks[what] = self._bars.add_task(what, total=total)
+        elif now - self._shown < 0.1 and done < total:
+            return
+        self._shown = now
+        self._bars.update(self._tasks[what], completed=done, total=total)

@@ -1,0 +1,436 @@
+"""The batch: from frames to orthoimages, placements and report, stage by stage, each stage resumable.
+
+load -> real time (paper III.B) -> coarse and fine refinement, vehicle by vehicle (III.C, III.D) -> final pictures.
+"""
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.basemap import Basemap, Bounds
+from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.export.cog import TILE_PX, write_cog
+from orthoswarm.frame import Frame, Ingest, Rejection
+from orthoswarm.geo import GroundGrid, LocalGrid
+from orthoswarm.mosaic.canvas import Canvas
+from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.realtime import mosaic
+from orthoswarm.mosaic.render import RenderStats, render
+from orthoswarm.placement import PlacedFrame, Solution, Terrain
+from orthoswarm.products import leg_rows, vehicle_rows, write_frames, write_json
+from orthoswarm.recorded import Recorded, area_grid, recorded_cameras
+from orthoswarm.stages import Clock, Stage
+from orthoswarm.workers import Workers
+from orthoswarm.workspace import Workspace, run_key
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many are done, how many there are."""
+Load = Callable[[Progress], Ingest]
+
+REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
+PRODUCTS = (REALTIME, COARSE, ORTHOIMAGE, "frames.jsonl", "footprints.gpkg", "report.json", "report.html")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to make of the frames.
+
+    Attributes:
+        basemap: the pre-disaster map, None to stay in the receivers' frame.
+        refine: which refiner. until: the last stage to run.
+        fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
+        gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
+        dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
+        gains: even out brightness between pictures.
+    """
+
+    basemap: Path | None = None
+    refine: Literal["swarm", "paper"] = "swarm"
+    until: Literal["realtime", "coarse", "fine"] = "fine"
+    fov_min_deg: float | None = None
+    gsd_m: float | None = None
+    dem: Path | None = None
+    split_legs: bool = False
+    gains: bool = True
+
+
+@dataclass(slots=True)
+class _Refinement:
+    """What the refiner made: cameras before and after the map, the ground, and the stages' times."""
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None
+
+
+@dataclass(slots=True)
+class _State:
+    """What is known so far in a run."""
+
+    ingest: Ingest
+    grid: LocalGrid
+    recorded: Recorded
+    gsd_m: float
+    basemap: Basemap | None
+    warnings: list[str] = field(default_factory=list)
+    rejected: dict[str, Rejection] = field(default_factory=dict)
+
+
+def run(load: Load, out: Path, options: Options, workers: Workers, progress: Progress) -> dict[str, Any]:
+    """Make all products of a set of inputs.
+
+    Args:
+        load: reads the inputs, calling a progress function meanwhile.
+        out: output folder; holds `PRODUCTS` afterwards.
+        options: see Options.
+        workers: where work runs; the products do not depend on their number.
+        progress: called during long work.
+
+    Returns:
+        The content of report.json.
+
+    Raises:
+        InputError: if the inputs hold no picture with a position, or the basemap is of no use.
+        OrthoSwarmError: if nothing could be made.
+    """
+    return _Batch(out, options, workers, progress).run(load)
+
+
+class _Batch:
+    """One run: what its stages share."""
+
+    def __init__(self, out: Path, options: Options, workers: Workers, progress: Progress) -> None:
+        self.out, self.options, self.workers, self.progress = out, options, workers, progress
+        self.clock = Clock(workers.usage)
+
+    def run(self, load: Load) -> dict[str, Any]:
+        if self.options.basemap is not None and not self.options.basemap.exists():
+            raise InputError(f"the basemap {self.options.basemap} does not exist; check the path")
+        with Workspace(self.out) as self.space:
+            with self.clock.stage("load") as stage:
+                state = self.load(load)
+                stage.items = len(state.ingest.frames) + len(state.ingest.rejected)
+            if self.space.begin(run_key(state.ingest.frames, self.options)):
+                state.warnings.append("this run was interrupted before and was continued")
+            placed = self.realtime(state)
+            refinement = None
+            if self.options.until != "realtime":
+                refinement = self.refine(state)
+                placed = self.pictures(state, refinement)
+            report = self.finish(state, placed, refinement)
+            self.space.complete()
+        return report
+
+    # -- stages ---------------------------------------------------------------------------------------------------
+
+    def load(self, load: Load) -> _State:
+        """Frames, grid, recorded cameras, ground pixel, basemap."""
+        ingest = load(self.progress)
+        if not ingest.frames:
+            raise InputError(_nothing_to_map(ingest))
+        grid = area_grid(ingest.frames)
+        if self.options.split_legs:
+            ingest = replace(ingest, frames=split_legs(ingest.frames, grid))
+        fov = self.options.fov_min_deg
+        recorded = recorded_cameras(ingest.frames, grid, None if fov is None else float(np.radians(fov)))
+        cameras = [p.camera for p in recorded.placed]
+        gsd = self.options.gsd_m or default_gsd(cameras)
+        basemap = None
+        warnings = [*ingest.warnings, *recorded.warnings]
+        if self.options.basemap is not None:
+            near = _bounds(recorded.placed, 0.0, 0.0)
+            basemap = Basemap.open(self.options.basemap, grid.epsg, near)
+            warnings += _partial_cover(basemap, cameras)
+        rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
+        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected)
+
+    def realtime(self, state: _State) -> list[PlacedFrame]:
+        """The picture from recorded poses; the frames that it holds."""
+        placed = state.recorded.placed
+        known = self.space.recall("realtime")
+        if known is not None and (self.out / REALTIME).exists():
+            stats, stage = known
+            self.clock.stages.append(stage)
+        else:
+            with self.clock.stage("realtime", len(placed)) as stage:
+                stats = self.draw(REALTIME, placed, Terrain.flat(), state, realtime=True)
+            if not stats.pixels.any():
+                reason = next(iter(stats.rejected.values()), "no picture sees the ground")
+                raise OrthoSwarmError(f"no picture could be drawn: {reason}")
+            self.space.remember("realtime", (replace(stats, thumbnails={}), stage))
+        if self.options.until == "realtime":
+            self.leave_out(state, stats.rejected, placed)
+        return [p for p in placed if p.frame.image not in stats.rejected]
+
+    def refine(self, state: _State) -> _Refinement | None:
+        """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
+        known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
+        if known is not None:
+            self.clock.stages += known[1]
+            return known[0]
+        outer = Clock(self.workers.usage)
+        frames = [p.frame for p in state.recorded.placed]
+        with outer.stage("refine", len(frames)) as stage:
+            try:
+                refinement = self.call_refiner(frames, state)
+            except OrthoSwarmError as error:
+                state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
+                return None
+        stages = _split_time(stage, refinement, self.options.until, state.basemap is not None)
+        self.clock.stages += stages
+        self.space.remember("refinement", (refinement, stages))
+        return refinement
+
+    def call_refiner(self, frames: Sequence[Frame], state: _State) -> _Refinement:
+        from orthoswarm.swarm.refine import refine_all
+
+        vehicles: dict[str, list[Frame]] = {}
+        for frame in frames:
+            vehicles.setdefault(frame.vehicle, []).append(frame)
+        basemap = state.basemap if self.options.until == "fine" else None
+        run = self.space.remembering("vehicle", self.workers.map)
+        refined = refine_all(vehicles, basemap, state.grid, run=run, progress=self.progress)
+        strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
+        return _Refinement(strip[0], strip[1], refined.terrain)
+
+    def pictures(self, state: _State, refinement: _Refinement | None) -> list[PlacedFrame]:
+        """coarse.tif and orthoimage.tif; gives the frames as last placed."""
+        if refinement is None:
+            placed = state.recorded.placed
+            with self.clock.stage("final: orthoimage", len(placed)):
+                stats = self.draw(ORTHOIMAGE, placed, Terrain.flat(), state)
+            self.leave_out(state, stats.rejected, placed)
+            return [p for p in placed if p.frame.image not in state.rejected]
+        terrain = refinement.terrain
+        for solution in refinement.fine:
+            reasons = dict(solution.dropped)
+            self.leave_out(state, reasons, state.recorded.placed)
+            state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
+        on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
+        with_map = state.basemap is not None and self.options.until == "fine"
+        if with_map and not on_map:
+            state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
+        coarse = [p for s in refinement.coarse for p in s.placed]
+        fine = [p for s in refinement.fine for p in s.placed]
+        if with_map:
+            self.picture(state, COARSE, coarse, _coarse_terrain(refinement.coarse))
+        if self.options.until == "fine":
+            self.picture(state, ORTHOIMAGE, fine, terrain)
+            if not with_map:
+                self.copy_coarse(state)
+            return [p for p in fine if p.frame.image not in state.rejected]
+        self.picture(state, COARSE, fine, terrain)
+        return [p for p in fine if p.frame.image not in state.rejected]
+
+    def picture(self, state: _State, name: str, placed: Sequence[PlacedFrame], terrain: Terrain | None) -> None:
+        """Render one product, unless an interrupted run has."""
+        known = self.space.recall(name)
+        if known is not None and (self.out / name).exists():
+            rejected, share, stage = known
+            self.clock.stages.append(stage)
+        else:
+            label = "orthoimage" if name == ORTHOIMAGE else "coarse picture"
+            with self.clock.stage(f"final: {label}", len(placed)) as stage:
+                stats = self.draw(name, placed, terrain or Terrain.flat(), state)
+            rejected, share = stats.rejected, stats.covered_share
+            self.space.remember(name, (rejected, share, stage))
+        self.leave_out(state, rejected, placed)
+
+    def draw(
+        self, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: _State, *, realtime: bool = False
+    ) -> RenderStats:
+        """Render frames on a canvas of their own and write it as a COG."""
+        low, high = float(terrain.z.min()), float(terrain.z.max())
+        usable = [p for p in placed if rejection(p.camera, float(terrain.height(p.camera.nadir)), state.gsd_m) is None]
+        if not usable:
+            reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
+            raise OrthoSwarmError(f"no picture can be drawn: {reason}")
+        grid = GroundGrid.around(state.grid.epsg, _bounds(usable, low, high), state.gsd_m)
+        stem = name.removesuffix(".tif")
+
+        def drawn(done: int, total: int) -> None:
+            self.progress(f"drawing {stem}", done, total)
+
+        def written(done: int, total: int) -> None:
+            self.progress(f"writing {name}", done, total)
+
+        with Canvas.create(self.space.scratch(stem), grid, plane="frame") as canvas:
+            if realtime:
+                stats = mosaic(placed, canvas, run=self.workers.map, progress=drawn)
+            else:
+                stats = render(placed, terrain, canvas, run=self.workers.map, progress=drawn)
+            write_cog(canvas, self.out / name, window=_drawn(canvas), progress=written, threads=self.workers.count)
+        self.space.clear_scratch()
+        return stats
+
+    def copy_coarse(self, state: _State) -> None:
+        """Without a map the orthoimage is the coarse product, too."""
+        from orthoswarm.export.partial import written_whole
+
+        with written_whole(self.out / COARSE) as part:
+            shutil.copyfile(self.out / ORTHOIMAGE, part)
+        if state.basemap is None:
+            state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
+
+    def leave_out(self, state: _State, reasons: Mapping[str, str], placed: Iterable[PlacedFrame]) -> None:
+        """Move frames to the rejected ones."""
+        frames = {p.frame.image: p.frame for p in placed} if reasons else {}
+        for image, reason in reasons.items():
+            frame = frames.get(image)
+            vehicle, time_s = (frame.vehicle, frame.time_s) if frame else ("", None)
+            state.rejected.setdefault(image, Rejection(image, reason, vehicle, time_s))
+
+    # -- products -------------------------------------------------------------------------------------------------
+
+    def finish(self, state: _State, placed: list[PlacedFrame], refinement: _Refinement | None) -> dict[str, Any]:
+        """frames.jsonl, footprints and the report."""
+        with self.clock.stage("final: report", len(placed)):
+            z = ground_level(placed, refinement.terrain if refinement else None)
+            write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
+        for name in PRODUCTS:  # of an earlier run with other options
+            if name not in self.made(refinement):
+                (self.out / name).unlink(missing_ok=True)
+        report = self.report(state, placed, refinement, z)
+        write_json(self.out / "report.json", report)
+        return report
+
+    def made(self, refinement: _Refinement | None) -> set[str]:
+        names = set(PRODUCTS)
+        if self.options.until != "fine":
+            names.discard(ORTHOIMAGE)
+        if self.options.until == "realtime" or refinement is None:
+            names.discard(COARSE)
+        return names
+
+    def report(
+        self, state: _State, placed: Sequence[PlacedFrame], refinement: _Refinement | None, ground_z_m: float
+    ) -> dict[str, Any]:
+        solutions = refinement.fine if refinement else []
+        used = Counter(p.frame.vehicle for p in placed)
+        wall, cpu, memory = self.clock.totals()
+        vehicles = vehicle_rows(solutions, used) or [
+            {"id": v, "frames": n, "fov_deg": _fov(placed, v), "fov_sigma_deg": None, "legs": 0}
+            for v, n in used.items()
+        ]
+        return {
+            "frames": {
+                "input": len(placed) + len(state.rejected),
+                "used": len(placed),
+                "rejected": len(state.rejected),
+            },
+            "vehicles": vehicles,
+            "legs": leg_rows(solutions),
+            "stages": [_stage_row(s) for s in self.clock.stages],
+            "wall_s": wall,
+            "cpu_s": cpu,
+            "peak_rss_mb": memory,
+            "ground_z_m": ground_z_m,
+            "refine": self.options.refine if refinement else "none",
+            "warnings": list(dict.fromkeys(state.warnings)),
+            "epsg": state.grid.epsg,
+            "gsd_m": state.gsd_m,
+            "basemap": str(self.options.basemap) if self.options.basemap else None,
+            "until": self.options.until,
+        }
+
+
+# -- helpers ------------------------------------------------------------------------------------------------------
+
+
+def split_legs(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
+    """Frames with each straight leg of a vehicle as a vehicle of its own (`id/leg1`); turns go to the leg before."""
+    from orthoswarm.swarm.legs import split_legs as find_legs
+
+    members: dict[str, list[Frame]] = {}
+    for frame in frames:
+        members.setdefault(frame.vehicle, []).append(frame)
+    out: list[Frame] = []
+    for vehicle, own in members.items():
+        ground = grid.to_grid([f.fix.lat_deg for f in own], [f.fix.lon_deg for f in own])
+        leg = find_legs(ground)
+        last = 0
+        for frame, number in zip(own, leg.tolist(), strict=True):
+            last = number if number >= 0 else last
+            out.append(replace(frame, vehicle=f"{vehicle}/leg{last + 1}"))
+    return out
+
+
+def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:
+    """Height of the plane on which homographies are stated: the middle of the ground below the cameras."""
+    if terrain is None or not placed:
+        return 0.0
+    return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+
+
+def _bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:
+    boxes = footprint_boxes([p.camera for p in placed], low, high)
+    boxes = boxes[np.isfinite(boxes).all(axis=1)]
+    if not len(boxes):
+        raise OrthoSwarmError("no picture looks at the ground; check the pitch angles (-90 is straight down)")
+    west, south = boxes[:, :2].min(axis=0)
+    east, north = boxes[:, 2:].max(axis=0)
+    return float(west), float(south), float(east), float(north)
+
+
+def _drawn(canvas: Canvas) -> tuple[int, int, int, int]:
+    """The window of a canvas that holds what was drawn, on tiles and on pixels of its coarsest overview."""
+    row0, row1, col0, col1 = canvas.drawn
+    step = TILE_PX
+    while max(row1 - row0, col1 - col0) > TILE_PX * step:
+        step *= 2
+    return row0 // step * step, row1, col0 // step * step, col1
+
+
+def _partial_cover(basemap: Basemap, cameras: Sequence[Any]) -> list[str]:
+    """A warning where pictures were taken outside the map."""
+    west, south, east, north = basemap.bounds
+    xy = np.array([c.position[:2] for c in cameras])
+    inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
+    if inside.mean() > 0.98:
+        return []
+    return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]
+
+
+def _coarse_terrain(solutions: Sequence[Solution]) -> Terrain | None:
+    return next((s.terrain for s in solutions if s.terrain is not None), None)
+
+
+def _split_time(stage: Stage, refinement: _Refinement, until: str, with_map: bool) -> list[Stage]:
+    """The refinement's time by stage: what was done before the map counts as coarse."""
+    laps: Counter[str] = Counter()
+    for solution in refinement.fine:
+        laps.update(solution.timings)
+    total = sum(laps.values())
+    if until == "coarse" or not with_map or total <= 0:
+        return [replace(stage, name="coarse: refinement")]
+    share = sum(laps[name] for name in ("tracks", "relative")) / total
+    return [
+        Stage("coarse: refinement", share * stage.wall_s, share * stage.cpu_s, stage.items),
+        Stage("fine: refinement", (1 - share) * stage.wall_s, (1 - share) * stage.cpu_s, stage.items),
+    ]
+
+
+def _stage_row(stage: Stage) -> dict[str, Any]:
+    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
+
+
+def _fov(placed: Sequence[PlacedFrame], vehicle: str) -> float:
+    return float(np.median([np.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]))
+
+
+def _named(vehicle: str, warning: str) -> str:
+    return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"
+
+
+def _nothing_to_map(ingest: Ingest) -> str:
+    if not ingest.rejected:
+        return "no picture was found in the input; name a folder of photos or a video"
+    reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
+    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"

@@ -1,0 +1,196 @@
+"""What a run writes besides pictures: a line per picture (frames.jsonl), footprints, and the report's numbers."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.camera import Camera, Lens, angles_from_rotation
+from orthoswarm.export.footprints import write_footprints
+from orthoswarm.export.partial import written_whole
+from orthoswarm.frame import Rejection
+from orthoswarm.geo import LocalGrid
+from orthoswarm.mosaic.footprint import footprint
+from orthoswarm.placement import PlacedFrame, Solution
+
+Array = NDArray[np.float64]
+
+
+def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[str, Any]:
+    """The line of frames.jsonl of a placed frame.
+
+    `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
+    `ground_z_m`; `camera` says where the camera was and how it looked (yaw from true north), for other programs.
+    """
+    frame, camera = placed.frame, placed.camera
+    lens = camera.lens
+    simple, to_full = simple_lens(lens)
+    h = camera_matrix(camera, ground_z_m) @ to_full @ np.linalg.inv(simple.matrix())
+    row: dict[str, Any] = {
+        "image": frame.image,
+        "vehicle": frame.vehicle,
+        "time": iso_time(frame.time_s),
+        "stage": placed.stage,
+        "epsg": grid.epsg,
+        "homography": (h / h[2, 2]).tolist(),
+    }
+    if not simple.is_pinhole or lens.cx or lens.cy:
+        row |= {"k1": simple.k1, "k2": simple.k2}
+    if lens.cx or lens.cy or lens.k3:
+        row |= {"cx": lens.cx, "cy": lens.cy, "k3": lens.k3}
+    row["fov_deg"] = math.degrees(lens.fov_rad)
+    row["sigma_m"] = placed.sigma_m
+    if placed.weak:
+        row["weak"] = True
+    row["camera"] = _camera_row(camera, grid)
+    return row
+
+
+def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
+    yaw, pitch, roll = angles_from_rotation(camera.rotation)
+    lat, lon = (float(v) for v in grid.to_geographic(camera.position[:2]))
+    true = math.degrees(float(yaw + grid.convergence_rad(lat, lon)))
+    return {
+        "lat_deg": lat,
+        "lon_deg": lon,
+        "height_m": float(camera.position[2]),
+        "yaw_deg": (true + 180.0) % 360.0 - 180.0,
+        "pitch_deg": math.degrees(float(pitch)),
+        "roll_deg": math.degrees(float(roll)),
+    }
+
+
+def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
+    """The 3x3 matrix from undistorted normalised coordinates (x, y, 1) to the ground plane, homogeneous."""
+    r = camera.rotation
+    drop = ground_z_m - float(camera.position[2])
+    return np.array(
+        [drop * r[0] + camera.position[0] * r[2], drop * r[1] + camera.position[1] * r[2], r[2]], dtype=np.float64
+    )
+
+
+@lru_cache(maxsize=256)
+def simple_lens(lens: Lens) -> tuple[Lens, Array]:
+    """A lens with k1 and k2 about the picture's centre alone that does nearly what a fuller one does.
+
+    Returns:
+        The lens (same focal length), and the 3x3 matrix from its normalised coordinates to those of the full one.
+    """
+    if not (lens.cx or lens.cy or lens.k3):
+        return lens, np.eye(3)
+    from scipy.optimize import least_squares
+
+    columns, rows = np.meshgrid(np.linspace(0, lens.width - 1, 17), np.linspace(0, lens.height - 1, 13))
+    pixels = np.stack([columns.ravel(), rows.ravel()], 1)
+    wanted = lens.undistort((pixels - np.array(lens.principal_point)) / lens.focal_px)
+
+    def parts(p: Array) -> tuple[Lens, Array]:
+        guess = Lens(lens.width, lens.height, lens.focal_px, p[8], p[9])
+        return guess, np.append(p[:8], 1.0).reshape(3, 3)
+
+    def misfit(p: Array) -> Array:
+        guess, matrix = parts(p)
+        xy = guess.undistort((pixels - np.array(guess.principal_point)) / guess.focal_px)
+        moved = np.c_[xy, np.ones(len(xy))] @ matrix.T
+        return np.asarray((moved[:, :2] / moved[:, 2:] - wanted).ravel() * lens.focal_px)
+
+    start = np.array([1, 0, -lens.cx / lens.focal_px, 0, 1, -lens.cy / lens.focal_px, 0, 0, lens.k1, lens.k2], float)
+    return parts(least_squares(misfit, start, method="lm").x)
+
+
+def rejection_row(rejection: Rejection, epsg: int | None) -> dict[str, Any]:
+    """The line of frames.jsonl of a picture that was left out."""
+    return {
+        "image": rejection.image,
+        "vehicle": rejection.vehicle,
+        "time": iso_time(rejection.time_s),
+        "stage": "rejected",
+        "reason": rejection.reason,
+        "epsg": epsg,
+    }
+
+
+def iso_time(time_s: float | None) -> str | None:
+    """UTC epoch seconds as ISO 8601 with Z; None if unknown or no date."""
+    if time_s is None:
+        return None
+    try:
+        text = datetime.fromtimestamp(round(time_s, 6), UTC).isoformat(timespec="microseconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+    head, _, tail = text.removesuffix("+00:00").partition(".")
+    return f"{head}.{tail[:3] if tail.endswith('000') else tail}Z"
+
+
+def write_frames(
+    out: Path, placed: Sequence[PlacedFrame], rejected: Sequence[Rejection], grid: LocalGrid, z: float
+) -> None:
+    """Write frames.jsonl and footprints.gpkg into the output folder.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    rows = [frame_row(p, grid, z) for p in placed]
+    lines = sorted([*rows, *(rejection_row(r, grid.epsg) for r in rejected)], key=lambda row: str(row["image"]))
+    write_text(out / "frames.jsonl", (json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
+    polygons = [footprint(p.camera, z, inset_px=-0.5) for p in placed]
+    write_footprints(out / "footprints.gpkg", rows, polygons, grid.epsg)
+
+
+def write_text(path: Path, lines: Iterable[str]) -> None:
+    """Write a text file that appears when it is complete.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    with written_whole(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(lines)
+
+
+def read_frames(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a frames.jsonl."""
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            if line.strip():
+                yield json.loads(line)
+
+
+def vehicle_rows(solutions: Sequence[Solution], placed: Mapping[str, int]) -> list[dict[str, Any]]:
+    """`vehicles` of report.json; placed is the number of frames of each vehicle that were used."""
+    return [
+        {
+            "id": s.vehicle,
+            "frames": placed.get(s.vehicle, 0),
+            "fov_deg": finite(s.fov_deg),
+            "fov_sigma_deg": finite(s.fov_sigma_deg),
+            "legs": len(s.legs),
+        }
+        for s in solutions
+    ]
+
+
+def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
+    """`legs` of report.json."""
+    rows = [asdict(leg) for s in solutions for leg in s.legs]
+    return [row | {"confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])} for row in rows]
+
+
+def finite(value: float) -> float | None:
+    """A number that JSON can hold; None for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write one JSON document that appears when it is complete.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    write_text(path, [json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False), "\n"])
