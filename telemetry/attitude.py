@@ -102,6 +102,8 @@ def _choose_yaw(
     vehicle: str,
 ) -> tuple[Array, str]:
     """The gimbal's yaw, unless it was recorded relative to the airframe or not at all."""
+    if np.isfinite(gimbal).any() and all(p.yaw_is_stated for p in photos):
+        return gimbal.copy(), "camera yaw"
     if not np.isfinite(gimbal).any():
         return flight.copy(), "flight yaw" if np.isfinite(flight).any() else ""
     both = np.isfinite(gimbal) & np.isfinite(flight)

@@ -22,6 +22,7 @@ from telemetry.course import courses_deg, local_metres, straight_legs
 from telemetry.discover import Discovery, Folder, discover, natural_key
 from telemetry.findings import Finding, plural
 from telemetry.photos import Angles, PhotoTags, read_photos
+from telemetry.sample import Sample
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
@@ -34,11 +35,12 @@ class LoadOptions:
     """How inputs are read.
 
     Attributes:
-        every_m: distance between pictures taken from a video, metres; None for the default of `telemetry.video`.
+        every_m: distance between pictures taken from a video, metres; None for the default of `telemetry.picks`.
         every_s: seconds between pictures taken from a video.
         cache: folder for pictures taken from videos; None makes one under the system's temporary folder.
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.
+        decode: False to look at the metadata of videos only, without taking pictures (for `inspect`).
     """
 
     every_m: float | None = None
@@ -46,6 +48,7 @@ class LoadOptions:
     cache: Path | None = None
     exclude: tuple[Path, ...] = ()
     workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
+    decode: bool = True
 
 
 @dataclass(slots=True)
@@ -55,16 +58,17 @@ class SourceInfo:
     Attributes:
         path: relative to the inputs' root. kind: "photos", "video", "geo.txt" and so on.
         counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious.
-        photos: the evidence, after merging, of the photos or pictures that became frames.
-        frames: the frames.
+        frames: the frames. tracks: for sources without frames, the poses of each vehicle in order.
+        shown: number of pictures of each vehicle where that is not the number of its frames.
     """
 
     path: str
     kind: str
     counts: Counter[str] = field(default_factory=Counter)
     findings: list[Finding] = field(default_factory=list)
-    photos: list[PhotoTags] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
+    tracks: dict[str, list[Sample]] = field(default_factory=dict)
+    shown: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -109,6 +113,8 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
     """The same as `load`, source by source, for `inspect`."""
+    from telemetry.ingest_video import read_videos
+
     options = options or LoadOptions()
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(found.root)
@@ -125,6 +131,8 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     for folder in found.folders:
         if folder.pictures:
             _photo_folder(folder, found, tables, options, advance, result)
+        if folder.videos or folder.subtitles:
+            read_videos(folder, found, options, progress, result)
     _check_vehicles(result)
     return result
 
@@ -178,7 +186,6 @@ def _photo_folder(
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
         frames = frames_of(photos, vehicle, found.name, source.findings)
-        source.photos += photos
         source.frames += frames
     source.counts["frames"] = len(source.frames)
     if seen:
@@ -220,8 +227,7 @@ def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str
                 own[2] if given[2] is None else given[2],
             )
             photo.origin["angles"] = kind
-            if given[0] is not None:  # a table states the picture's yaw; there is nothing left to choose
-                photo.flight_deg = (None, None, None)
+            photo.yaw_is_stated |= given[0] is not None
     return vehicle
 
 
@@ -325,8 +331,7 @@ def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str)
 
 def _check_vehicles(result: Survey) -> None:
     """Findings over all sources."""
-    names = Counter(frame.path.name for source in result.sources for frame in source.frames)
-    if not names and not result.rejected:
+    if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
 
 

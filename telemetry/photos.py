@@ -37,6 +37,7 @@ class PhotoTags:
         make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
         band: name of the spectral band, "" for a colour picture.
         fov_hint_rad: horizontal field of view from focal length tags.
+        yaw_is_stated: True where the source defines its yaw as the picture's, so that nothing is left to choose.
         origin: field -> where it came from.
     """
 
@@ -57,6 +58,7 @@ class PhotoTags:
     camera: str = ""
     band: str = ""
     fov_hint_rad: float | None = None
+    yaw_is_stated: bool = False
     origin: dict[str, str] = field(default_factory=dict)
 
 

@@ -1,0 +1,300 @@
+"""Pictures out of a video: decoded once, picked, written as JPEG, each with the pose of its own packet."""
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry import srt
+from telemetry.findings import Finding, plural
+from telemetry.photos import PhotoTags
+from telemetry.picks import Candidate, Picker
+from telemetry.sample import Sample
+from telemetry.video import Poses, VideoScan, demux, open_video, scan
+
+JPEG_QUALITY = 95
+_ZOOM_STEP = 0.03
+
+
+@dataclass(slots=True)
+class Picture:
+    """A picture that was taken from a video.
+
+    Attributes:
+        number: of the picture in the video, in order of presentation, from 0.
+        sample: its pose, None where nothing is known. origin: where the pose is from.
+        rgb: uint8 (rows, columns, 3). video_s: its time in the video.
+    """
+
+    number: int
+    sample: Sample | None
+    origin: str
+    rgb: NDArray[np.uint8]
+    video_s: float
+
+
+@dataclass(slots=True)
+class Extraction:
+    """What a video gave: photos by vehicle, findings, counts."""
+
+    photos: dict[str, list[PhotoTags]] = field(default_factory=dict)
+    names: dict[Path, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    pictures: int = 0
+    without_pose: int = 0
+
+
+def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tuple[int, int | None, Any]]:
+    """Every picture of a file in order of presentation: number, index of its packet, decoded frame.
+
+    The packet's index travels through the decoder with the picture; where a decoder does not carry it the
+    presentation time tells. Pictures that cannot be decoded are left out, and counted in counter[0].
+    """
+    import av
+    from av.codec.context import Flags
+
+    by_time = {round(note.video_s, 6): i for i, note in enumerate(found.pictures) if note.video_s is not None}
+    with open_video(found.path) as container:
+        stream = container.streams.video[0]
+        start = stream.start_time or 0
+        context = stream.codec_context
+        context.thread_type = "AUTO"
+        context.flags |= int(Flags.copy_opaque)
+        number, index = 0, 0
+        for packet in demux(container, [stream]):
+            if packet.size:
+                packet.opaque = index
+                index += 1
+            try:
+                frames = packet.decode()
+            except (av.error.FFmpegError, ValueError):
+                if counter is not None:
+                    counter[0] += 1
+                continue
+            for frame in frames:
+                own = frame.opaque if isinstance(frame.opaque, int) else None
+                if own is None and frame.pts is not None:
+                    own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
+                yield number, own, frame
+                number += 1
+
+
+def pictures(
+    found: VideoScan,
+    poses: Poses,
+    *,
+    every_m: float | None = None,
+    every_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    result: Extraction | None = None,
+) -> Iterator[Picture]:
+    """The pictures of a video that are worth mapping, each with its pose.
+
+    Args:
+        found: the file's metadata.
+        poses: of its packets.
+        every_m: spacing in metres.
+        every_s: spacing in seconds; see `Picker` for the default.
+        progress: called with pictures decoded and their number in the file.
+        result: where counts are kept.
+    """
+    picker = Picker(every_m, every_s)
+    result = result if result is not None else Extraction()
+    damaged = [0]
+    total = len(found.pictures)
+    placed_only = poses.has_positions
+    for number, index, frame in decoded(found, damaged):
+        result.pictures += 1
+        if progress is not None and number % 25 == 0:
+            progress(number, total)
+        if frame.is_corrupt:
+            damaged[0] += 1
+            continue
+        pose = None if index is None or index >= total else poses.of(index)
+        if placed_only and (pose is None or not pose.sample.has_position):
+            result.without_pose += 1
+            continue
+        video_s = number / (found.rate or 30.0)
+        if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
+            video_s = own
+        sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
+        for taken in picker.push(Candidate(number, frame, sample, video_s, origin)):
+            yield _picture(taken)
+    for taken in picker.flush():
+        yield _picture(taken)
+    if damaged[0]:
+        result.findings.append(
+            Finding("video-damaged", f"{plural(damaged[0], 'picture')} of {found.path.name} cannot be decoded")
+        )
+    if progress is not None:
+        progress(total, total)
+
+
+def _picture(taken: Candidate) -> Picture:
+    return Picture(taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s)
+
+
+def to_rgb(frame: Any) -> NDArray[np.uint8]:
+    """A decoded frame's colours, uint8 (rows, columns, 3); unmarked pictures of 720 rows or more are BT.709."""
+    from av.video.reformatter import ColorRange, Colorspace
+
+    if frame.format.is_rgb:
+        return np.asarray(frame.to_ndarray(format="rgb24"))
+    source = Colorspace.ITU709 if frame.height >= 720 or int(frame.colorspace) == 1 else Colorspace.ITU601
+    return np.asarray(
+        frame.reformat(
+            format="rgb24", src_colorspace=source, dst_colorspace=source, dst_color_range=ColorRange.JPEG
+        ).to_ndarray()
+    )
+
+
+def extract(
+    path: Path,
+    name: str,
+    cache: Path,
+    *,
+    subtitles: srt.Subtitles | None = None,
+    every_m: float | None = None,
+    every_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    found: VideoScan | None = None,
+) -> Extraction:
+    """Take the pictures of a video and write them as JPEG files into a folder.
+
+    Args:
+        path: the video.
+        name: its name relative to the inputs; names its folder in the cache.
+        cache: folder for the pictures.
+        subtitles: of an SRT file beside it.
+        every_m: spacing in metres.
+        every_s: spacing in seconds.
+        progress: called with pictures decoded and their number.
+        found: the file's metadata if it was scanned already.
+
+    Raises:
+        telemetry.video.NotAVideo: it is none.
+        OSError: a picture cannot be written.
+    """
+    found = found or scan(path)
+    poses = Poses(found, subtitles)
+    result = Extraction()
+    folder = cache / name.replace("/", "__")
+    folder.mkdir(parents=True, exist_ok=True)
+    lens = _LensKey(found)
+    for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
+        target = folder / f"{picture.number:06d}.jpg"
+        write_jpeg(target, picture.rgb)
+        photo = _photo(target, picture, lens)
+        vehicle = picture.sample.vehicle if picture.sample is not None and picture.sample.vehicle else path.stem
+        result.photos.setdefault(vehicle, []).append(photo)
+        result.names[target] = picture.number
+    result.findings += _notes(found, poses, subtitles, result)
+    return result
+
+
+def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> None:
+    """Write a picture as JPEG under its name once it is whole.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import simplejpeg
+
+    data = simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420")
+    temporary = path.with_suffix(".part")
+    temporary.write_bytes(data)
+    os.replace(temporary, path)
+
+
+class _LensKey:
+    """Names the lens of a picture; a zoom (the stated field of view changes) begins another."""
+
+    def __init__(self, found: VideoScan) -> None:
+        self._base = f"video {found.width}x{found.height}"
+        self._fov: float | None = None
+
+    def of(self, sample: Sample | None) -> str:
+        fov = None if sample is None else sample.fov_deg
+        if fov is None:
+            return self._base
+        if self._fov is None or abs(math.log(fov / self._fov)) > _ZOOM_STEP:
+            self._fov = fov
+        return f"{self._base} fov{self._fov:.1f}"
+
+
+def _photo(path: Path, picture: Picture, lens: _LensKey) -> PhotoTags:
+    rows, columns = picture.rgb.shape[:2]
+    photo = PhotoTags(path, columns, rows)
+    sample = picture.sample
+    photo.camera = lens.of(sample)
+    if sample is None:
+        return photo
+    photo.lat_deg, photo.lon_deg = sample.lat_deg, sample.lon_deg
+    photo.altitude_m, photo.height_m = sample.altitude_m, sample.height_m
+    photo.height_is_ground = sample.height_is_ground
+    photo.time_s = sample.time_s
+    photo.camera_deg = (sample.yaw_deg, sample.pitch_deg, sample.roll_deg)
+    photo.flight_deg = (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg)
+    photo.position_sigma_m = sample.sigma_m
+    # DJI's sources say "gimbal yaw" and mean different things by it; all others define the picture's.
+    photo.yaw_is_stated = not {"djmd", "SRT"} & set(picture.origin.split(" + "))
+    photo.fov_hint_rad = None if sample.fov_deg is None else math.radians(sample.fov_deg)
+    names = {
+        "position": sample.lat_deg, "height": sample.height_m, "time": sample.time_s, "angles": sample.yaw_deg,
+        "flight_yaw": sample.flight_yaw_deg, "fov_hint": sample.fov_deg,
+    }  # fmt: skip
+    photo.origin = {field: picture.origin for field, value in names.items() if value is not None}
+    return photo
+
+
+def _notes(found: VideoScan, poses: Poses, cues: srt.Subtitles | None, result: Extraction) -> list[Finding]:
+    return [*metadata_findings(found, poses, cues), *_pose_findings(found, result)]
+
+
+def _pose_findings(found: VideoScan, result: Extraction) -> list[Finding]:
+    if not result.without_pose:
+        return []
+    return [
+        Finding(
+            "pictures-without-pose",
+            f"{plural(result.without_pose, 'picture')} of {result.pictures} in {found.path.name} have no position "
+            "and are left out",
+        )
+    ]
+
+
+def metadata_findings(found: VideoScan, poses: Poses, cues: srt.Subtitles | None) -> list[Finding]:
+    """What is odd about a video's metadata, without decoding it."""
+    findings: list[Finding] = []
+    name = found.path.name
+    errors: dict[str, int] = {}
+    for _, _, packet in found.klv_packets:
+        if packet.error:
+            errors[packet.error] = errors.get(packet.error, 0) + 1
+    for reason, count in errors.items():
+        findings.append(Finding("klv-damaged", f"{plural(count, 'KLV packet')} of {name} refused: {reason}"))
+    kinds = sorted({packet.kind for _, _, packet in found.klv_packets})
+    if "EG 0104" in kinds:
+        findings.append(Finding("klv-eg0104", f"the KLV of {name} is EG 0104, an older set than ST 0601", note=True))
+    if poses.clock_offset_s is not None and abs(poses.clock_offset_s) > 0.5:
+        findings.append(
+            Finding(
+                "clock-offset",
+                f"the SEI times of {name} are {poses.clock_offset_s:+.1f} s off its KLV times; poses are bound by "
+                "the transport's time stamps instead",
+            )
+        )
+    for code, message in (cues or found.cues).notes.items():
+        findings.append(Finding(code, message, note=code == "srt-tuple-order"))
+    if not poses.has_positions:
+        findings.append(
+            Finding(
+                "no-position", f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT or log beside it"
+            )
+        )
+    return findings

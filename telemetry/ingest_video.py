@@ -1,0 +1,118 @@
+"""Videos and their subtitles as sources of frames."""
+
+import hashlib
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthoswarm.frame import Rejection
+from telemetry import srt
+from telemetry.discover import Discovery, Folder
+from telemetry.extract import extract, metadata_findings
+from telemetry.findings import Finding
+from telemetry.sample import Sample
+from telemetry.video import NotAVideo, Poses, VideoScan, scan
+
+if TYPE_CHECKING:
+    from telemetry.ingest import LoadOptions, Progress, SourceInfo, Survey
+
+NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT or a log beside it"
+
+
+def read_videos(
+    folder: Folder, found: Discovery, options: "LoadOptions", progress: "Progress | None", result: "Survey"
+) -> None:
+    """Read the videos of a folder, each with the SRT of its name; SRT files without a video are named only."""
+    from telemetry.ingest import SourceInfo
+
+    beside = {path.stem.lower(): path for path in folder.subtitles}
+    for path in folder.videos:
+        name = found.name(path)
+        subtitles = beside.pop(path.stem.lower(), None)
+        try:
+            scanned = scan(path)
+        except (NotAVideo, OSError) as reason:
+            result.rejected.append(Rejection(name, str(reason), path.stem))
+            continue
+        source = SourceInfo(name, "video", Counter(frames=len(scanned.pictures)))
+        source.counts["sei"] = scanned.sei_count
+        source.counts["klv"] = len(scanned.klv_packets)
+        result.sources.append(source)
+        if options.decode:
+            _take(path, name, scanned, subtitles, options, progress, source, result)
+        else:
+            _look(path, scanned, subtitles, source)
+    for path in beside.values():
+        _lone_subtitles(path, found.name(path), result)
+
+
+def cache_folder(root: Path) -> Path:
+    """Where pictures of videos go if the caller names no folder."""
+    key = hashlib.sha1(str(root).encode(), usedforsecurity=False).hexdigest()[:12]
+    return Path(tempfile.gettempdir()) / f"orthoswarm-video-{key}"
+
+
+def _take(
+    path: Path,
+    name: str,
+    scanned: VideoScan,
+    subtitles: Path | None,
+    options: "LoadOptions",
+    progress: "Progress | None",
+    source: "SourceInfo",
+    result: "Survey",
+) -> None:
+    """Take pictures and make frames of them."""
+    from telemetry.ingest import frames_of
+
+    cues = srt.read_srt(subtitles) if subtitles is not None else None
+    if not Poses(scanned, cues).has_positions:
+        result.rejected.append(Rejection(name, NO_POSITION, path.stem))
+        return
+    taken = extract(
+        path,
+        name,
+        options.cache or cache_folder(result.root),
+        subtitles=cues,
+        every_m=options.every_m,
+        every_s=options.every_s,
+        progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
+        found=scanned,
+    )
+    source.findings += taken.findings
+    for vehicle, photos in taken.photos.items():
+        source.frames += frames_of(photos, vehicle, lambda jpeg: f"{name}#{taken.names[jpeg]:06d}", source.findings)
+        source.shown[vehicle] = len(photos)
+
+
+def _look(path: Path, scanned: VideoScan, subtitles: Path | None, source: "SourceInfo") -> None:
+    """Only the metadata: the poses of all pictures, by vehicle."""
+    cues = srt.read_srt(subtitles) if subtitles is not None else None
+    poses = Poses(scanned, cues)
+    source.findings += metadata_findings(scanned, poses, cues)
+    order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
+    vehicle = path.stem
+    for index in order:
+        pose = poses.of(index)
+        sample = pose.sample if pose is not None else Sample()
+        vehicle = sample.vehicle or vehicle
+        source.shown[vehicle] = source.shown.get(vehicle, 0) + 1
+        source.tracks.setdefault(vehicle, []).append(sample)
+
+
+def _lone_subtitles(path: Path, name: str, result: "Survey") -> None:
+    from telemetry.ingest import SourceInfo
+
+    source = SourceInfo(name, "srt")
+    result.sources.append(source)
+    try:
+        cues = srt.read_srt(path)
+    except OSError as error:
+        source.findings.append(Finding("unreadable", f"{path.name} cannot be read ({error.strerror})"))
+        return
+    source.findings += [Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items()]
+    source.findings.append(Finding("no-video", f"{path.name} has no video of its name beside it", note=True))
+    source.counts["samples"] = len(cues.cues)
+    source.tracks[path.stem] = [cue.sample for cue in cues.cues if cue.sample is not None]
+    source.shown[path.stem] = 0
