@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.errors import InputError
 from orthoswarm.geo import GroundGrid
-from orthoswarm.placement import Terrain
 from orthoswarm.resample import resample
 from orthoswarm.tilefolder import TileFolder
 
@@ -389,53 +388,3 @@ def _blank(values: NDArray[Any]) -> Mask:
 
 def _short(error: Exception) -> str:
     return str(error).splitlines()[0][:120]
-
-
-def read_terrain(path: str | Path, epsg: int, bounds: Bounds, step_m: float = 10.0) -> Terrain:
-    """Ground heights of an elevation model around an area, in the model's own datum.
-
-    Args:
-        path: a raster of heights in metres that GDAL reads.
-        epsg: the area's grid.
-        bounds: west, south, east, north of the area.
-        step_m: distance of the answer's nodes.
-
-    Raises:
-        InputError: if the model cannot be read or does not cover any of the area.
-    """
-    from rasterio.enums import Resampling
-    from rasterio.errors import RasterioError
-    from rasterio.vrt import WarpedVRT
-
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"the elevation model {path} does not exist; check the path")
-    raster = _Raster.__new__(_Raster)
-    raster._path, raster._handles = path, threading.local()
-    source = raster._open()
-    crs = _crs_of(source, path)
-    grid = GroundGrid.around(epsg, bounds, step_m)
-    try:
-        with WarpedVRT(
-            source,
-            src_crs=crs,
-            crs=f"EPSG:{epsg}",
-            transform=grid.affine(),
-            width=grid.width,
-            height=grid.height,
-            resampling=Resampling.bilinear,
-            add_alpha=True,
-        ) as vrt:
-            z = vrt.read(1).astype(np.float64) * (source.scales[0] or 1.0) + source.offsets[0]
-            valid = (vrt.read(vrt.count) > 127) & np.isfinite(z)
-    except (RasterioError, OSError) as error:
-        raise InputError(f"the elevation model {path.name} is damaged ({_short(error)}); export it again") from None
-    if not valid.any():
-        raise InputError(f"the elevation model {path.name} does not cover the flight; give one of this area")
-    if not valid.all():
-        from scipy.ndimage import distance_transform_edt
-
-        nearest = distance_transform_edt(~valid, return_distances=False, return_indices=True)
-        z = z[tuple(nearest)]
-    west, south = grid.bounds[0] + 0.5 * step_m, grid.bounds[1] + 0.5 * step_m
-    return Terrain(west, south, step_m, np.ascontiguousarray(z[::-1], np.float32))

@@ -25,6 +25,7 @@ from orthoswarm.mosaic.render import RenderStats, render
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.products import leg_rows, vehicle_rows, write_frames, write_json
 from orthoswarm.recorded import Recorded, area_grid, recorded_cameras
+from orthoswarm.report.page import write_page
 from orthoswarm.stages import Clock, Stage
 from orthoswarm.workers import Workers
 from orthoswarm.workspace import Workspace, run_key
@@ -291,13 +292,17 @@ class _Batch:
 
     def finish(self, state: _State, placed: list[PlacedFrame], refinement: _Refinement | None) -> dict[str, Any]:
         """frames.jsonl, footprints and the report."""
-        with self.clock.stage("final: report", len(placed)):
-            z = ground_level(placed, refinement.terrain if refinement else None)
-            write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
         for name in PRODUCTS:  # of an earlier run with other options
             if name not in self.made(refinement):
                 (self.out / name).unlink(missing_ok=True)
-        report = self.report(state, placed, refinement, z)
+        with self.clock.stage("final: report", len(placed)) as stage:
+            z = ground_level(placed, refinement.terrain if refinement else None)
+            write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
+            report = self.report(state, placed, refinement, z)
+            write_page(self.out, report, placed, list(state.rejected.values()), state.basemap)
+        wall, cpu, memory = self.clock.totals()
+        report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
+        report["stages"].append(_stage_row(stage))
         write_json(self.out / "report.json", report)
         return report
 

@@ -10,7 +10,7 @@ import rasterio
 from rasterio.crs import CRS
 from rasterio.transform import Affine, from_origin
 
-from orthoswarm.basemap import Basemap, read_terrain
+from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError
 from orthoswarm.geo import GroundGrid, LocalGrid
 
@@ -277,16 +277,3 @@ def test_threads_and_processes_share_a_map(gray_tif):
     with ThreadPoolExecutor(4) as pool:
         for gray, _ in pool.map(lambda _: basemap.gray(AREA, 0.5), range(12)):
             np.testing.assert_array_equal(gray, first)
-
-
-def test_heights_become_a_terrain(tmp_path):
-    affine = from_origin(EAST, NORTH, 2.0, 2.0)
-    rows, cols = np.mgrid[:100, :100]
-    z = (300.0 + 0.1 * (cols + 0.5) * 2 - 0.05 * (rows + 0.5) * 2).astype(np.float32)
-    z[:5, :5] = -9999
-    path = write(tmp_path / "dem.tif", z, affine, nodata=-9999)
-    terrain = read_terrain(path, EPSG, AREA, 5.0)
-    points = np.array([[EAST + 80, NORTH - 90], [EAST + 121.5, NORTH - 100.2]])
-    np.testing.assert_allclose(terrain.height(points), [300 + 8 - 4.5, 300 + 12.15 - 5.01], atol=0.05)
-    with pytest.raises(InputError, match="does not cover"):
-        read_terrain(path, EPSG, tuple(np.array(AREA) + 1000))

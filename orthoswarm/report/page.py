@@ -1,0 +1,299 @@
+"""report.html: the state of the map in words, its pictures, and the numbers behind them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm import __version__
+from orthoswarm.basemap import Basemap
+from orthoswarm.frame import Rejection
+from orthoswarm.mosaic.footprint import footprint
+from orthoswarm.placement import PlacedFrame
+from orthoswarm.products import write_text
+from orthoswarm.report import charts
+from orthoswarm.report.displacement import Displacements, displacements
+from orthoswarm.report.pictures import (
+    Bounds,
+    Picture,
+    data_uri,
+    draw_arrows,
+    draw_lines,
+    fill_polygons,
+    map_edges,
+    on_paper,
+    pale,
+    product_bounds,
+    product_picture,
+    scale_bar,
+    view_grid,
+)
+
+Array = NDArray[np.float64]
+
+_STAGES = (
+    ("realtime.tif", "Real time", "as recorded, no matching"),
+    ("coarse.tif", "Coarse", "pictures adjusted to each other"),
+    ("orthoimage.tif", "Fine", "settled on the pre-disaster map"),
+)
+_EDGE = (255, 214, 0)
+_ARROW = (208, 30, 60)
+_LEGS = {"matched": (0, 140, 90), "carried": (240, 150, 0), "failed": (208, 30, 60)}
+_VEHICLES = charts.PALETTE
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A picture of the page: its heading, the picture inside the page, and what it shows."""
+
+    title: str
+    uri: str
+    text: str
+
+
+def write_page(
+    out: Path,
+    report: Mapping[str, Any],
+    placed: Sequence[PlacedFrame],
+    rejected: Sequence[Rejection],
+    basemap: Basemap | None,
+) -> None:
+    """Write report.html beside the products.
+
+    Args:
+        out: output folder with the products.
+        report: content of report.json.
+        placed: the frames as last placed.
+        rejected: the pictures that were left out.
+        basemap: the map, if there is one.
+
+    Raises:
+        OrthoSwarmError: if the disk is full.
+    """
+    import jinja2
+
+    best = next((out / name for name, _, _ in reversed(_STAGES) if (out / name).exists()), None)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("orthoswarm.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    values: dict[str, Any] = {
+        "report": report,
+        "version": __version__,
+        "name": out.resolve().name,
+        "rejected": rejected,
+    }
+    moved = None
+    if best is not None:
+        bounds = product_bounds(best)
+        if basemap is not None:
+            moved = _against_map(best, bounds, basemap, report)
+        values |= _pictures(out, best, bounds, report, placed, basemap, moved)
+    values["verdict"] = _verdict(report, placed, moved)
+    values["facts"] = _facts(report, placed, moved)
+    values["fov"] = charts.fields_of_view(report["vehicles"])
+    values["times"] = charts.times(report["stages"])
+    values["legs"] = _leg_summary(report)
+    write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
+
+
+def _pictures(
+    out: Path,
+    best: Path,
+    bounds: Bounds,
+    report: Mapping[str, Any],
+    placed: Sequence[PlacedFrame],
+    basemap: Basemap | None,
+    moved: Displacements | None,
+) -> dict[str, Any]:
+    """All figures, largest first."""
+    gsd = float(report["gsd_m"])
+    grid = view_grid(report["epsg"], bounds, 1400, gsd)
+    ortho = product_picture(best, grid)
+    small = view_grid(report["epsg"], bounds, 760, gsd)
+    reduced = product_picture(best, small)
+    main = ortho.copy()
+    scale_bar(main)
+    stages = []
+    for name, title, text in _STAGES:
+        if (out / name).exists() and not (name == "orthoimage.tif" and _same_as_coarse(report)):
+            stages.append(Figure(title, data_uri(product_picture(out / name, small).rgb), text))
+    return {
+        "main": data_uri(main.rgb, 86),
+        "stages": stages if len(stages) > 1 else [],
+        "edges": _edge_crops(best, bounds, report, basemap) if basemap is not None else [],
+        "footprints": _footprints(reduced, placed, basemap, float(report["ground_z_m"])),
+        "arrows": _arrows(reduced, moved) if moved is not None and len(moved.at) else None,
+        "paths": _paths(reduced, placed, report) if report["legs"] else None,
+    }
+
+
+def _same_as_coarse(report: Mapping[str, Any]) -> bool:
+    return not report.get("basemap")
+
+
+# -- figures ------------------------------------------------------------------------------------------------------
+
+
+def _against_map(best: Path, bounds: Bounds, basemap: Basemap, report: Mapping[str, Any]) -> Displacements:
+    """Blocks of the orthoimage on the map, at a pixel between the two's own and what fits into memory."""
+    import cv2
+
+    least = max(float(report["gsd_m"]), basemap.native_gsd_m, 0.25)
+    grid = view_grid(report["epsg"], bounds, 2600, least)
+    picture = product_picture(best, grid)
+    gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    there, valid = basemap.gray(grid.bounds, grid.gsd_m)
+    rows, cols = min(gray.shape[0], there.shape[0]), min(gray.shape[1], there.shape[1])
+    cut = (slice(rows), slice(cols))
+    return displacements(gray[cut], picture.seen[cut], there[cut], valid[cut], grid)
+
+
+def _edge_crops(best: Path, bounds: Bounds, report: Mapping[str, Any], basemap: Basemap) -> list[Figure]:
+    """Parts of the orthoimage with the map's edges over them, where the map has most of them."""
+    side = 360
+    gsd = max(float(report["gsd_m"]), 0.5 * basemap.native_gsd_m)
+    overview = view_grid(report["epsg"], bounds, 400, gsd)
+    seen = product_picture(best, overview).seen.astype(np.float32)
+    gray, valid = basemap.gray(overview.bounds, overview.gsd_m)
+    rows, cols = min(seen.shape[0], gray.shape[0]), min(seen.shape[1], gray.shape[1])
+    import cv2
+
+    size = max(3, int(side * gsd / overview.gsd_m))
+    edges = map_edges(gray, valid)[:rows, :cols].astype(np.float32) * seen[:rows, :cols]
+    full = cv2.boxFilter(seen[:rows, :cols], -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9
+    score = cv2.boxFilter(edges, -1, (size, size), borderType=cv2.BORDER_CONSTANT) * full
+    figures: list[Figure] = []
+    while len(figures) < 3 and score.size and score.max() > 0.01:
+        r, c = np.unravel_index(int(score.argmax()), score.shape)
+        middle = overview.to_ground([float(c), float(r)])
+        half = 0.5 * side * gsd
+        window = (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half)
+        grid = view_grid(report["epsg"], window, side, gsd)
+        figures.append(Figure("", data_uri(_with_edges(best, grid, basemap).rgb, 88), ""))
+        score[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
+    return figures
+
+
+def _with_edges(best: Path, grid: Any, basemap: Basemap) -> Picture:
+    picture = product_picture(best, grid)
+    gray, valid = basemap.gray(grid.bounds, grid.gsd_m)
+    edges = map_edges(gray, valid)[: grid.height, : grid.width]
+    rows, cols = edges.shape
+    picture.rgb[:rows, :cols][edges] = _EDGE
+    scale_bar(picture)
+    return picture
+
+
+def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], basemap: Basemap | None, ground_z_m: float) -> Figure:
+    """Each vehicle's footprints on the map, or on the orthoimage where there is none."""
+    under, on = reduced, "the orthoimage"
+    if basemap is not None:
+        rgb, valid = basemap.rgb(reduced.grid.bounds, reduced.grid.gsd_m)
+        rows, cols = min(rgb.shape[0], reduced.rgb.shape[0]), min(rgb.shape[1], reduced.rgb.shape[1])
+        seen = np.zeros(reduced.seen.shape, bool)
+        full = np.zeros_like(reduced.rgb)
+        full[:rows, :cols], seen[:rows, :cols] = rgb[:rows, :cols], valid[:rows, :cols]
+        under, on = on_paper(full, seen, reduced.grid), "the map"
+    picture = under.copy()
+    vehicles = list(dict.fromkeys(p.frame.vehicle for p in placed))
+    for i, vehicle in enumerate(vehicles):
+        own = [p for p in placed if p.frame.vehicle == vehicle]
+        step = max(1, len(own) // 60)
+        rings = [footprint(p.camera, ground_z_m) for p in own[::step]]
+        rings = [ring for ring in rings if len(ring)]
+        colour = _VEHICLES[i % len(_VEHICLES)]
+        fill_polygons(picture, rings, colour, 0.03)
+        draw_lines(picture, rings, colour, 1, closed=True)
+    scale_bar(picture)
+    text = f"What each picture sees, on {on}; one colour a vehicle."
+    return Figure("Footprints", data_uri(picture.rgb), text)
+
+
+def _arrows(reduced: Picture, moved: Displacements) -> Figure:
+    picture = pale(reduced, 0.8)
+    size = moved.size_m
+    usual = max(float(np.percentile(size, 90)), 1e-3)
+    stretch = 18.0 * picture.grid.gsd_m / usual
+    draw_arrows(picture, moved.at, moved.at + moved.shift * stretch, _ARROW)
+    scale_bar(picture)
+    text = (
+        f"Where {len(moved.at)} of {moved.blocks} blocks of the orthoimage are found on the map, shifts drawn "
+        f"{stretch:,.0f} times as long: median {np.median(size):.2f} m, 95 % below {np.percentile(size, 95):.2f} m. "
+        "No arrow: changed since the map was made, or without texture."
+    )
+    return Figure("Displacement against the map", data_uri(picture.rgb), text)
+
+
+def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str, Any]) -> Figure:
+    picture = pale(reduced, 0.7)
+    by_vehicle: dict[str, list[PlacedFrame]] = {}
+    for p in placed:
+        by_vehicle.setdefault(p.frame.vehicle, []).append(p)
+    for own in by_vehicle.values():
+        draw_lines(picture, [np.array([p.camera.nadir for p in own])], (150, 155, 165), 1)
+    for leg in report["legs"]:
+        own = by_vehicle.get(leg["vehicle"], [])[leg["first"] : leg["last"] + 1]
+        draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], _LEGS[leg["state"]], 3)
+    scale_bar(picture)
+    text = "Green: matched to the map. Orange: carried by the others. Red: failed. Grey: turns."
+    return Figure("Legs", data_uri(picture.rgb), text)
+
+
+# -- words --------------------------------------------------------------------------------------------------------
+
+
+def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], moved: Displacements | None) -> dict[str, str]:
+    """How far the map can be trusted, in one sentence and one colour."""
+    sigma = [p.sigma_m for p in placed if np.isfinite(p.sigma_m)]
+    usual = float(np.median(sigma)) if sigma else float("nan")
+    fine = sum(p.stage == "fine" for p in placed)
+    if report["until"] == "realtime" or report["refine"] == "none":
+        return {
+            "kind": "rough",
+            "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m.",
+        }
+    if not fine:
+        text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
+        return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
+    text = f"Lies on the pre-disaster map; expected error {usual:.2f} m (one sigma)"
+    if moved is not None and len(moved.at) >= 10:
+        median, high = np.percentile(moved.size_m, [50, 95])
+        text += f", measured against it {median:.2f} m (median), {high:.2f} m (95 %)"
+        if median > 3 * max(usual, 0.3):
+            return {"kind": "doubt", "text": text + ". The two disagree: check the pictures below before use."}
+    return {"kind": "good" if fine >= 0.9 * len(placed) else "rough", "text": text + "."}
+
+
+def _facts(
+    report: Mapping[str, Any], placed: Sequence[PlacedFrame], moved: Displacements | None
+) -> list[tuple[str, str]]:
+    frames = report["frames"]
+    gsd = float(report["gsd_m"])
+    facts = [
+        (f"{frames['used']:,} of {frames['input']:,}", "pictures mapped"),
+        (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),
+        (f"{gsd * 100:.1f} cm" if gsd < 1 else f"{gsd:.2f} m", "ground pixel"),
+    ]
+    if "area_ha" in report:
+        facts.append((f"{report['area_ha']:,.1f} ha", "mapped"))
+    if moved is not None and len(moved.at):
+        facts.append((f"{np.median(moved.size_m):.2f} m", "from the map (median)"))
+    return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]
+
+
+def _leg_summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    rows = []
+    for vehicle in report["vehicles"]:
+        legs = [leg for leg in report["legs"] if leg["vehicle"] == vehicle["id"]]
+        sigmas = [leg["sigma_m"] for leg in legs if leg["sigma_m"] is not None]
+        rows.append(
+            {
+                "vehicle": vehicle,
+                "legs": [{"state": leg["state"], "confidence": leg["confidence"] or 0.0} for leg in legs],
+                "sigma_m": float(np.median(sigmas)) if sigmas else None,
+            }
+        )
+    return rows
