@@ -91,8 +91,7 @@ class MissionDownload(Exchange):
 
     def _heard(self, now: float) -> None:
         self._heard_at = now
-        if not self._asked_again:
-            self._trip.answered(now - self._asked_at)
+        self._trip.answered(now - self._asked_at, asked_again=self._asked_again)
 
     def _counted(self, count: int, now: float) -> list[Message]:
         if self._count == count and self._got:  # a copy of the first answer

@@ -95,12 +95,15 @@ class RoundTrip:
     """
 
     wait_s: float = 0.7
+    _usual_s: float = 0.7
     _smooth_s: float | None = None
 
-    def answered(self, took_s: float) -> None:
-        """An answer came to a question that was asked once."""
-        self._smooth_s = took_s if self._smooth_s is None else 0.8 * self._smooth_s + 0.2 * took_s
-        self.wait_s = min(2.0, max(0.2, 4.0 * self._smooth_s))
+    def answered(self, took_s: float, *, asked_again: bool) -> None:
+        """An answer came. Which of several equal questions it answers is not known, so those tell nothing."""
+        if not asked_again:
+            self._smooth_s = took_s if self._smooth_s is None else 0.8 * self._smooth_s + 0.2 * took_s
+            self._usual_s = min(2.0, max(0.2, 4.0 * self._smooth_s))
+        self.wait_s = self._usual_s
 
     def missed(self) -> None:
         """No answer came in time."""

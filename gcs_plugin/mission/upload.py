@@ -1,9 +1,11 @@
 """Putting a mission into a vehicle, and making sure that it is there.
 
 The vehicle leads: MISSION_COUNT makes it ask for one item after the other, in its own time, and it acknowledges at the
-end (https://mavlink.io/en/services/mission.html). Every one of these messages may be lost, doubled or late, so neither
-an acknowledgement nor its absence is believed: the mission is read back and compared. ArduPilot's store is not atomic;
-after a refusal or a time-out it holds a mixture of the old and the new mission, which must never pass for a success.
+end (https://mavlink.io/en/services/mission.html). An item that brings no further request is sent once more before the
+vehicle asks again: ArduPilot takes a second for that. Every one of these messages may be lost, doubled or late, so
+neither an acknowledgement nor its absence is believed: the mission is read back and compared. ArduPilot's store is not
+atomic; after a refusal or a time-out it holds a mixture of the old and the new mission, which must never pass for a
+success.
 
 What the acknowledgements mean in practice (measured): 13 (invalid sequence) answers a duplicate and is not the end; 1
 (error) answers a copy of the last item although the mission is stored, and PX4 while it is busy; 14 (denied) says that
@@ -17,7 +19,7 @@ from typing import Final
 from gcs_plugin.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.compare import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import Exchange
+from gcs_plugin.mission.exchange import Exchange, RoundTrip
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.refusal import (
     ACCEPTED,
@@ -75,7 +77,11 @@ class MissionUpload(Exchange):
     _begun: int = field(default=0, init=False)
     _heard_at: float = field(default=0.0, init=False)
     _served: int = field(default=-1, init=False)
+    _ahead: int = field(default=-1, init=False)
     _answered: dict[int, float] = field(default_factory=dict, init=False)
+    _trip: RoundTrip = field(default_factory=RoundTrip, init=False)
+    _repeated: bool = field(default=False, init=False)
+    _silence_ends: float = field(default=0.0, init=False)
     _refused: Refusal | None = field(default=None, init=False)
     _doubt: Refusal | None = field(default=None, init=False)
     _denied: Refusal | None = field(default=None, init=False)
@@ -119,7 +125,9 @@ class MissionUpload(Exchange):
             return []
         if self._doubt is not None:
             return self._nack(self._doubt, now)
-        if self.stage is Stage.ITEMS and self._served == len(self.mission) - 1:
+        if self.stage is Stage.ITEMS and now < self._silence_ends:
+            return self._repeat(now)
+        if self.stage is Stage.ITEMS and self._all_sent:
             return self._verify(now)
         if self.stage is Stage.COUNT:
             self.deadline = now + _COUNT_AGAIN_S
@@ -150,7 +158,8 @@ class MissionUpload(Exchange):
         if self._begun > self.attempts:
             self._fail(self._mixed or f"did not take the mission in {self.attempts} attempts; check the link")
             return []
-        self.stage, self._served, self._reading, self._doubt = Stage.COUNT, -1, None, None
+        self.stage, self._reading, self._doubt = Stage.COUNT, None, None
+        self._served, self._ahead, self._repeated = -1, -1, False
         self._answered.clear()
         self.deadline = now + _COUNT_AGAIN_S
         return [self._count_message()]
@@ -165,35 +174,55 @@ class MissionUpload(Exchange):
         self._heard_at, self._touched, self._denied, self._doubt = now, True, None, None
         if now - self._answered.get(seq, -1.0) < _SAME_REQUEST_S:
             return []
-        self._answered[seq] = now
         if self._reading is None:
             self.stage = Stage.ITEMS
-            if seq <= self._served + 1:  # a vehicle asks in order; what lies further ahead is a late copy
-                self._served = max(self._served, seq)
-            self.deadline = now + (_LAST_SILENCE_S if self._served == len(self.mission) - 1 else _SILENCE_S)
-        return [self.mission.items[seq].message(seq, self.vehicle.system, self.vehicle.component)]
+            if self._served < seq <= self._ahead + 1:  # a vehicle asks in order; further ahead is a late copy
+                if seq > 0:
+                    self._trip.answered(now - self._answered.get(seq - 1, now), asked_again=self._repeated)
+                self._served, self._ahead, self._repeated = seq, max(seq, self._ahead), False
+            self._silence_ends = now + (_LAST_SILENCE_S if self._all_sent else _SILENCE_S)
+            self.deadline = min(now + self._trip.wait_s, self._silence_ends)
+        self._answered[seq] = now
+        return [self._item(seq)]
+
+    def _item(self, seq: int) -> Message:
+        return self.mission.items[seq].message(seq, self.vehicle.system, self.vehicle.component)
+
+    @property
+    def _all_sent(self) -> bool:
+        return self._served == len(self.mission) - 1
+
+    def _repeat(self, now: float) -> list[Message]:
+        """Send the last item once more: either it was lost, or the request that should have followed it."""
+        self._repeated = True
+        self._trip.missed()
+        self.deadline = min(now + self._trip.wait_s, self._silence_ends)
+        return [self._item(self._served)]
 
     def _acknowledged(self, code: int, message: Message, now: float) -> list[Message]:
         if code != DENIED:
             self._heard_at = now
-        all_sent = self._served == len(self.mission) - 1
         if self._reading is not None:
             if code == CANCELLED:  # it had still been waiting for an item
                 return self._announce(now)
             return self._read(self._reading.feed(message, now), now)
+        if code == INVALID_SEQUENCE and self.stage is Stage.ITEMS and self._repeated and not self._all_sent:
+            self._ahead = self._served + 1
+            return [self._item(self._ahead)]  # it has that one, so it waits for the next
         if self.stage is Stage.PAUSE or code == INVALID_SEQUENCE:
             return []
         if self.stage is Stage.COUNT:
             return self._answered_count(code, now)
         if code == ACCEPTED:
-            return self._verify(now) if all_sent else []
+            return self._verify(now) if self._all_sent else []
         if code == CANCELLED:
             return self._announce(now)
         refusal = explain(code, self.mission, self._served)
         if code == ERROR:
-            # About this item, or about a copy of something: further requests, or what is stored, will tell.
-            self._doubt = refusal
-            if all_sent:
+            # About this item, about a copy of it, or about an upload that the vehicle has given up: further
+            # requests, or what is stored, will tell.
+            self._doubt = None if self._repeated else refusal
+            if self._all_sent:
                 return self._verify(now)
             self.deadline = now + _DOUBT_S
             return []
