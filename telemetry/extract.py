@@ -14,8 +14,9 @@ from telemetry import srt
 from telemetry.findings import Finding, plural
 from telemetry.photos import PhotoTags
 from telemetry.picks import Candidate, Picker
+from telemetry.poses import Poses
 from telemetry.sample import Sample
-from telemetry.video import Poses, VideoScan, demux, open_video, scan
+from telemetry.video import VideoScan, demux, open_video, scan
 
 JPEG_QUALITY = 95
 _ZOOM_STEP = 0.03
@@ -193,7 +194,15 @@ def extract(
         vehicle = picture.sample.vehicle if picture.sample is not None and picture.sample.vehicle else path.stem
         result.photos.setdefault(vehicle, []).append(photo)
         result.names[target] = picture.number
-    result.findings += _notes(found, poses, subtitles, result)
+    result.findings += poses.findings
+    if result.without_pose:
+        result.findings.append(
+            Finding(
+                "pictures-without-pose",
+                f"{plural(result.without_pose, 'picture')} of {result.pictures} in {path.name} have no position "
+                "and are left out",
+            )
+        )
     return result
 
 
@@ -250,51 +259,3 @@ def _photo(path: Path, picture: Picture, lens: _LensKey) -> PhotoTags:
     }  # fmt: skip
     photo.origin = {field: picture.origin for field, value in names.items() if value is not None}
     return photo
-
-
-def _notes(found: VideoScan, poses: Poses, cues: srt.Subtitles | None, result: Extraction) -> list[Finding]:
-    return [*metadata_findings(found, poses, cues), *_pose_findings(found, result)]
-
-
-def _pose_findings(found: VideoScan, result: Extraction) -> list[Finding]:
-    if not result.without_pose:
-        return []
-    return [
-        Finding(
-            "pictures-without-pose",
-            f"{plural(result.without_pose, 'picture')} of {result.pictures} in {found.path.name} have no position "
-            "and are left out",
-        )
-    ]
-
-
-def metadata_findings(found: VideoScan, poses: Poses, cues: srt.Subtitles | None) -> list[Finding]:
-    """What is odd about a video's metadata, without decoding it."""
-    findings: list[Finding] = []
-    name = found.path.name
-    errors: dict[str, int] = {}
-    for _, _, packet in found.klv_packets:
-        if packet.error:
-            errors[packet.error] = errors.get(packet.error, 0) + 1
-    for reason, count in errors.items():
-        findings.append(Finding("klv-damaged", f"{plural(count, 'KLV packet')} of {name} refused: {reason}"))
-    kinds = sorted({packet.kind for _, _, packet in found.klv_packets})
-    if "EG 0104" in kinds:
-        findings.append(Finding("klv-eg0104", f"the KLV of {name} is EG 0104, an older set than ST 0601", note=True))
-    if poses.clock_offset_s is not None and abs(poses.clock_offset_s) > 0.5:
-        findings.append(
-            Finding(
-                "clock-offset",
-                f"the SEI times of {name} are {poses.clock_offset_s:+.1f} s off its KLV times; poses are bound by "
-                "the transport's time stamps instead",
-            )
-        )
-    for code, message in (cues or found.cues).notes.items():
-        findings.append(Finding(code, message, note=code == "srt-tuple-order"))
-    if not poses.has_positions:
-        findings.append(
-            Finding(
-                "no-position", f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT or log beside it"
-            )
-        )
-    return findings

@@ -316,7 +316,7 @@ def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str)
             )
         )
     altitudes = np.array([p.altitude_m for p in photos if p.altitude_m is not None], dtype=np.float64)
-    wrong = altitudes[(altitudes < 0.0) | (altitudes > 9000.0)]
+    wrong = altitudes[(altitudes < 0.0) | (altitudes > 15_000.0)]
     if len(wrong):
         findings.append(
             Finding(

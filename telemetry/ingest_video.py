@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 from orthoswarm.frame import Rejection
 from telemetry import srt
 from telemetry.discover import Discovery, Folder
-from telemetry.extract import extract, metadata_findings
+from telemetry.extract import extract
 from telemetry.findings import Finding
+from telemetry.poses import Poses
 from telemetry.sample import Sample
-from telemetry.video import NotAVideo, Poses, VideoScan, scan
+from telemetry.video import NotAVideo, VideoScan, scan
 
 if TYPE_CHECKING:
     from telemetry.ingest import LoadOptions, Progress, SourceInfo, Survey
@@ -90,7 +91,7 @@ def _look(path: Path, scanned: VideoScan, subtitles: Path | None, source: "Sourc
     """Only the metadata: the poses of all pictures, by vehicle."""
     cues = srt.read_srt(subtitles) if subtitles is not None else None
     poses = Poses(scanned, cues)
-    source.findings += metadata_findings(scanned, poses, cues)
+    source.findings += poses.findings
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
     vehicle = path.stem
     for index in order:

@@ -1,25 +1,19 @@
-"""Video files: which pose belongs to which picture.
+"""Video files: all metadata that they carry.
 
 One pass over the packets, without decoding, finds all metadata: SEI of each picture, KLV, DJI's djmd track, a
-subtitle track; an SRT file may lie beside. What is carried in or with a picture's own packet (SEI, djmd) is bound to
-that packet, and follows it through the decoder (`telemetry.extract`), so that B-frames and threads cannot mix it up.
-What has times of its own (KLV, subtitles) is interpolated at the picture's time.
+subtitle track. `telemetry.poses` makes one pose for each picture of it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from telemetry import bitstream, djmd, klv, sei, srt
 from telemetry.exif import parse_time
 from telemetry.sample import Sample
-from telemetry.timeline import Timeline
 
 _MAX_PICTURES = 5_000_000
-_HELD_AT_ENDS_S = 1.0
 
 
 class NotAVideo(Exception):
@@ -184,148 +178,3 @@ def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers:
     sample = djmd.read_djmd(data)
     if sample is not None and seconds is not None:
         result.djmd_samples.append((seconds, sample))
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """The merged sample of a picture and where its parts come from."""
-
-    sample: Sample
-    origin: str
-
-
-class Poses:
-    """The pose of each picture of a video: SEI, djmd, KLV and subtitles merged, the richer first."""
-
-    def __init__(self, found: VideoScan, subtitles: srt.Subtitles | None = None) -> None:
-        self._scan = found
-        self.clock_offset_s: float | None = None
-        self._interval = 1.0 / found.rate if found.rate else 1.0 / 30.0
-        self._djmd = sorted(found.djmd_samples, key=lambda row: row[0])
-        self._djmd_times = np.array([row[0] for row in self._djmd])
-        times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
-        self._interpolated: list[tuple[str, list[Sample]]] = []
-        for name, (timeline, clock) in (
-            ("KLV", self._klv_timeline()),
-            ("SRT", _cue_timeline(subtitles if subtitles is not None else found.cues)),
-        ):
-            if timeline is not None:
-                samples = timeline.at_all(times)
-                for sample in samples:
-                    t = sample.time_s
-                    sample.time_s = None if clock is None or t is None or t != t else t + clock
-                self._interpolated.append((name, samples))
-
-    def _time(self, index: int) -> float:
-        """Video time of a packet's picture; NaN where it is not known."""
-        t = self._scan.pictures[index].video_s
-        if t is not None:
-            return t
-        return index * self._interval if self._scan.rate else float("nan")
-
-    def of(self, index: int) -> Pose | None:
-        """Pose of the picture of a packet (its index in `VideoScan.pictures`); None where nothing is known."""
-        note = self._scan.pictures[index]
-        t = self._time(index)
-        parts: list[tuple[Sample, str]] = []
-        if note.sample is not None:
-            parts.append((note.sample, " + ".join(note.decoders)))
-        own = self._own_djmd(t)
-        if own is not None:
-            parts.append((own, "djmd"))
-        for name, samples in self._interpolated:
-            if samples[index].has_position or samples[index].yaw_deg is not None:
-                parts.append((samples[index], name))
-        if self._scan.created_s is not None and t == t:
-            parts.append((Sample(time_s=self._scan.created_s + t), "container"))
-        if not parts:
-            return None
-        # What has a position leads; a bare time stamp only says when.
-        parts.sort(key=lambda part: not part[0].has_position)
-        merged, origin = parts[0]
-        if note.sample is not None and note.sample.time_s is not None:
-            merged = replace(merged, time_s=note.sample.time_s)
-        for sample, _ in parts[1:]:
-            merged = merged.merge(sample)
-        return Pose(
-            merged, " + ".join(dict.fromkeys([origin, *(name for _, name in parts[1:] if name != "container")]))
-        )
-
-    @property
-    def has_positions(self) -> bool:
-        """Whether any source of this video knows positions."""
-        return (
-            any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
-            or any(sample.has_position for _, sample in self._djmd)
-            or bool(self._interpolated)
-        )
-
-    def _own_djmd(self, t: float) -> Sample | None:
-        """The djmd message with the picture's own time."""
-        if not self._djmd:
-            return None
-        i = int(np.argmin(np.abs(self._djmd_times - t)))
-        return self._djmd[i][1] if abs(self._djmd_times[i] - t) < 0.51 * self._interval else None
-
-    def _klv_timeline(self) -> tuple[Timeline | None, float | None]:
-        """KLV over video time, and what to add to video time for UTC."""
-        rows: list[tuple[float | None, int, Sample]] = [
-            (t, after, p.sample)
-            for t, after, p in self._scan.klv_packets
-            if p.sample is not None and p.sample.has_position
-        ]
-        if not rows:
-            return None, None
-        times = self._klv_times(rows)
-        placed = [(t, s) for t, (_, _, s) in zip(times, rows, strict=True) if t is not None]
-        offsets = [s.time_s - t for t, s in placed if s.time_s is not None]
-        clock = float(np.median(offsets)) if offsets else None
-        stamps = [
-            n.sample.time_s - n.video_s
-            for n in self._scan.pictures
-            if n.sample is not None and n.sample.time_s is not None and n.video_s is not None
-        ]
-        if clock is not None and stamps:
-            self.clock_offset_s = float(np.median(stamps)) - clock
-        return _held_timeline([replace(s, time_s=t) for t, s in placed]), clock
-
-    def _klv_times(self, rows: list[tuple[float | None, int, Sample]]) -> list[float | None]:
-        """Video times of KLV packets: their own, else by UTC against the pictures' SEI times, else by place."""
-        if all(t is not None for t, _, _ in rows):
-            return [t for t, _, _ in rows]
-        known = [
-            (n.sample.time_s, n.video_s)
-            for n in self._scan.pictures
-            if n.sample is not None and n.sample.time_s is not None and n.video_s is not None
-        ]
-        utc = [s.time_s for _, _, s in rows if s.time_s is not None]
-        if len(known) > 1 and len(utc) == len(rows):
-            first, last = min(known)[0], max(known)[0]
-            if sum(first - 1.0 <= t <= last + 1.0 for t in utc) > 0.5 * len(utc):
-                shift = float(np.median([v - t for t, v in known]))
-                return [t + shift for t in utc]
-        notes = self._scan.pictures
-        return [notes[min(after, len(notes) - 1)].video_s for _, after, _ in rows]
-
-
-def _held_timeline(samples: list[Sample]) -> Timeline | None:
-    """A timeline whose ends are held for one usual interval (at most a second): pictures stand between samples."""
-    samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
-    if not samples:
-        return None
-    times = np.array([s.time_s for s in samples], dtype=np.float64)
-    usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S
-    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
-    before = replace(samples[0], time_s=float(times[0]) - usual)
-    after = replace(samples[-1], time_s=float(times[-1]) + usual)
-    return Timeline([before, *samples, after], max_gap_s=max(2.0, 4.0 * usual))
-
-
-def _cue_timeline(cues: srt.Subtitles) -> tuple[Timeline | None, float | None]:
-    """Subtitles over video time, and what to add to video time for their clock."""
-    placed = [(cue.start_s, cue.sample) for cue in cues.cues if cue.sample is not None and cue.sample.has_position]
-    if not placed:
-        return None, None
-    offsets = [s.time_s - t for t, s in placed if s.time_s is not None]
-    clock = float(np.median(offsets)) if offsets else None
-    return _held_timeline([replace(s, time_s=t) for t, s in placed]), clock
