@@ -343,6 +343,7 @@ class _Batch:
             "gsd_m": state.gsd_m,
             "basemap": str(self.options.basemap) if self.options.basemap else None,
             "until": self.options.until,
+            "root": _root(state.ingest.frames),
         }
 
 
@@ -420,6 +421,15 @@ def _split_time(stage: Stage, refinement: _Refinement, until: str, with_map: boo
         Stage("coarse: refinement", share * stage.wall_s, share * stage.cpu_s, stage.items),
         Stage("fine: refinement", (1 - share) * stage.wall_s, (1 - share) * stage.cpu_s, stage.items),
     ]
+
+
+def _root(frames: Sequence[Frame]) -> str | None:
+    """The folder that picture names are relative to; None where they are pictures of videos."""
+    for frame in frames:
+        path = frame.path.absolute().as_posix()
+        if path.endswith("/" + frame.image):
+            return path.removesuffix("/" + frame.image) or "/"
+    return None
 
 
 def _stage_row(stage: Stage) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -65,6 +66,17 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
         "pitch_deg": math.degrees(float(pitch)),
         "roll_deg": math.degrees(float(roll)),
     }
+
+
+def takeoff_altitudes(placed: Sequence[PlacedFrame]) -> dict[str, float]:
+    """Absolute altitude of each vehicle's takeoff level, from photos that tell their own; absent where none does."""
+    found: dict[str, list[float]] = {}
+    for p in placed:
+        if p.frame.fix.altitude_m is not None:
+            level = p.frame.fix.altitude_m - float(p.camera.position[2])
+            if -500.0 < level < 9000.0:
+                found.setdefault(p.frame.vehicle, []).append(level)
+    return {vehicle: statistics.median(levels) for vehicle, levels in found.items()}
 
 
 def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
@@ -138,6 +150,10 @@ def write_frames(
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     rows = [frame_row(p, grid, z) for p in placed]
+    levels = takeoff_altitudes(placed)
+    for row in rows:
+        if row["vehicle"] in levels:
+            row["camera"]["altitude_m"] = row["camera"]["height_m"] + levels[row["vehicle"]]
     lines = sorted([*rows, *(rejection_row(r, grid.epsg) for r in rejected)], key=lambda row: str(row["image"]))
     write_text(out / "frames.jsonl", (json.dumps(line, ensure_ascii=False) + "\n" for line in lines))
     polygons = [footprint(p.camera, z, inset_px=-0.5) for p in placed]

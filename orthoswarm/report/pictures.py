@@ -145,11 +145,9 @@ def scale_bar(picture: Picture) -> None:
     length = round(metres / grid.gsd_m)
     x, y = 12, grid.height - 14
     text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
-    for colour, thick in (((255, 255, 255), 5), ((20, 24, 30), 2)):
-        cv2.line(picture.rgb, (x, y), (x + length, y), colour, thick)
-        cv2.putText(
-            picture.rgb, text, (x, y - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, max(1, thick - 1), cv2.LINE_AA
-        )
+    cv2.rectangle(picture.rgb, (x - 6, y - 22), (x + max(length, 44) + 6, y + 6), (255, 255, 255), -1)
+    cv2.line(picture.rgb, (x, y), (x + length, y), (20, 24, 30), 2)
+    cv2.putText(picture.rgb, text, (x, y - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 24, 30), 1, cv2.LINE_AA)
 
 
 def map_edges(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -163,8 +161,8 @@ def map_edges(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np
     if not inside.any():
         return np.zeros(gray.shape, bool)
     high = float(np.percentile(size[inside], 92))
-    edges: NDArray[np.bool_] = np.asarray(cv2.Canny(gx, gy, 0.4 * high, max(high, 1.0), L2gradient=True)) > 0
-    return edges & inside
+    edges = np.asarray(cv2.Canny(gx, gy, 0.4 * high, max(high, 1.0), L2gradient=True), np.uint8)
+    return np.asarray((edges > 0) & inside)
 
 
 def data_uri(rgb: Bytes, quality: int = 82) -> str:
