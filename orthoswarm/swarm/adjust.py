@@ -382,6 +382,8 @@ def _solve(system: _System) -> tuple[Array, Array]:
 def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
     """Place of each free camera in the band (-1 if held) and the band's width in cameras, as narrow as it goes."""
     index = np.flatnonzero(free)
+    if len(index) == 0:
+        return np.full(cameras, -1, np.int32), 0
     local = np.full(cameras, -1, np.int64)
     local[index] = np.arange(len(index))
     use = free[tracks.camera]

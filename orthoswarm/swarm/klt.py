@@ -137,3 +137,30 @@ def track(before, before_half, after, after_half, points, guess, affine, found, 
             continue
         found[k, 0], found[k, 1] = q[0], q[1]
         ok[k] = True
+
+
+@kernel
+def anchor(stack, slot, points, after, affine, limit, found, ok):  # type: ignore[no-untyped-def]
+    """Compare K windows with their first sight, so that errors from picture to picture do not add up.
+
+    Args:
+        stack: uint8 (R, rows, columns), pictures held. slot: int64 (K,), the picture of each first sight.
+        points: float32 (K, 2), where it was seen there. after: the picture now.
+        affine: float64 (K, 2, 2), derivative of the map from `after` back to the first sight.
+        limit: farthest move in pixels. found: float32 (K, 2), in: from picture to picture, out: improved.
+        ok: bool (K,) out, False where the first sight is no longer recognised.
+    """
+    wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
+    q = np.empty(2)
+    for k in range(len(points)):
+        ok[k] = False
+        if not _template(stack[slot[k]], points[k, 0], points[k, 1], affine[k], wide):
+            continue
+        q[0], q[1] = found[k, 0], found[k, 1]
+        error = _refine(after, wide, q, 8)
+        if error < 0 or error > 0.4 * variance(wide) + 4.0:
+            continue
+        if (q[0] - found[k, 0]) ** 2 + (q[1] - found[k, 1]) ** 2 > limit * limit:
+            continue
+        found[k, 0], found[k, 1] = q[0], q[1]
+        ok[k] = True

@@ -113,7 +113,7 @@ def _relative(flight: Flight) -> Surface:
     for k, c in enumerate((1e4, 1e4, 100.0, 100.0, 9.0, 9.0)):
         first = k < 2
         flight.adjustment.step(
-            c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 4.0)
+            c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
         )
         if k >= 3:
             surface = fit_surface(flight.adjustment, surface)

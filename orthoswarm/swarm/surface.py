@@ -38,7 +38,7 @@ class Surface:
         """The ground for rectifying pictures and for the map's lean."""
         return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.lift_m)
 
-    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 4.0) -> Ground:
+    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> Ground:
         """The height prior of points (P, 3)."""
         if self.fit is None:
             expected = np.full(len(points), self.level_m)

@@ -6,6 +6,7 @@ turned and scaled as the prediction says, so that chains survive corners.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,15 +21,24 @@ Gray = NDArray[np.uint8]
 CELL_PX = 80
 BORDER_PX = 9
 FLOW_SIGMA_PX = 0.35
+HELD = 48
+"""Pictures that are held for comparison with first sights."""
+ANCHOR_PX = 1.5
 
 
 @dataclass(slots=True)
 class _Live:
-    """Tracks alive in the last picture: pixel, id, age in pictures."""
+    """Tracks alive in the last picture: pixel, id, age in pictures, first sight (picture number and pixel)."""
 
     uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     age: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor_uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+
+    def take(self, keep: NDArray[Any]) -> "_Live":
+        """Some of the tracks."""
+        return _Live(self.uv[keep], self.ident[keep], self.age[keep], self.anchor[keep], self.anchor_uv[keep])
 
 
 @dataclass(slots=True)
@@ -43,6 +53,8 @@ class Tracker:
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
+    _stack: NDArray[np.uint8] | None = None
+    _chain: list[Array] = field(default_factory=list)
     _next: int = 0
     _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
 
@@ -61,8 +73,13 @@ class Tracker:
         survived = 1.0
         if predicted is None or self._gray is None or self._gray.shape != gray.shape:
             self._live = _Live()
-        elif len(self._live.ident):
-            survived = self._follow(gray, half, predicted)
+            self._chain.append(np.eye(3))
+        else:
+            self._chain.append(predicted @ self._chain[-1])
+            self._chain[-1] /= self._chain[-1][2, 2]
+            if len(self._live.ident):
+                survived = self._follow(gray, half, predicted)
+        self._hold(gray)
         self._start(gray)
         self._log.append((index, self._live.ident.copy(), self._live.uv.copy()))
         self._gray, self._half = gray, half
@@ -93,8 +110,30 @@ class Tracker:
                 good2, found2 = self._flow(gray, half, moved, _apply(moved, live.uv))
                 if good2.sum() > good.sum():
                     good, found = good2, found2
-        self._live = _oldest_per_cell(_Live(found[good], live.ident[good], live.age[good] + 1), gray.shape)
+        kept = live.take(good)
+        kept.uv, kept.age = found[good], kept.age + 1
+        self._to_first_sight(kept, gray)
+        self._live = _oldest_per_cell(kept, gray.shape)
         return float(good.sum()) / max(before, 1)
+
+    def _to_first_sight(self, live: _Live, gray: Gray) -> None:
+        """Compare with the first sight; where it is no longer recognised, the present sight becomes the first."""
+        if self._stack is None or not len(live.uv):
+            return
+        now = len(self._chain) - 1
+        affine = np.empty((len(live.uv), 2, 2))
+        for a in np.unique(live.anchor):
+            mine = live.anchor == a
+            affine[mine] = _backward(self._chain[now] @ np.linalg.inv(self._chain[a]), live.uv[mine])
+        ok = np.zeros(len(live.uv), bool)
+        klt.anchor(self._stack, live.anchor % HELD, live.anchor_uv, gray, affine, ANCHOR_PX, live.uv, ok)
+        lost = ~ok | (now + 1 - live.anchor >= HELD)
+        live.anchor[lost], live.anchor_uv[lost] = now, live.uv[lost]
+
+    def _hold(self, gray: Gray) -> None:
+        if self._stack is None or self._stack.shape[1:] != gray.shape:
+            self._stack = np.zeros((HELD, *gray.shape), np.uint8)
+        self._stack[(len(self._chain) - 1) % HELD] = gray
 
     def _flow(
         self, gray: Gray, half: Gray, predicted: Array, guess: NDArray[np.float32]
@@ -122,6 +161,8 @@ class Tracker:
                 np.concatenate([self._live.uv, uv]),
                 np.concatenate([self._live.ident, ident]),
                 np.concatenate([self._live.age, np.zeros(len(uv), np.int64)]),
+                np.concatenate([self._live.anchor, np.full(len(uv), len(self._chain) - 1)]),
+                np.concatenate([self._live.anchor_uv, uv]),
             )
 
 
@@ -219,7 +260,7 @@ def _oldest_per_cell(live: _Live, shape: tuple[int, ...]) -> _Live:
     order = np.lexsort((live.ident, -live.age))
     _, first = np.unique(cell[order], return_index=True)
     keep = np.sort(order[first])
-    return _Live(live.uv[keep], live.ident[keep], live.age[keep])
+    return live.take(keep)
 
 
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
