@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.lift import draw_positions, ground_lift
 from orthoswarm.swarm.locus import Sweep, dense_ground
-from orthoswarm.swarm.surface import Surface, ground_points
+from orthoswarm.swarm.ground import Surface, ground_points
 
 Array = NDArray[np.float64]
 

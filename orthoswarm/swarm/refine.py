@@ -25,7 +25,7 @@ from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
 from orthoswarm.swarm.settle import resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
-from orthoswarm.swarm.surface import Surface, fit_surface, ground_points
+from orthoswarm.swarm.ground import Surface, fit_surface, ground_points
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
 

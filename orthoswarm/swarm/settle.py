@@ -13,7 +13,7 @@ from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.onmap import shift_cameras
 from orthoswarm.swarm.rig import Tracks
 from orthoswarm.swarm.sights import one_per_cell
-from orthoswarm.swarm.surface import Surface, fit_surface
+from orthoswarm.swarm.ground import Surface, fit_surface
 from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, vote_lean
 
 Array = NDArray[np.float64]

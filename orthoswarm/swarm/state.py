@@ -11,7 +11,7 @@ from orthoswarm.placement import Leg, LegState, PlacedFrame, Solution, Stage, Te
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.rig import CX, CY, WIDTH, F, Rig
-from orthoswarm.swarm.surface import Surface
+from orthoswarm.swarm.ground import Surface
 from orthoswarm.swarm.ties import MapMatches
 
 Array = NDArray[np.float64]
