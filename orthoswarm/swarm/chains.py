@@ -97,3 +97,43 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
     for x in range(count):
         root[x] = _find(parent, x)
     return root
+
+
+def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64], per_cell: int = 3) -> Tracks:
+    """Fewer tracks that still cover every photo evenly: longest first, kept while a photo's cell has room.
+
+    Args:
+        tracks: of N photos.
+        width: (N,) columns of each photo.
+        rows: (N,) rows of each photo.
+        per_cell: observations in each of 8 x 6 cells of a photo from which on longer tracks are needed no more.
+    """
+    if not len(tracks.camera):
+        return tracks
+    length = np.bincount(tracks.point, minlength=tracks.count)
+    order = np.lexsort((tracks.camera, tracks.point, -length[tracks.point]))
+    start = np.flatnonzero(np.r_[True, np.diff(tracks.point[order]) != 0, True])
+    cx = np.clip(tracks.uv[:, 0] * 8 / np.asarray(width)[tracks.camera], 0, 7).astype(np.int64)
+    cy = np.clip(tracks.uv[:, 1] * 6 / np.asarray(rows)[tracks.camera], 0, 5).astype(np.int64)
+    cell = tracks.camera.astype(np.int64) * 48 + cy * 8 + cx
+    keep = np.zeros(len(order), np.bool_)
+    _thin(cell[order], start, per_cell, 48 * len(width), keep)
+    kept = np.sort(order[keep])
+    _, point = np.unique(tracks.point[kept], return_inverse=True)
+    return Tracks(
+        tracks.camera[kept], point.reshape(-1).astype(np.int32), tracks.uv[kept], tracks.sigma_px[kept].copy()
+    )
+
+
+@kernel
+def _thin(cell, start, room, cells, keep):  # type: ignore[no-untyped-def]
+    used = np.zeros(cells, np.int64)
+    for t in range(len(start) - 1):
+        wanted = False
+        for k in range(start[t], start[t + 1]):
+            if used[cell[k]] < room:
+                wanted = True
+        if wanted:
+            for k in range(start[t], start[t + 1]):
+                used[cell[k]] += 1
+                keep[k] = True

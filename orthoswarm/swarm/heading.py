@@ -24,7 +24,7 @@ class TagHeading:
     """How one lens's recorded angles relate to the pictures' headings.
 
     Attributes:
-        source: "yaw", "flight_yaw" or "sum" (gimbal yaw relative to the body), "" if no tag agrees with the pictures.
+        source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
         offset: constant difference picture - tag, radians. agree: share of photos within 20 degrees.
     """
 
@@ -170,7 +170,7 @@ def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHead
         yaw: float64 (N,), the pictures' headings.
     """
     best = TagHeading("", 0.0, 0.0)
-    for source in ("yaw", "flight_yaw", "sum"):
+    for source in ("yaw", "flight_yaw"):
         tag = tag_yaw(records, source)[rows]
         finite = np.isfinite(tag)
         if finite.sum() < 3:
@@ -185,8 +185,4 @@ def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHead
 
 def tag_yaw(records: Records, source: str) -> Array:
     """A recorded heading by name, float64 (N,), NaN where unknown."""
-    if source == "yaw":
-        return records.yaw
-    if source == "flight_yaw":
-        return records.flight_yaw
-    return records.yaw + records.flight_yaw
+    return records.flight_yaw if source == "flight_yaw" else records.yaw

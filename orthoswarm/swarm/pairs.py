@@ -5,7 +5,6 @@ A pair is kept when mutual nearest neighbours agree on one similarity of the pla
 the ground is not flat) and on one epipolar geometry (tightly).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,6 +23,7 @@ _PLANE_SHARE = 0.03
 _EPIPOLAR_STEPS = 1.5
 _SCALES = (0.5, 2.0)
 _SECTORS = 6
+_BEST_DISTANCE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,45 +146,42 @@ def consecutive(group: NDArray[np.integer], time_s: Array, max_gap_s: float = 60
     return np.array(pairs, np.int32).reshape(-1, 2)
 
 
-def nearby(centre: Complex, reach: Array, count: int = 10) -> Ints:
+def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
     """Pairs whose footprints may overlap, spread over all directions, int32 (n, 2), sorted, first < second.
+
+    Each photo chooses from six directions, in each from photos of its own group and of others, those first whose
+    distance is near 0.4 of the reach: nearer ones tell little about relief and tilt, farther ones share little ground.
 
     Args:
         centre: complex (N,), east + i north of the ground that each photo shows in its middle.
         reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
-        count: how many neighbours each photo may choose; each of six directions serves its nearest first.
+        group: integers (N,), leg or segment.
+        count: how many neighbours each photo may choose.
     """
     from scipy.spatial import cKDTree
 
     points = np.stack([centre.real, centre.imag], axis=1)
     tree = cKDTree(points)
     chosen: set[tuple[int, int]] = set()
-    for i in range(len(points)):
-        near = _neighbours(tree, points, i, float(max(reach[i], 1e-6)), 32 * count)
+    for i, close in enumerate(tree.query_ball_point(points, r=np.maximum(reach, 1e-6), return_sorted=True)):
+        near = np.asarray(close, np.int64)
+        near = near[near != i]
         distance = np.abs(centre[near] - centre[i])
-        close = (near != i) & (distance <= 0.5 * (reach[near] + reach[i]))
-        near, distance = near[close], distance[close]
-        order = np.lexsort((near, np.abs(near - i), np.round(distance, 3)))
+        mean = 0.5 * (reach[near] + reach[i])
+        near, distance = near[distance <= mean], (distance / mean)[distance <= mean]
+        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - _BEST_DISTANCE), 3)))
         near = near[order]
-        for j in _round_robin(near, np.angle(centre[near] - centre[i]), count):
+        sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
+        for j in _round_robin(near, sector + _SECTORS * (group[near] != group[i]), count):
             chosen.add((min(i, j), max(i, j)))
     return np.array(sorted(chosen), np.int32).reshape(-1, 2)
 
 
-def _neighbours(tree: object, points: Array, i: int, reach: float, most: int) -> NDArray[np.int64]:
-    """Nearest photos within twice the reach (the other's may be larger), at most so many (many photos of one spot)."""
-    k = min(most, len(points))
-    _, index = tree.query(points[i], k=k, distance_upper_bound=2.0 * reach)  # type: ignore[attr-defined]
-    index = np.atleast_1d(np.asarray(index, np.int64))
-    return index[index < len(points)]
-
-
-def _round_robin(near: NDArray[np.int64], direction: Array, count: int) -> Iterator[int]:
-    """The first of every sector, then the second, until `count`."""
-    sector = np.floor((direction / (2 * np.pi)) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
+def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -> list[int]:
+    """The first of every kind, then the second, until `count`."""
     rank = np.zeros(len(near), np.int64)
-    for s in range(_SECTORS):
-        inside = np.flatnonzero(sector == s)
+    for k in np.unique(kind):
+        inside = np.flatnonzero(kind == k)
         rank[inside] = np.arange(len(inside))
     order = np.lexsort((np.arange(len(near)), rank))
-    return iter(near[order][:count].tolist())
+    return [int(j) for j in near[order][:count]]
