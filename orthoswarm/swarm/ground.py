@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class GroundModel:
     """Ground as it is believed now.
 
     Attributes:
@@ -60,12 +60,12 @@ def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Ar
 
 def fit_surface(
     adjustment: Adjustment,
-    before: Surface,
+    before: GroundModel,
     *,
     kappa: float | None = None,
     extra: tuple[Array, Array] | None = None,
     settings: FitSettings | None = None,
-) -> Surface:
+) -> GroundModel:
     """Fit the ground to the points now (and to extra ones with their sigmas); few points leave it as it was."""
     points, sigma = ground_points(adjustment)
     if extra is not None:
@@ -77,4 +77,4 @@ def fit_surface(
     low, high = position.min(0) - reach, position.max(0) + reach
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     fit = fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings)
-    return Surface(fit, before.level_m, before.lift_m, before.lean)
+    return GroundModel(fit, before.level_m, before.lift_m, before.lean)

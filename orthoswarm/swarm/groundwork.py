@@ -6,18 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.ground import GroundModel, ground_points
 from orthoswarm.swarm.lift import draw_positions, ground_lift
-from orthoswarm.swarm.locus import Sweep, dense_ground
-from orthoswarm.swarm.ground import Surface, ground_points
+from orthoswarm.swarm.locus import LARGE, SMALL, dense_ground
 
 Array = NDArray[np.float64]
 
 CELL_M = 14.0
-LOCUS_SIGMA_M = 0.35
 USUAL_HEIGHT_M = 150.0
 
 
-def with_lift(flight: Flight, surface: Surface) -> Surface:
+def with_lift(flight: Flight, surface: GroundModel) -> GroundModel:
     """The surface with the level of the ground between its points."""
     if surface.fit is None:
         return surface
@@ -29,7 +28,7 @@ def with_lift(flight: Flight, surface: Surface) -> Surface:
     return replace(surface, lift_m=lift.lift_m)
 
 
-def dense_points(flight: Flight, surface: Surface) -> tuple[Array, Array]:
+def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array]:
     """Ground points (K, 3) and their sigmas in the cells that no track holds."""
     rig = flight.rig()
     height = float(np.median(rig.position[:, 2] - surface.level_m))
@@ -38,9 +37,9 @@ def dense_points(flight: Flight, surface: Surface) -> tuple[Array, Array]:
     cells = _empty_cells(rig.position[:, :2], known[:, :2], cell, _half_width(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0)
-    sweep = Sweep().at_height(height)
-    found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg, sweep)
-    return found.points, np.full(len(found.points), LOCUS_SIGMA_M * height / USUAL_HEIGHT_M)
+    sweeps = (SMALL.at_height(height), LARGE.at_height(height))
+    found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg, sweeps)
+    return found.points, found.sigma_z
 
 
 def _half_width(flight: Flight) -> float:

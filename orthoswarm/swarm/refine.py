@@ -18,6 +18,7 @@ from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow, Solution, Terrain
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight, open_flight
+from orthoswarm.swarm.ground import GroundModel, fit_surface, ground_points
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.levels import level_network
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
@@ -25,7 +26,6 @@ from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
 from orthoswarm.swarm.settle import resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
-from orthoswarm.swarm.ground import Surface, fit_surface, ground_points
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
 
@@ -107,9 +107,9 @@ def solo(
     return state
 
 
-def _relative(flight: Flight) -> Surface:
+def _relative(flight: Flight) -> GroundModel:
     """The adjustment without a map, its ground fitted as soon as the points allow."""
-    surface = Surface()
+    surface = GroundModel()
     for k, c in enumerate((1e4, 1e4, 100.0, 100.0, 9.0, 9.0)):
         first = k < 2
         flight.adjustment.step(

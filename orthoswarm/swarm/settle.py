@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Adjustment, Ties
 from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import with_lift
 from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.onmap import shift_cameras
 from orthoswarm.swarm.rig import Tracks
 from orthoswarm.swarm.sights import one_per_cell
-from orthoswarm.swarm.ground import Surface, fit_surface
 from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, vote_lean
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class Settled:
         links: observations added between legs.
     """
 
-    surface: Surface
+    surface: GroundModel
     ties: Ties
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
@@ -51,7 +51,7 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
 
 
 def tie_round(
-    flight: Flight, surface: Surface, ground: LoadedMap, cell_m: float, reach_m: float, half_m: float = 10.0
+    flight: Flight, surface: GroundModel, ground: LoadedMap, cell_m: float, reach_m: float, half_m: float = 10.0
 ) -> MapMatches:
     """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`."""
     adj = flight.adjustment
@@ -87,7 +87,7 @@ def as_ties(matches: MapMatches, points: Array) -> Ties:
     return Ties(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
-def roof_round(flight: Flight, surface: Surface, ground: LoadedMap) -> tuple[MapMatches, Array]:
+def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Raised points found on the map, and their heights over the ground."""
     adj = flight.adjustment
     seen = flight.sights()
@@ -134,7 +134,7 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
 
 
 def settle(
-    flight: Flight, basemap: MapWindow, origin: Array, surface: Surface, lean: tuple[float, float] | None
+    flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel, lean: tuple[float, float] | None
 ) -> Settled:
     """Two rounds of ties and links; the flight must lie within some metres of the map already.
 
@@ -164,15 +164,17 @@ def settle(
 
 
 def resettle(
-    flight: Flight, basemap: MapWindow, origin: Array, surface: Surface, ties: Ties
-) -> tuple[Surface, Ties, MapMatches]:
+    flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel, ties: Ties
+) -> tuple[GroundModel, Ties, MapMatches]:
     """Fresh ties and four iterations, for a flight that lies on the map already (level or lean may have moved)."""
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
     return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)
 
 
-def _second_round(flight: Flight, ground: LoadedMap, surface: Surface, rounds: int) -> tuple[Surface, Ties, MapMatches]:
+def _second_round(
+    flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
+) -> tuple[GroundModel, Ties, MapMatches]:
     matches = accepted(tie_round(flight, surface, ground, 30.0, 5.0))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):

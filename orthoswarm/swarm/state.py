@@ -10,8 +10,8 @@ from orthoswarm.camera import fov_rad
 from orthoswarm.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.ground import GroundModel
 from orthoswarm.swarm.rig import CX, CY, WIDTH, F, Rig
-from orthoswarm.swarm.ground import Surface
 from orthoswarm.swarm.ties import MapMatches
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class VehicleState:
     vehicle: str
     flight: Flight
     coarse: Rig
-    surface: Surface
+    surface: GroundModel
     ties: Ties
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
