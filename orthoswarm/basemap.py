@@ -326,7 +326,7 @@ def _band_roles(source: Any) -> tuple[list[int], int | None, Bytes | None]:
 
 def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None) -> tuple[float, Bounds]:
     """Pixel size on the ground and bounds in the area's grid; of a huge map, of the part around the area."""
-    from rasterio.errors import RasterioError
+    from rasterio.errors import CRSError, RasterioError
     from rasterio.transform import from_gcps
     from rasterio.warp import transform, transform_bounds
 
@@ -346,7 +346,7 @@ def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None
         middle = _apply(~affine, 0.5 * (own[0] + own[2]), 0.5 * (own[1] + own[3]))
         steps = [_apply(affine, middle[0] + dx, middle[1] + dy) for dx, dy in ((0, 0), (1, 0), (0, 1))]
         x, y = (np.array(v) for v in transform(crs, target, *zip(*steps, strict=True)))
-    except RasterioError as error:
+    except (CRSError, RasterioError) as error:
         raise InputError(
             f"the basemap {path.name} cannot be brought to the area's grid ({_short(error)}); check its CRS"
         ) from None

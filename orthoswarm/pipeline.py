@@ -3,6 +3,7 @@
 load -> real time (paper III.B) -> coarse and fine refinement, vehicle by vehicle (III.C, III.D) -> final pictures.
 """
 
+import logging
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -183,6 +184,11 @@ class _Batch:
                 refinement = self.call_refiner(frames, state)
             except OrthoSwarmError as error:
                 state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
+                return None
+            except Exception as error:  # in the field a rough map is better than none; the fault is told in full
+                logging.getLogger(__name__).exception("the refinement failed")
+                fault = f"{type(error).__name__}: {error}"
+                state.warnings.append(f"the refinement failed ({fault}); the map is the real-time one")
                 return None
         stages = _split_time(stage, refinement, self.options.until, state.basemap is not None)
         self.clock.stages += stages

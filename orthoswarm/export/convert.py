@@ -22,7 +22,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
     """
     import rasterio
     import rasterio.shutil
-    from rasterio.errors import RasterioError
+    from rasterio.errors import CRSError, RasterioError
     from rasterio.vrt import WarpedVRT
 
     settings: dict[str, Any] = {
@@ -39,6 +39,6 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
             crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
                 rasterio.shutil.copy(raster if crs == raster.crs else vrt, part, **settings)
-    except RasterioError as error:
+    except (CRSError, RasterioError) as error:
         text = str(error).splitlines()[0]
         raise InputError(f"{source.name} cannot be written as asked ({text}); check --epsg") from None

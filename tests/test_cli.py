@@ -1,0 +1,75 @@
+"""The command line: fast, helpful, and with the right exit codes."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gcs_plugin import cli
+from gcs_plugin.checkup import checks, find_weights
+from orthoswarm import __version__
+
+HEAVY = {"numpy", "torch", "kornia", "numba", "cv2", "rasterio", "matplotlib", "pymavlink", "av", "rich", "scipy"}
+
+
+def python(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize("args", [[], ["--help"], ["mosaic", "--help"], ["export", "--help"], ["doctor", "--help"]])
+def test_help_imports_nothing_heavy(args):
+    code = f"import sys; from gcs_plugin.cli import main; main({args!r}); print(sorted(sys.modules), file=sys.stdout)"
+    loaded = python(code).splitlines()[-1]
+    assert not {name for name in HEAVY if f"'{name}'" in loaded}
+
+
+def test_help_answers_at_once():
+    def seconds():
+        started = time.perf_counter()
+        python("from gcs_plugin.cli import main; main(['--help'])")
+        return time.perf_counter() - started
+
+    assert min(seconds() for _ in range(3)) < 2.0  # the goal is 0.2 s on an idle machine
+
+
+@pytest.mark.parametrize("verb", sorted(cli.VERBS))
+def test_every_verb_has_help_with_an_example(verb, capsys):
+    assert cli.main([verb, "--help"]) == 0
+    assert "example" in capsys.readouterr().out
+
+
+def test_exit_codes(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.split() == ["orthoswarm", __version__]
+    assert cli.main([]) == 2
+    assert cli.main(["fly"]) == 2
+    assert "there is no verb 'fly'" in capsys.readouterr().err
+    assert cli.main(["mosaic"]) == 2
+
+
+def test_doctor_says_what_is_there(capsys, tmp_path):
+    assert cli.main(["doctor", "--json", "--workspace", str(tmp_path / "not" / "yet")]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = {c["name"]: c for c in document["checks"]}
+    assert document["ok"] and {"python", "cores", "memory", "disk", "jpeg", "video", "gpu", "kernels"} <= set(found)
+    assert all(c["cost"] for c in found.values() if not c["ok"])
+    assert cli.main(["doctor"]) == 0
+    assert "map driver GTiff" in capsys.readouterr().out
+
+
+def test_doctor_survives_what_it_looks_at(monkeypatch, tmp_path):
+    import gcs_plugin.checkup
+
+    def broken():
+        raise RuntimeError("no such library")
+
+    monkeypatch.setattr(gcs_plugin.checkup, "_video", broken)
+    (video,) = (c for c in checks(tmp_path) if c.name == "video")
+    assert not video.ok and "no such library" in video.detail
+
+
+def test_weights_are_found_in_their_packages_only():
+    assert find_weights("no-such-package", "xfeat") is None
+    assert find_weights("numpy", "xfeat") is None
