@@ -1,0 +1,122 @@
+"""One height level for vehicles that were solved alone: a small network of their differences over common ground."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+
+SPREAD_FLAT_M, SPREAD_RELIEF_M = 0.8, 1.6
+"""Spread of the levels up to which the zero is the least lifted vehicle's, and from which it is the mean's."""
+
+
+@dataclass(frozen=True, slots=True)
+class LevelNetwork:
+    """Corrections that bring vehicles to a common level.
+
+    Attributes:
+        correction_m: float64 (V,), to be added to each vehicle's heights; 0 for vehicles without common ground.
+        sigma_m: float64 (V,), one sigma of each against the mean of its component; NaN without common ground.
+        component: int64 (V,), number of the connected component that each vehicle belongs to.
+        pairs: int64 (E, 2), pairs with enough common ground.
+        difference_m: float64 (E,), height of the first over the second there.
+        residual_m: float64 (E,), what the network does not explain of it.
+    """
+
+    correction_m: Array
+    sigma_m: Array
+    component: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    difference_m: Array
+    residual_m: Array
+
+
+def level_network(
+    ground: Sequence[Array], *, radius_m: float = 25.0, neighbours: int = 3, least: int = 15
+) -> LevelNetwork:
+    """Level vehicles on each other by their ground points.
+
+    Every vehicle's own datum holds the mode of ITS points at the takeoff level. Rubble and bushes lift that mode
+    over the ground, so a vehicle's ground can only come out too low: where the levels differ little, the vehicle
+    that needs the least correction is right and stays (a low quantile of many, as the lowest of many is noise).
+    Large differences come from relief, where each vehicle took the median of its own piece for the takeoff level:
+    then the mean is the best guess. Between SPREAD_FLAT_M and SPREAD_RELIEF_M the anchor moves from one to the
+    other, so that it does not jump when a vehicle joins. Levels are never chained from the first vehicle.
+
+    Args:
+        ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame.
+        radius_m: greatest horizontal distance of a point to the other vehicle's points.
+        neighbours: points of the other vehicle that must lie within it (their median height is compared).
+        least: common points that make a pair.
+    """
+    count = len(ground)
+    trees = [cKDTree(g[:, :2]) if len(g) >= neighbours else None for g in ground]
+    pairs: list[tuple[int, int]] = []
+    difference: list[float] = []
+    sigma: list[float] = []
+    for i in range(count):
+        for j in range(i + 1, count):
+            d = _common_difference(ground[i], ground[j], trees[i], trees[j], radius_m, neighbours)
+            if len(d) >= least:
+                pairs.append((i, j))
+                difference.append(float(np.median(d)))
+                spread = 1.4826 * float(np.median(np.abs(d - difference[-1])))
+                sigma.append(float(np.hypot(1.25 * spread / np.sqrt(len(d)), 0.03)))
+    edge = np.array(pairs, np.int64).reshape(-1, 2)
+    return _adjust(count, edge, np.array(difference, float), np.array(sigma, float))
+
+
+def _common_difference(
+    a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None, radius: float, k: int
+) -> Array:
+    """Heights of a over b, at the points of both where they meet."""
+    if tree_a is None or tree_b is None:
+        return np.empty(0)
+    low, high = np.maximum(a.min(0), b.min(0)) - radius, np.minimum(a.max(0), b.max(0)) + radius
+    parts = []
+    for points, other, tree, sign in ((a, b, tree_b, 1.0), (b, a, tree_a, -1.0)):
+        near = points[((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2])).all(1)]
+        if len(near) == 0:
+            continue
+        distance, index = tree.query(near[:, :2], k=k, distance_upper_bound=radius)
+        ok = np.isfinite(distance).reshape(len(near), k).all(1)
+        parts.append(sign * (near[ok, 2] - np.median(other[index.reshape(len(near), k)[ok], 2], axis=1)))
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), (count, count))
+    component = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    normal, rhs = np.zeros((count, count)), np.zeros(count)
+    weight = 1.0 / sigma**2
+    for (i, j), d, w in zip(edge, difference, weight, strict=True):
+        # level_i - level_j = d
+        normal[[i, j], [i, j]] += w
+        normal[[i, j], [j, i]] -= w
+        rhs[i] += w * d
+        rhs[j] -= w * d
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    level = inverse @ rhs
+    correction = np.zeros(count)
+    for number in np.unique(component):
+        members = np.flatnonzero(component == number)
+        c = -(level[members] - level[members].mean())
+        correction[members] = c - _anchor(c)
+    degree = np.bincount(edge.ravel(), minlength=count)
+    sd = np.where(degree > 0, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.nan)
+    residual = difference - (level[edge[:, 0]] - level[edge[:, 1]])
+    return LevelNetwork(correction, sd, component, edge, difference, residual)
+
+
+def _anchor(correction: Array) -> float:
+    """Which of the corrections (about their mean) becomes zero."""
+    lowest = float(np.quantile(correction, 0.1 if len(correction) > 10 else 0.0))
+    spread = float(np.quantile(correction, 0.9 if len(correction) > 10 else 1.0)) - lowest
+    share = float(np.clip((spread - SPREAD_FLAT_M) / (SPREAD_RELIEF_M - SPREAD_FLAT_M), 0.0, 1.0))
+    return (1.0 - share) * lowest

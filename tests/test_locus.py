@@ -1,0 +1,212 @@
+"""Heights at free positions from pictures of one leg, on rendered scenes of known shape."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from orthoswarm.camera import rotation_from_angles
+from orthoswarm.placement import Terrain
+from orthoswarm.swarm.lift import draw_positions, ground_lift, mode
+from orthoswarm.swarm.locus import LARGE, dense_ground
+from orthoswarm.swarm.rig import Rig
+
+WIDTH, HEIGHT, FOCAL = 400, 300, 190.0
+TEXTURE_M = 0.4
+
+
+def texture(seed=0, size=1100):
+    rng = np.random.default_rng(seed)
+    t = sum(a * cv2.GaussianBlur(rng.normal(0, 1, (size, size)), (0, 0), s) * s for s, a in ((1.2, 22), (4, 25)))
+    return np.clip(120 + t, 0, 255).astype(np.float32)
+
+
+def hill(xy):
+    return 3 * np.sin(xy[..., 0] / 45.0) * np.cos(xy[..., 1] / 60.0) + 2.0
+
+
+def rig_of(legs=2, per_leg=12, spacing=18.0, tilt_deg=3.0, k1=0.0, seed=0, height=100.0):
+    """Legs 60 m apart, the second one flown back, with the wobble of a real flight."""
+    rng = np.random.default_rng(seed)
+    position, rotation, leg = [], [], []
+    for number in range(legs):
+        for i in range(per_leg):
+            along = i * spacing if number % 2 == 0 else (per_leg - 1 - i) * spacing
+            position.append(
+                [60.0 * number + rng.normal(0, 0.5), along + rng.normal(0, 0.5), height + rng.normal(0, 0.3)]
+            )
+            yaw = np.pi * (number % 2) + 0.2 + rng.normal(0, 0.01)
+            tilt = np.radians(tilt_deg) * rng.normal(0, 1, 2) / 2
+            rotation.append(rotation_from_angles(yaw, -np.pi / 2 + tilt[0], tilt[1]))
+            leg.append(number)
+    lens = np.array([[FOCAL, k1, 0, 0, 0, 0, WIDTH, HEIGHT]])
+    rig = Rig(np.array(position), np.array(rotation), np.zeros(len(leg), np.int32), lens)
+    return rig, np.array(leg)
+
+
+def render(rig, i, surface, picture, noise=1.5):
+    """What camera i sees of a gentle surface with a texture draped over it (origin 200 m south-west of zero)."""
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
+    uv = np.c_[columns.ravel(), rows.ravel()]
+    index = np.full(len(uv), i)
+    z = np.zeros(len(uv))
+    for _ in range(6):
+        xy = rig.to_ground(index, uv, z)
+        z = surface(xy)
+    at = ((xy + 200.0) / TEXTURE_M).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
+    out = cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    gain = 1 + 0.1 * np.sin(i)
+    out = out * gain + np.random.default_rng(i).normal(0, noise, out.shape)
+    return np.clip(out, 0, 255).astype(np.uint8)
+
+
+class Pictures:
+    def __init__(self, rig, surface, picture=None):
+        self.made = [render(rig, i, surface, texture() if picture is None else picture) for i in range(len(rig))]
+        self.read = []
+
+    def __call__(self, i):
+        self.read.append(i)
+        return self.made[i]
+
+
+@pytest.fixture(scope="module")
+def hilly():
+    rig, leg = rig_of()
+    return rig, leg, Pictures(rig, hill)
+
+
+def cells(step=9.0, pad=40.0):
+    east, north = np.meshgrid(np.arange(-pad, 60 + pad, step), np.arange(-pad, 198 + pad, step))
+    return np.c_[east.ravel(), north.ravel()]
+
+
+SWEEP = (LARGE.at_height(100.0),)
+
+
+def test_the_sweep_finds_the_surface_to_decimetres(hilly):
+    rig, leg, gray = hilly
+    found = dense_ground(rig, gray, cells(), Terrain.flat(0.0), leg, SWEEP)
+    error = found.points[:, 2] - hill(found.points[:, :2])
+    assert len(found.points) > 0.8 * len(cells())
+    assert abs(np.median(error)) < 0.05
+    assert np.median(np.abs(error)) < 0.12
+    assert (np.abs(error) > 1.0).mean() < 0.01
+    assert (found.score >= SWEEP[0].min_score).all() and found.score.max() <= 1.0
+
+
+def test_points_stay_by_their_cells(hilly):
+    rig, leg, gray = hilly
+    found = dense_ground(rig, gray, cells(), Terrain.flat(0.0), leg, SWEEP)
+    beside = np.hypot(*(found.points[:, :2] - cells()[found.cell]).T)
+    assert beside.max() < 8.0
+    assert len(np.unique(found.cell)) == len(found.cell)
+
+
+def test_distortion_is_honoured():
+    rig, leg = rig_of(legs=1, k1=-0.06)
+    gray = Pictures(rig, hill)
+    at = cells(pad=30)[:, :]
+    found = dense_ground(rig, gray, at, Terrain.flat(0.0), leg, SWEEP)
+    error = found.points[:, 2] - hill(found.points[:, :2])
+    assert len(error) > 100
+    assert np.median(np.abs(error)) < 0.12
+
+
+def test_results_do_not_depend_on_how_many_pictures_are_held(hilly):
+    rig, leg, gray = hilly
+    wide = dense_ground(rig, gray, cells(), Terrain.flat(1.0), leg, SWEEP, slots=64)
+    gray.read.clear()
+    narrow = dense_ground(rig, gray, cells(), Terrain.flat(1.0), leg, SWEEP, slots=2)
+    np.testing.assert_array_equal(wide.points, narrow.points)
+    assert len(gray.read) < 4 * len(rig)
+
+
+def test_each_picture_is_read_once_when_the_window_is_wide(hilly):
+    rig, leg, gray = hilly
+    gray.read.clear()
+    dense_ground(rig, gray, cells(), Terrain.flat(1.0), leg, SWEEP)
+    assert len(gray.read) == len(set(gray.read))
+
+
+def test_cameras_without_a_leg_are_not_used(hilly):
+    rig, leg, gray = hilly
+    gray.read.clear()
+    without = np.where(np.arange(len(rig)) == 3, -1, leg)
+    dense_ground(rig, gray, cells(), Terrain.flat(1.0), without, SWEEP)
+    assert 3 not in gray.read
+    nothing = dense_ground(rig, gray, cells(), Terrain.flat(1.0), np.full(len(rig), -1), SWEEP)
+    assert nothing.points.shape == (0, 3)
+
+
+def test_featureless_ground_gives_nothing():
+    rig, leg = rig_of(legs=1)
+    gray = Pictures(rig, hill, np.full((1100, 1100), 130.0, np.float32))
+    found = dense_ground(rig, gray, cells(pad=20), Terrain.flat(0.0), leg, SWEEP)
+    assert len(found.points) < 0.02 * len(cells(pad=20))
+
+
+def test_a_repeating_texture_is_resolved_by_several_baselines_and_refused_with_one():
+    rig, leg = rig_of(legs=1, tilt_deg=0.0)
+    stripes = np.tile((120 + 60 * np.sin(np.arange(1100) * 0.785))[:, None], (1, 1100)).astype(np.float32)
+    gray = Pictures(rig, hill, stripes)  # repeats along the flight every 3.2 m
+    middle = cells(pad=20)[np.abs(cells(pad=20)[:, 1] - 99) < 25]  # seen from 54 m fore and aft
+    found = dense_ground(rig, gray, middle, Terrain.flat(0.0), leg, SWEEP)
+    assert len(found.points) > 0.8 * len(middle)
+    assert np.percentile(np.abs(found.points[:, 2] - hill(found.points[:, :2])), 95) < 0.5
+    lone = dense_ground(rig, gray, middle, Terrain.flat(0.0), leg, [replace(SWEEP[0], baselines_m=(54.0,))])
+    assert len(lone.points) < 0.1 * len(middle)
+
+
+def test_positions_nobody_sees_are_left_out(hilly):
+    rig, leg, gray = hilly
+    far = np.array([[900.0, 900.0], [30.0, 100.0]])
+    found = dense_ground(rig, gray, far, Terrain.flat(1.0), leg, SWEEP)
+    assert 0 not in found.cell
+
+
+def test_large_pictures_are_shrunk_to_what_the_sweep_needs():
+    rig, leg = rig_of(legs=1)
+    gray = Pictures(rig, hill)
+    fine = rig.lens.copy()
+    fine[:, [0, 6, 7]] *= 3
+    double = Rig(rig.position, rig.rotation, rig.lens_id, fine)
+    big = lambda i: cv2.resize(gray(i), (3 * WIDTH, 3 * HEIGHT), interpolation=cv2.INTER_LINEAR)  # noqa: E731
+    coarse = dense_ground(rig, gray, cells(pad=20), Terrain.flat(0.0), leg)
+    shrunk = dense_ground(double, big, cells(pad=20), Terrain.flat(0.0), leg)
+    assert len(shrunk.points) > 0.8 * len(coarse.points)
+    error = shrunk.points[:, 2] - hill(shrunk.points[:, :2])
+    assert np.median(np.abs(error)) < 0.2
+
+
+def test_the_lift_tells_the_level_of_the_ground(hilly):
+    rig, leg, gray = hilly
+    positions = draw_positions(rig.position[:, :2], count=500, spread_m=30.0)
+    high = Terrain(-300.0, -300.0, 5.0, np.zeros((160, 120), np.float32))
+    east, north = np.meshgrid(-300 + 5.0 * np.arange(120), -300 + 5.0 * np.arange(160))
+    for offset in (0.0, 0.4):
+        surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
+        lift = ground_lift(rig, gray, positions, surface, leg)
+        assert lift.count > 200
+        assert lift.lift_m == pytest.approx(-offset, abs=0.08)
+
+
+def test_too_few_heights_give_no_lift(hilly):
+    rig, leg, gray = hilly
+    lift = ground_lift(rig, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
+    assert lift.lift_m == 0.0
+
+
+def test_positions_are_drawn_alike_every_time():
+    xy = np.c_[np.arange(50.0), np.arange(50.0)]
+    a, b = draw_positions(xy), draw_positions(xy)
+    np.testing.assert_array_equal(a, b)
+    assert a.shape == (900, 2)
+    assert (a.min(0) > -46).all() and (a.max(0) < 96).all()
+
+
+def test_the_mode_ignores_a_long_tail():
+    rng = np.random.default_rng(0)
+    values = np.r_[rng.normal(-0.3, 0.1, 300), rng.uniform(-0.5, 8, 500)]
+    assert mode(values, 0.2) == pytest.approx(-0.28, abs=0.08)
