@@ -11,6 +11,8 @@ from orthoswarm.errors import OrthoSwarmError
 # verb -> one line of help; the module is gcs_plugin.commands.<verb>, with configure(parser) and run(args) -> int.
 VERBS = {
     "mosaic": "make a georeferenced orthoimage from drone photos",
+    "inspect": "say what photos, videos and logs hold and what is suspicious about them",
+    "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
     "twin": "make a set of photos, map and truth of a digital twin city",
     "evaluate": "measure an orthoimage against a reference, and poses against truth",

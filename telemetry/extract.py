@@ -206,17 +206,23 @@ def extract(
     return result
 
 
+def encode_jpeg(rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> bytes:
+    """A picture, uint8 (rows, columns, 3), as JPEG."""
+    import simplejpeg
+
+    return bytes(
+        simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420")
+    )
+
+
 def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> None:
     """Write a picture as JPEG under its name once it is whole.
 
     Raises:
         OSError: it cannot be written.
     """
-    import simplejpeg
-
-    data = simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420")
     temporary = path.with_suffix(".part")
-    temporary.write_bytes(data)
+    temporary.write_bytes(encode_jpeg(rgb, quality=quality))
     os.replace(temporary, path)
 
 

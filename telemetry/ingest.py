@@ -17,6 +17,7 @@ from orthoswarm.errors import InputError
 from orthoswarm.frame import Fix, Frame, Ingest, Rejection
 from telemetry import posetable
 from telemetry.attitude import check_legs, decide
+from telemetry.checks import flight_findings
 from telemetry.container import NotAPicture
 from telemetry.course import courses_deg, local_metres, straight_legs
 from telemetry.discover import Discovery, Folder, discover, natural_key
@@ -76,6 +77,7 @@ class Survey:
     """Everything that was found out about a set of inputs."""
 
     root: Path
+    discovery: Discovery | None = None
     sources: list[SourceInfo] = field(default_factory=list)
     rejected: list[Rejection] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
@@ -117,7 +119,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
 
     options = options or LoadOptions()
     found = discover([Path(path) for path in inputs], options.exclude)
-    result = Survey(found.root)
+    result = Survey(found.root, found)
     tables = _tables(found, result)
     total = sum(len(folder.pictures) for folder in found.folders)
     done = 0
@@ -164,7 +166,8 @@ def _photo_folder(
     result: Survey,
 ) -> None:
     """Read one folder's photos into one source."""
-    source = SourceInfo(found.name(folder.path), "photos")
+    name = found.name(folder.path)
+    source = SourceInfo(folder.path.name if name == "." else name, "photos")
     groups: dict[str, list[PhotoTags]] = {}
     seen = 0
     for path, photo in zip(
@@ -187,6 +190,7 @@ def _photo_folder(
         photos = sorted(groups[vehicle], key=_photo_key)
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
+        source.findings += flight_findings(photos, frames, vehicle)
     source.counts["frames"] = len(source.frames)
     if seen:
         result.sources.append(source)

@@ -37,6 +37,7 @@ class PhotoTags:
         make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
         band: name of the spectral band, "" for a colour picture.
         fov_hint_rad: horizontal field of view from focal length tags.
+        dewarp_k1: radial distortion that the tags state for a picture which still has it.
         yaw_is_stated: True where the source defines its yaw as the picture's, so that nothing is left to choose.
         origin: field -> where it came from.
     """
@@ -58,6 +59,7 @@ class PhotoTags:
     camera: str = ""
     band: str = ""
     fov_hint_rad: float | None = None
+    dewarp_k1: float | None = None
     yaw_is_stated: bool = False
     origin: dict[str, str] = field(default_factory=dict)
 
@@ -250,11 +252,23 @@ def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     if zoom > 1.0:
         key.append(f"zoom{zoom:.1f}")
     photo.camera = " ".join([*key, *filter(None, (sensor, photo.band))])
+    photo.dewarp_k1 = _dewarp_k1(found)
     for hint, source in _fov_hints(photo, found, tags, focal, focal_35, max(zoom, 1.0)):
         if hint is not None and math.radians(2.0) < hint < math.radians(150.0):
             photo.fov_hint_rad = hint
             photo.origin["fov_hint"] = source
             return
+
+
+def _dewarp_k1(found: xmp.Properties) -> float | None:
+    """k1 of DJI's "date;fx,fy,cx,cy,k1,k2,p1,p2,k3" where the picture was not dewarped by the camera."""
+    if xmp.number(found, "drone-dji:DewarpFlag") != 0.0:
+        return None
+    numbers = found.get("drone-dji:DewarpData", "").partition(";")[2].split(",")
+    try:
+        return float(numbers[4])
+    except (IndexError, ValueError):
+        return None
 
 
 def _fov_hints(

@@ -195,7 +195,10 @@ def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
             f"positions have {decimals} decimals only, steps of {111_195 * 10.0**-decimals:.0f} m"
         )
     if all(s.yaw_deg is None and s.flight_yaw_deg is None for s in placed):
-        result.notes["srt-no-attitude"] = "the subtitles hold no yaw; it comes from the course"
+        result.notes["srt-no-attitude"] = "the subtitles hold no yaw; it has to come from the course and the pictures"
+    tuples = [_TUPLE.search(block.text) is not None for block in blocks]
+    if 0 < sum(t and s is not None and s.has_position for t, s in zip(tuples, samples)) < len(placed):
+        result.notes["srt-mixed"] = "the subtitles mix two layouts: recordings of two cameras were joined"
     starts = [cue.start_s for cue in result.cues]
     if any(later < earlier for earlier, later in pairwise(starts)):
         result.notes["time-backwards"] = "the times of the subtitles go backwards; they are put in order"
