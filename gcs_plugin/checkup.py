@@ -43,24 +43,25 @@ class Check:
 
 def checks(workspace: Path) -> list[Check]:
     """Look at everything; never raises."""
+    looks: dict[str, Callable[[], Check | list[Check]]] = {
+        "python": _python,
+        "cores": _cores,
+        "memory": _memory,
+        "disk": lambda: _disk(workspace),
+        "jpeg": _jpeg,
+        "map drivers": _maps,
+        "video": _video,
+        "weights": _weights,
+        "gpu": _gpu,
+        "kernels": _kernels,
+        "cluster": _cluster,
+    }
     out: list[Check] = []
-    for look in (
-        _python,
-        _cores,
-        _memory,
-        lambda: _disk(workspace),
-        _jpeg,
-        _maps,
-        _video,
-        _weights,
-        _gpu,
-        _kernels,
-        _cluster,
-    ):
+    for name, look in looks.items():
         try:
             found = look()
         except Exception as error:  # a check-up must not fall ill itself
-            found = Check(getattr(look, "__name__", "check").strip("_"), False, f"could not be checked: {error}")
+            found = Check(name, False, f"could not be checked: {error}", cost="install OrthoSwarm again")
         out += [found] if isinstance(found, Check) else found
     return out
 
