@@ -1,11 +1,13 @@
 """Where work runs: in this process, or in several processes of this machine (paper III.E).
 
 Work is a function of one item. Results come back in the order of the items, so that nothing depends on the number
-of workers or on which of them was faster. Items and results are pickled: hand over paths and small arrays.
+of workers or on which of them was faster. Every item is pickled, also for work in this process, so that a function
+that changes what it was given changes the same copy everywhere: hand over paths and small arrays.
 """
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import time
@@ -66,7 +68,7 @@ class Serial:
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
-        return map(function, items)
+        return (function(_own(item)) for item in items)
 
     def usage(self) -> Usage:
         """See Workers."""
@@ -94,7 +96,7 @@ class Processes:
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         if self.count == 1:
-            yield from map(function, items)
+            yield from (function(_own(item)) for item in items)
             return
         source = iter(items)
         queue: deque[Future[_Outcome[Result]]] = deque()
@@ -176,10 +178,16 @@ def _measured(function: Callable[[Item], Result], item: Item) -> _Outcome[Result
     return _Outcome(value, os.getpid(), time.process_time(), peak_rss_mb())
 
 
+def _own(item: Item) -> Item:
+    """A copy that nobody else sees, as another process would get it."""
+    copy: Item = pickle.loads(pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
+    return copy
+
+
 def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Result]]":
     future: Future[_Outcome[Result]] = Future()
     try:
-        future.set_result(_Outcome(function(item), os.getpid(), 0.0, 0.0))
+        future.set_result(_Outcome(function(_own(item)), os.getpid(), 0.0, 0.0))
     except Exception as error:
         future.set_exception(error)
     return future

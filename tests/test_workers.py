@@ -14,6 +14,11 @@ def square(n):
     return n * n
 
 
+def grow(numbers):
+    numbers.append(1)
+    return len(numbers) - 1
+
+
 def where(_):
     end = time.perf_counter() + 0.05
     while time.perf_counter() < end:
@@ -45,6 +50,14 @@ def test_results_do_not_depend_on_the_number_of_workers():
     with Processes(3) as three:
         assert list(three.map(square, iter(items))) == expected
         assert list(three.map(square, [])) == []
+
+
+def test_a_function_changes_a_copy_of_its_own():
+    shared = [0]
+    for count in (1, 2):
+        with Processes(count) as some:
+            assert list(some.map(grow, [shared] * 6)) == [1] * 6
+    assert list(Serial().map(grow, [shared] * 3)) == [1] * 3 and shared == [0]
 
 
 def test_the_caller_works_too_and_the_others_are_measured():
