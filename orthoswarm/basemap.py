@@ -6,6 +6,7 @@ alpha, nodata, a rotated or foreign grid) leaves here as 8-bit values and a mask
 
 import os
 import threading
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -162,14 +163,16 @@ class _Raster:
 
     def _open(self, level: int | None = None) -> Any:
         import rasterio
-        from rasterio.errors import RasterioIOError
+        from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
         handles: dict[Any, Any] = self._handles.__dict__
         key = (os.getpid(), level)
         if key not in handles:
             options = {} if level is None else {"OVERVIEW_LEVEL": level}
             try:
-                handles[key] = rasterio.open(self._path, **options)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said as an error, in plain words
+                    handles[key] = rasterio.open(self._path, **options)
             except (RasterioIOError, OSError):
                 raise InputError(
                     f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"

@@ -221,7 +221,6 @@ def test_a_map_without_crs_is_refused(tmp_path):
         Basemap.open(path, EPSG, AREA)
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_a_plain_picture_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "m.png"), np.zeros((50, 50), np.uint8))
     with pytest.raises(InputError, match="no coordinate system"):
