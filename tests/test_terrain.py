@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthoswarm.errors import OrthoSwarmError
-from orthoswarm.swarm.surface import FitSettings
+from orthoswarm.swarm.surface import FitSettings, fit_nodes, solve_banded
 from orthoswarm.swarm.terrain import fit_terrain, lower_flank
 
 BOUNDS = (0.0, 0.0, 900.0, 700.0)
@@ -51,7 +51,8 @@ def test_flat_ground_under_houses_and_rubble_stays_flat_and_low(seed):
     assert fit.is_flat and fit.shrink == 0.0
     assert abs(np.median(error)) < 0.1
     assert np.abs(error).max() < 0.3
-    np.testing.assert_allclose(fit.prior(0.25).z, 0.25)
+    np.testing.assert_allclose(fit.prior(0.25, anchored=False).z, 0.25)
+    np.testing.assert_allclose(fit.prior(0.25).z, 0.25 + fit.pull_m, atol=1e-6)
     assert abs(fit.ground_m) < 0.12
 
 
@@ -127,7 +128,7 @@ def test_rendering_keeps_the_median_and_shrinks_about_it():
     shown = fit.rendering(-0.2)
     assert abs(np.median(shown.height(probe())) - np.median(fit.terrain.height(probe())) + 0.2) < 0.05
     assert shown.height(probe()).std() < fit.terrain.height(probe()).std()
-    assert abs(np.median(fit.prior().height(probe(30)))) < 0.5
+    assert abs(np.median(fit.prior(anchored=False).height(probe(30)))) < 0.5
 
 
 def test_a_height_prior_moved_by_the_pull_lets_the_ground_settle_at_zero():
@@ -159,3 +160,39 @@ def test_finer_nodes_can_be_asked_for():
     assert fit.terrain.step_m == 20.0
     error = fit.terrain.height(probe()) - relief(probe())
     assert np.percentile(np.abs(error), 95) < 0.4
+
+
+def test_large_areas_are_solved_in_tiles_without_seams():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((20, 20), (2180, 880), (9000, 2))
+    points = np.c_[xy, relief(xy) + rng.normal(0, 0.2, len(xy))]
+    sigma, bounds = np.full(len(xy), 0.2), (0.0, 0.0, 2200.0, 900.0)
+    tiled = fit_nodes(points, sigma, bounds, 0.8, FitSettings())
+    whole = fit_nodes(points, sigma, bounds, 0.8, FitSettings(), core=1000)
+    assert tiled is not None and whole is not None
+    assert np.abs(tiled.z - whole.z).max() < 0.1
+    np.testing.assert_array_equal(tiled.support, whole.support)
+
+
+def test_tiles_without_points_go_on_from_their_neighbours():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((20, 20), (600, 600), (2000, 2))
+    fit = fit_terrain(np.c_[xy, np.full(len(xy), 5.0)], np.full(len(xy), 0.2), (0.0, 0.0, 4000.0, 900.0))
+    np.testing.assert_allclose(fit.terrain.z, 5.0, atol=0.2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(3, 60), st.integers(1, 20), st.integers(0, 1000))
+def test_the_banded_solver_solves(n, width, seed):
+    rng = np.random.default_rng(seed)
+    width = min(width, n - 1)
+    full = np.zeros((n, n))
+    band = np.zeros((n + 4, width + 4))
+    for k in range(width + 1):
+        diagonal = rng.normal(0, 1, n - k) + (3.0 * (width + 1) if k == 0 else 0.0)
+        band[: n - k, k] = diagonal
+        full += np.diag(diagonal, k) + (np.diag(diagonal, -k) if k else 0.0)
+    b = rng.normal(0, 1, n)
+    x = b.copy()
+    solve_banded(band, width, x)
+    np.testing.assert_allclose(full @ x, b, atol=1e-8)

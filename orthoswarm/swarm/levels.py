@@ -59,7 +59,7 @@ def level_network(
     sigma: list[float] = []
     for i in range(count):
         for j in range(i + 1, count):
-            d = _common_difference(ground[i], ground[j], trees[i], trees[j], radius_m, neighbours)
+            d = _common_difference(ground[i], ground[j], trees[i], trees[j], radius_m, neighbours, least)
             if len(d) >= least:
                 pairs.append((i, j))
                 difference.append(float(np.median(d)))
@@ -70,21 +70,26 @@ def level_network(
 
 
 def _common_difference(
-    a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None, radius: float, k: int
+    a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None, radius: float, k: int, least: int
 ) -> Array:
-    """Heights of a over b, at the points of both where they meet."""
+    """Heights of a over b, at the points of both where they meet.
+
+    At the border all neighbours lie on one side and a slope would count as a difference: the half of the points
+    that lie nearest to the middle of their neighbours is used.
+    """
     if tree_a is None or tree_b is None:
         return np.empty(0)
     low, high = np.maximum(a.min(0), b.min(0)) - radius, np.minimum(a.max(0), b.max(0)) + radius
-    parts = []
+    difference, beside = [np.empty(0)], [np.empty(0)]
     for points, other, tree, sign in ((a, b, tree_b, 1.0), (b, a, tree_a, -1.0)):
         near = points[((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2])).all(1)]
-        if len(near) == 0:
-            continue
         distance, index = tree.query(near[:, :2], k=k, distance_upper_bound=radius)
         ok = np.isfinite(distance).reshape(len(near), k).all(1)
-        parts.append(sign * (near[ok, 2] - np.median(other[index.reshape(len(near), k)[ok], 2], axis=1)))
-    return np.concatenate(parts) if parts else np.empty(0)
+        around = other[index.reshape(len(near), k)[ok]]
+        difference.append(sign * (near[ok, 2] - np.median(around[..., 2], axis=1)))
+        beside.append(np.hypot(*(around[..., :2].mean(1) - near[ok, :2]).T))
+    d, away = np.concatenate(difference), np.concatenate(beside)
+    return d[np.argsort(away, kind="stable")[: max(least, len(d) // 2)]]
 
 
 def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:

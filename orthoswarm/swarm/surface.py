@@ -49,7 +49,37 @@ class FitSettings:
     slope_sigma_m: float = 6.0
     level_ratio: float = 1.5
     flat_sd_m: float = 0.5
-    render_flat_sd_m: float = 0.35
+    render_flat_sd_m: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Where nodes lie: the first one, their distance and number."""
+
+    west: float
+    south: float
+    step: float
+    columns: int
+    rows: int
+
+    @classmethod
+    def over(cls, bounds: tuple[float, float, float, float], step: float) -> "_Grid":
+        """The nodes on multiples of the step that cover bounds (west, south, east, north)."""
+        west, south = (float(np.floor(v / step) * step) for v in bounds[:2])
+        columns, rows = (int(np.ceil((v - first) / step)) + 1 for v, first in zip(bounds[2:], (west, south)))
+        return cls(west, south, step, max(3, columns), max(3, rows))
+
+    def window(self, column: int, row: int, count: int) -> "_Grid":
+        """At most count cells each way from a node on, within this grid."""
+        c, r = max(column, 0), max(row, 0)
+        columns, rows = min(column + count, self.columns - 1) - c + 1, min(row + count, self.rows - 1) - r + 1
+        return _Grid(self.west + c * self.step, self.south + r * self.step, self.step, max(columns, 3), max(rows, 3))
+
+    def holds(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (P, 3) lie within and have a height."""
+        c, r = (points[:, 0] - self.west) / self.step, (points[:, 1] - self.south) / self.step
+        inside = (c >= 0) & (r >= 0) & (c < self.columns - 1) & (r < self.rows - 1) & np.isfinite(points[:, 2])
+        return np.asarray(inside, np.bool_)
 
 
 @dataclass(slots=True)
@@ -57,7 +87,7 @@ class Surface:
     """Points on a grid of nodes, ready to be solved for any smoothness; inner is the shorter side of the grid.
 
     Attributes:
-        west, south: first node. columns, rows: number of nodes.
+        columns, rows: number of nodes.
         cell: int32 (P,), first node of the cell of each point, in the solver's order.
         share: float64 (P, 2), place within the cell, inner and outer.
         z: float64 (P,), heights; sigma: their sigma.
@@ -66,8 +96,6 @@ class Surface:
         curvature, slope, level: float64 (N + 4, band + 4), penalties for unit sigma, see `solve_banded`.
     """
 
-    west: float
-    south: float
     columns: int
     rows: int
     cell: NDArray[np.int32]
@@ -82,15 +110,11 @@ class Surface:
     settings: FitSettings
 
     @classmethod
-    def over(
-        cls, points: Array, sigma_z: Array, bounds: tuple[float, float, float, float], s: FitSettings
-    ) -> "Surface":
-        """Set up nodes that cover bounds (west, south, east, north); points (P, 3) outside do not count."""
-        west, south = (float(np.floor(v / s.step_m) * s.step_m) for v in bounds[:2])
-        columns = max(3, int(np.ceil((bounds[2] - west) / s.step_m)) + 1)
-        rows = max(3, int(np.ceil((bounds[3] - south) / s.step_m)) + 1)
-        c, r = (points[:, 0] - west) / s.step_m, (points[:, 1] - south) / s.step_m
-        good = (c >= 0) & (r >= 0) & (c < columns - 1) & (r < rows - 1) & np.isfinite(points[:, 2]) & (sigma_z > 0)
+    def over(cls, points: Array, sigma_z: Array, grid: _Grid, s: FitSettings) -> "Surface":
+        """Set up the nodes of a grid; points (P, 3) outside or without a sigma do not count."""
+        columns, rows = grid.columns, grid.rows
+        c, r = (points[:, 0] - grid.west) / s.step_m, (points[:, 1] - grid.south) / s.step_m
+        good = grid.holds(points) & (sigma_z > 0)
         inner, outer = sorted((columns, rows))
         if columns > rows:
             c, r = r, c
@@ -104,7 +128,7 @@ class Surface:
         curvature, slope, level = np.zeros(size), np.zeros(size), np.zeros(size)
         _penalties(inner, outer, support, curvature, slope, level)
         return cls(
-            west=west, south=south, columns=columns, rows=rows, cell=cell, share=np.stack([c - ci, r - ri], 1),
+            columns=columns, rows=rows, cell=cell, share=np.stack([c - ci, r - ri], 1),
             z=np.where(good, points[:, 2], 0.0), sigma=np.where(good, sigma_z, 1.0),
             base=np.where(good, 1.0 / (sigma_z**2 + s.floor_sigma_m**2), 0.0),
             support=support, curvature=curvature, slope=slope, level=level, settings=s,
@@ -120,8 +144,8 @@ class Surface:
         g = nodes.reshape(-1, self.inner)
         return np.ascontiguousarray(g.T) if self.columns > self.rows else g
 
-    def solve(self, kappa: float, base: Array | None = None, solves: int | None = None) -> tuple[Array, Array]:
-        """Heights of the nodes (N,) for one smoothness, and the robust weight (P,) of each point there."""
+    def solve(self, kappa: float, base: Array | None = None, solves: int | None = None) -> Array:
+        """Heights of the nodes (N,), in the solver's order, for one smoothness."""
         s, inner = self.settings, self.inner
         base = self.base if base is None else base
         ratio = s.step_m / 30.0
@@ -137,8 +161,7 @@ class Surface:
             _assemble(penalty, self.cell, self.share, inner, self.z - start, base * weight, band, rhs)
             solve_banded(band, 2 * inner, rhs)
             z = rhs + start
-        _robust(z, self.cell, self.share, inner, self.z, self.sigma, s.scale_end_m, s.below_min_m, weight)
-        return z, np.where(self.base > 0, weight, 0.0)
+        return z
 
     def choose_kappa(self) -> float:
         """The smoothest surface whose error at points left out is within half a standard error of the best.
@@ -154,7 +177,7 @@ class Surface:
         costs: list[Array] = []
         mean: list[float] = []
         for kappa in KAPPAS:
-            z, _ = self.solve(kappa, base, max(6, 2 * s.solves // 3))
+            z = self.solve(kappa, base, max(6, 2 * s.solves // 3))
             e = self.z[out] - _interpolate(z, self.cell[out], self.share[out], self.inner)
             q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
             costs.append(q / (1.0 + q))
@@ -164,6 +187,81 @@ class Surface:
         best = int(np.argmin(mean))
         limit = mean[best] + 0.5 * float(costs[best].std()) / np.sqrt(len(out))
         return KAPPAS[next(i for i, m in enumerate(mean) if m <= limit)]
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """A solved surface: first node, heights (rows, columns; rows go north), nodes that have data next to them."""
+
+    west: float
+    south: float
+    z: Array
+    support: NDArray[np.bool_]
+    kappa: float
+
+
+def fit_nodes(
+    points: Array,
+    sigma_z: Array,
+    bounds: tuple[float, float, float, float],
+    kappa: float | None,
+    s: FitSettings,
+    *,
+    core: int = 40,
+    overlap: int = 8,
+) -> Nodes | None:
+    """Solve for nodes that cover bounds; None without a point. Large areas in overlapping tiles, blended.
+
+    The band's cost grows with the square of the shorter side, and ground 8 nodes away has no influence where there
+    is data. The smoothness of tiles is the median of what the four fullest ask for.
+    """
+    grid = _Grid.over(bounds, s.step_m)
+    if max(grid.columns, grid.rows) <= core + 3 * overlap:
+        surface = Surface.over(points, sigma_z, grid, s)
+        if not (surface.base > 0).any():
+            return None
+        kappa = kappa or surface.choose_kappa()
+        return Nodes(grid.west, grid.south, surface.grid(surface.solve(kappa)), surface.grid(surface.support), kappa)
+    tiles = []
+    for row in range(0, grid.rows - 1, core):
+        for column in range(0, grid.columns - 1, core):
+            part = grid.window(column - overlap, row - overlap, core + 2 * overlap)
+            inside = part.holds(points)
+            if inside.any():
+                tiles.append((part, inside))
+    if not tiles:
+        return None
+    if kappa is None:
+        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[:4]
+        asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
+        kappa = sorted(asked)[len(asked) // 2]
+    total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))
+    support: NDArray[np.bool_] = np.zeros((grid.rows, grid.columns), np.bool_)
+    for part, inside in tiles:
+        surface = Surface.over(points[inside], sigma_z[inside], part, s)
+        r, c = round((part.south - grid.south) / s.step_m), round((part.west - grid.west) / s.step_m)
+        at = (slice(r, r + part.rows), slice(c, c + part.columns))
+        ramp = np.multiply.outer(_ramp(part.rows, 2 * overlap), _ramp(part.columns, 2 * overlap))
+        total[at] += ramp * surface.grid(surface.solve(kappa))
+        weight[at] += ramp
+        support[at] |= surface.grid(surface.support)
+    return Nodes(grid.west, grid.south, _blended(total, weight), support, kappa)
+
+
+def _ramp(count: int, reach: int) -> Array:
+    """Weights of a tile's nodes along one side: small at its ends, 1 from `reach` nodes on."""
+    k = np.arange(count)
+    return np.asarray(np.minimum(np.minimum(k, k[::-1]) + 0.1, reach) / reach, np.float64)
+
+
+def _blended(total: Array, weight: Array) -> Array:
+    from scipy.ndimage import distance_transform_edt
+
+    z = total / np.where(weight > 0, weight, 1.0)
+    if (weight > 0).all():
+        return z
+    nearest = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
+    return np.asarray(z[tuple(nearest)])
 
 
 def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.placement import Terrain
-from orthoswarm.swarm.surface import FitSettings, Surface
+from orthoswarm.swarm.surface import FitSettings, fit_nodes
 
 Array = NDArray[np.float64]
 
@@ -23,12 +23,12 @@ class TerrainFit:
     Attributes:
         terrain: the surface T as fitted (not shrunk).
         weight: float64 (P,), final robust weight (0 to 1) of each point as ground: 1 on T, near 0 on a roof.
-        kappa: smoothness, sigma of the second difference between nodes in metres.
+        kappa: smoothness, sigma of the second difference between nodes 30 m apart, metres.
         sd_m: standard deviation of T over nodes with data; median_m: its median there.
         ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
             the mode of the heights (rubble, cars and bushes only lift points, nothing digs them in).
         pull_m: how far the robust centre (scale 2 m) of the points lies over that ground; a height prior around
-            `level + pull_m` lets the ground itself settle at the level.
+            level + pull lets the ground itself settle at the level.
         support: bool (rows, columns), nodes that have data in a cell next to them.
         settings: how it was fitted.
     """
@@ -53,9 +53,15 @@ class TerrainFit:
         """True where the relief cannot be told from noise, so that the prior is a level plane."""
         return self.shrink == 0.0
 
-    def prior(self, z0_m: float = 0.0) -> Terrain:
-        """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat."""
-        return _about(self.terrain, self.median_m, self.shrink, z0_m)
+    def prior(self, level_m: float = 0.0, *, anchored: bool = True) -> Terrain:
+        """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
+
+        Args:
+            level_m: where the ground (its median where there is relief) shall settle: the takeoff level.
+            anchored: z0 = level + pull, so that the ground and not the centre of all points settles there; False
+                takes z0 = level.
+        """
+        return _about(self.terrain, self.median_m, self.shrink, level_m + (self.pull_m if anchored else 0.0))
 
     def rendering(self, lift_m: float = 0.0) -> Terrain:
         """T shrunk about its own median for rectifying pictures (never about zero), plus a lift."""
@@ -88,20 +94,22 @@ def fit_terrain(
     """
     s = settings or FitSettings()
     points, sigma_z = np.asarray(points, float).reshape(-1, 3), np.asarray(sigma_z, float)
-    surface = Surface.over(points, sigma_z, bounds, s)
-    used = surface.base > 0
-    if not used.any():
+    nodes = fit_nodes(points, sigma_z, bounds, kappa, s)
+    if nodes is None:
         raise OrthoSwarmError("no adjusted point lies on the area, so no terrain can be fitted; give one by --dem")
-    if kappa is None:
-        kappa = surface.choose_kappa()
-    z, weight = surface.solve(kappa)
-    terrain = Terrain(surface.west, surface.south, s.step_m, surface.grid(z).astype(np.float32))
-    sd, median = float(z[surface.support].std()), float(np.median(z[surface.support]))
+    terrain = Terrain(nodes.west, nodes.south, s.step_m, nodes.z.astype(np.float32))
+    rows, columns = nodes.z.shape
+    c, r = (points[:, 0] - nodes.west) / s.step_m, (points[:, 1] - nodes.south) / s.step_m
+    used = (c >= 0) & (r >= 0) & (c < columns - 1) & (r < rows - 1) & np.isfinite(points[:, 2]) & (sigma_z > 0)
+    above = points[used, 2] - terrain.height(points[used, :2])
+    scale = np.where(above > 0, s.scale_end_m, s.below_min_m)
+    weight = np.zeros(len(points))
+    weight[used] = 1.0 / (1.0 + above**2 / (scale**2 + sigma_z[used] ** 2)) ** 2
+    sd, median = float(nodes.z[nodes.support].std()), float(np.median(nodes.z[nodes.support]))
     flat = _shrink(sd, s.flat_sd_m) == 0.0
-    height = points[used, 2]
-    ground = lower_flank(height, sigma_z[used]) if flat else median
-    pull = robust_centre(height - (ground if flat else terrain.height(points[used, :2])))
-    return TerrainFit(terrain, weight, kappa, sd, median, ground, pull, surface.grid(surface.support), s)
+    ground = lower_flank(points[used, 2], sigma_z[used]) if flat else median
+    pull = robust_centre(points[used, 2] - ground if flat else above)
+    return TerrainFit(terrain, weight, nodes.kappa, sd, median, ground, pull, nodes.support, s)
 
 
 def lower_flank(height: Array, sigma: Array | None = None, kernel_m: float = 0.15) -> float:
