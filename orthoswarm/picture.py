@@ -49,6 +49,25 @@ def read_rgb(path: Path) -> Bytes:
     return np.ascontiguousarray(_decode_other(path, data, gray=False)[..., ::-1])
 
 
+def read_rgba(path: Path) -> Bytes:
+    """A picture's colours with alpha 255, uint8 (rows, columns, 4); a JPEG costs no more than by read_rgb.
+
+    Raises:
+        PictureError: if the file is no picture or is damaged beyond decoding.
+    """
+    data = _bytes(path)
+    if data[:2] == b"\xff\xd8":
+        import simplejpeg
+
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGBA", fastdct=True, fastupsample=True))
+        except ValueError as error:
+            raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
+    import cv2
+
+    return np.asarray(cv2.cvtColor(_decode_other(path, data, gray=False), cv2.COLOR_BGR2RGBA))
+
+
 def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()

@@ -193,6 +193,11 @@ class Canvas:
         self._store.flush()
         self._index.flush()
 
+    @property
+    def mapped_mb(self) -> float:
+        """Megabytes of tiles that are mapped now."""
+        return self._store.mapped * 8e-6 * self.tile_px**2
+
     # -- drawing --------------------------------------------------------------------------------------------------
 
     def begin(self, key: Key) -> Tile:

@@ -1,9 +1,11 @@
 """What a camera sees of the ground: convex footprints, the limit of sane view angles, and frames that are absurd."""
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.camera import Camera, Lens
 
@@ -11,6 +13,8 @@ Array = NDArray[np.float64]
 
 MAX_OFF_NADIR_RAD = np.radians(75.0)
 """Ground seen at a flatter angle is left out: there a pixel is smeared over more than 15 times its size at nadir."""
+LEAST_DESCENT = float(np.cos(MAX_OFF_NADIR_RAD))
+"""What a ray goes down per unit of depth at that angle at least: a straight line that cuts off the horizon."""
 MAX_MAGNIFICATION = 16.0
 """A frame whose pixel at nadir is this many times the map's is no picture of this flight (an altitude gone wrong)."""
 
@@ -28,27 +32,65 @@ def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
     return float(np.median(heights[heights > 0] / focal[heights > 0]))
 
 
-def rejection(camera: Camera, ground_z_m: float, gsd_m: float) -> str | None:
-    """Why a frame cannot be drawn on a map of a ground pixel, one clause; None if it can.
+def rejections(cameras: Sequence[Camera], ground_z_m: ArrayLike, gsd_m: float) -> dict[int, str]:
+    """Frames that cannot be drawn on a map: index -> why, one clause.
 
     Args:
-        camera: where its camera is.
-        ground_z_m: height of the ground below.
+        cameras: where the frames' cameras are.
+        ground_z_m: height of the ground below each, (N,) or one number.
         gsd_m: the map's ground pixel.
     """
-    numbers = (*camera.position, *camera.rotation.ravel(), camera.lens.focal_px)
-    if not np.isfinite(numbers).all() or camera.lens.focal_px <= 0:
+    if len(cameras) == 0:
+        return {}
+    position = np.array([c.position for c in cameras], float)
+    rotation = np.array([c.rotation for c in cameras], float)
+    focal = np.array([c.lens.focal_px for c in cameras], float)
+    heights = np.broadcast_to(position[:, 2] - np.asarray(ground_z_m, float), len(cameras))
+    steepest = np.full(len(cameras), -np.inf)
+    for lens, index in _by_lens(cameras).items():
+        steepest[index] = -_rays(lens, rotation[index])[..., 2].min(1)
+    reasons = {}
+    for i, numbers in enumerate(zip(heights.tolist(), focal.tolist(), steepest.tolist())):
+        reason = _reason(*numbers, gsd_m)
+        if reason is not None:
+            reasons[i] = reason
+    return reasons
+
+
+def rejection(camera: Camera, ground_z_m: float, gsd_m: float) -> str | None:
+    """Why one frame cannot be drawn on a map, one clause; None if it can. See `rejections`."""
+    border = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, 0.0)
+    down = camera.rotation[2]
+    steepest = -float((border @ down[:2]).min() + down[2])
+    return _reason(float(camera.position[2]) - ground_z_m, camera.lens.focal_px, steepest, gsd_m)
+
+
+def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> str | None:
+    if not (math.isfinite(height) and math.isfinite(focal_px) and math.isfinite(steepest) and focal_px > 0):
         return "its pose is not a number"
-    height = float(camera.position[2]) - ground_z_m
-    if height <= 0.0:
+    if height <= 0:
         return f"its camera is not above the ground (height {height:.1f} m)"
-    if height / camera.lens.focal_px > MAX_MAGNIFICATION * gsd_m:
-        return f"it is {height:.0f} m above the ground, far higher than the others: the altitude must be wrong"
-    if len(footprint(camera, ground_z_m)) == 0:
+    if height > MAX_MAGNIFICATION * gsd_m * focal_px:
+        return f"its height of {height:.0f} m above the ground is far beyond the other frames'"
+    if steepest < LEAST_DESCENT:
         return "it looks at the horizon or above, and not at the ground"
     return None
 
 
+def _by_lens(cameras: Sequence[Camera]) -> dict[Lens, list[int]]:
+    groups: dict[Lens, list[int]] = {}
+    for i, camera in enumerate(cameras):
+        groups.setdefault(camera.lens, []).append(i)
+    return groups
+
+
+def _rays(lens: Lens, rotation: Array) -> Array:
+    """Ground directions (N, K, 3), camera depth 1, of the border of a lens's picture under rotations (N, 3, 3)."""
+    xy = _border(lens, 1 if lens.is_pinhole else 8, 0.0)
+    return np.asarray(np.concatenate([xy, np.ones((len(xy), 1))], 1) @ rotation.transpose(0, 2, 1))
+
+
+@lru_cache(maxsize=256)
 def _border(lens: Lens, per_side: int, inset_px: float) -> Array:
     """Undistorted normalised points (4 per_side, 2) around the picture, clockwise from the upper left."""
     w, h = lens.width - 1.0 - inset_px, lens.height - 1.0 - inset_px
@@ -76,7 +118,7 @@ def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) ->
     height = float(camera.position[2]) - ground_z_m
     xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ camera.rotation.T
-    rays = _clip(rays, float(np.cos(MAX_OFF_NADIR_RAD)))
+    rays = _clip(rays, LEAST_DESCENT)
     if len(rays) < 3 or height <= 0:
         return np.empty((0, 2))
     return np.asarray(camera.position[:2] + rays[:, :2] * (height / -rays[:, 2:]))
@@ -108,24 +150,18 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
     West > east where a camera sees nothing.
     """
     boxes = np.full((len(cameras), 4), np.nan)
-    limit = float(np.cos(MAX_OFF_NADIR_RAD))
-    groups: dict[Lens, list[int]] = {}
-    for i, camera in enumerate(cameras):
-        groups.setdefault(camera.lens, []).append(i)
-    for lens, index in groups.items():
-        xy = _border(lens, 1 if lens.is_pinhole else 8, 0.0)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], 1)
-        rotation = np.stack([cameras[i].rotation for i in index])
+    for lens, index in _by_lens(cameras).items():
         position = np.stack([cameras[i].position for i in index]).astype(float)
-        down = rays @ rotation.transpose(0, 2, 1)  # (n, K, 3)
-        level = (-down[..., 2] >= limit).all(1)
+        down = _rays(lens, np.stack([cameras[i].rotation for i in index]))
+        border = down.shape[1]
+        level = (-down[..., 2] >= LEAST_DESCENT).all(1)
         for z in (z_low, z_high):
-            drop = (position[:, 2] - z)[:, None, None] / np.maximum(-down[..., 2:], limit)
+            drop = (position[:, 2] - z)[:, None, None] / np.maximum(-down[..., 2:], LEAST_DESCENT)
             ground = position[:, None, :2] + down[..., :2] * drop
             for j in np.nonzero(~level)[0]:
                 oblique = footprint(cameras[index[j]], z)
-                ground[j] = oblique[np.arange(len(xy)) % len(oblique)] if len(oblique) else np.nan
-                if len(oblique) > len(xy):  # clipping adds a corner
+                ground[j] = oblique[np.arange(border) % len(oblique)] if len(oblique) else np.nan
+                if len(oblique) > border:  # clipping adds a corner
                     ground[j, :2] = oblique.min(0), oblique.max(0)
             low, high = ground.min(1), ground.max(1)
             if not lens.is_pinhole:  # the border bows out between the points
@@ -133,21 +169,3 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
             old = boxes[index]
             boxes[index] = np.concatenate([np.fmin(old[:, :2], low), np.fmax(old[:, 2:], high)], 1)
     return np.where(np.isnan(boxes), np.array([np.inf, np.inf, -np.inf, -np.inf]), boxes)
-
-
-def half_planes(polygon: Array) -> Array:
-    """The convex polygon (K, 2) as rows (a, b, c) with a x + b y <= c inside, float64 (K, 3), either winding."""
-    following = np.roll(polygon, -1, 0)
-    edge = following - polygon
-    area = float((polygon[:, 0] * following[:, 1] - following[:, 0] * polygon[:, 1]).sum())
-    normal = np.stack([edge[:, 1], -edge[:, 0]], 1) * (1.0 if area > 0 else -1.0)
-    return np.asarray(np.concatenate([normal, (normal * polygon).sum(1, keepdims=True)], 1))
-
-
-def convex(polygon: Array) -> Array:
-    """The convex hull (K, 2) of points, counter-clockwise."""
-    import cv2
-
-    origin = polygon.mean(0)
-    hull = cv2.convexHull((polygon - origin).astype(np.float32), clockwise=False)[:, 0]
-    return np.asarray(np.asarray(hull, np.float64) + origin)

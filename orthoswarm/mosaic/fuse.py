@@ -19,41 +19,99 @@ _FRACTION = np.uint32(255)
 
 
 @kernel
-def row_span(planes, centre, radius, y, limit):  # type: ignore[no-untyped-def]
-    """Columns [first, last) with pixel centres in a convex polygon and a circle, on the line y.
+def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, planes, box):  # type: ignore[no-untyped-def]
+    """The footprint of a picture on the canvas as half planes and a box; gives the number of half planes, 0 if none.
+
+    The picture is clipped where its rays go down by less than `least` per unit of depth, so the footprint is finite.
 
     Args:
-        planes: float64 (K, 3), a x + b y <= c inside.
+        position: float64 (3,), easting, northing, height of the camera.
+        rotation: float64 (3, 3), camera to ground.
+        corners: float64 (4,), x low, x high, y low, y high of a box in undistorted normalised coordinates.
+        ground_z_m: height of the ground plane.
+        least: smallest descent of a ray.
+        west: easting of the canvas's left edge.
+        north: northing of its upper edge.
+        gsd_m: its ground pixel.
+        planes: float64 (8, 3), set to rows a, b, c with a column + b row <= c inside, canvas pixels.
+        box: float64 (4,), set to the least and greatest column, least and greatest row.
+    """
+    rays, kept = np.empty((4, 3)), np.empty((8, 3))
+    for i in range(4):
+        x = corners[1] if i == 1 or i == 2 else corners[0]
+        y = corners[3] if i >= 2 else corners[2]
+        for j in range(3):
+            rays[i, j] = rotation[j, 0] * x + rotation[j, 1] * y + rotation[j, 2]
+    n = 0
+    for i in range(4):
+        here, there = rays[i], rays[(i + 1) % 4]
+        a, b = -here[2] - least, -there[2] - least
+        if a >= 0.0:
+            kept[n] = here
+            n += 1
+        if (a >= 0.0) != (b >= 0.0):
+            kept[n] = here + (there - here) * (a / (a - b))
+            n += 1
+    if n < 3:
+        return 0
+    height = position[2] - ground_z_m
+    box[0], box[1], box[2], box[3] = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(n):
+        scale = height / -kept[i, 2]
+        column = (position[0] + kept[i, 0] * scale - west) / gsd_m - 0.5
+        row = (north - position[1] - kept[i, 1] * scale) / gsd_m - 0.5
+        kept[i, 0], kept[i, 1] = column, row
+        box[0], box[1] = min(box[0], column), max(box[1], column)
+        box[2], box[3] = min(box[2], row), max(box[3], row)
+    twice = 0.0
+    for i in range(n):
+        j = (i + 1) % n
+        twice += (kept[i, 0] - box[0]) * (kept[j, 1] - box[2]) - (kept[j, 0] - box[0]) * (kept[i, 1] - box[2])
+    turn = 1.0 if twice > 0.0 else -1.0
+    for i in range(n):
+        j = (i + 1) % n
+        planes[i, 0], planes[i, 1] = turn * (kept[j, 1] - kept[i, 1]), turn * (kept[i, 0] - kept[j, 0])
+        planes[i, 2] = planes[i, 0] * kept[i, 0] + planes[i, 1] * kept[i, 1]
+    return n
+
+
+@kernel
+def row_span(planes, centre, radius, row, first, last):  # type: ignore[no-untyped-def]
+    """Columns [first, last) cut down to the pixel centres in a convex polygon and a circle, on a row.
+
+    Args:
+        planes: float64 (K, 3), a column + b row <= c inside.
         centre: float64 (2,), the circle's centre.
         radius: its radius.
-        y: the row's centre.
-        limit: columns are within [0, limit).
+        row: the row.
+        first: first column.
+        last: past the last column.
     """
-    low, high = 0.0, limit - 1.0
-    dy = y - centre[1]
+    low, high = float(first), last - 1.0
+    dy = row - centre[1]
     room = radius * radius - dy * dy
     if room < 0.0:
-        return 0, 0
+        return first, first
     half = np.sqrt(room)
     low, high = max(low, centre[0] - half), min(high, centre[0] + half)
     for k in range(planes.shape[0]):
-        a, rest = planes[k, 0], planes[k, 2] - planes[k, 1] * y
+        a, rest = planes[k, 0], planes[k, 2] - planes[k, 1] * row
         if a > 1e-12:
             high = min(high, rest / a)
         elif a < -1e-12:
             low = max(low, rest / a)
         elif rest < 0.0:
-            return 0, 0
+            return first, first
     if not high >= low:
-        return 0, 0
+        return first, first
     return int(np.ceil(low)), int(np.floor(high)) + 1
 
 
 @kernel
-def touches(planes, centre, radius, rows, columns):  # type: ignore[no-untyped-def]
-    """Whether any pixel centre of a tile of rows x columns lies in the polygon and the circle (tile pixels)."""
-    for r in range(rows):
-        first, last = row_span(planes, centre, radius, float(r), columns)
+def touches(planes, centre, radius, row0, col0, rows, columns):  # type: ignore[no-untyped-def]
+    """Whether any pixel centre of a part of the canvas lies in the polygon and the circle."""
+    for r in range(row0, row0 + rows):
+        first, last = row_span(planes, centre, radius, r, col0, col0 + columns)
         if last > first:
             return True
     return False
@@ -100,7 +158,7 @@ def _blend(texels, stride, at, weight, keep, target):  # type: ignore[no-untyped
 
 
 @kernel
-def fuse(packed, score, picture, planes, centre, radius, matrix, lens, gsd_m, reals, integers):  # type: ignore[no-untyped-def]
+def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, lens, gsd_m, reals, integers):  # type: ignore[no-untyped-def]
     """Draw a picture where it sees the ground more orthogonally than what is there; gives the number of pixels won.
 
     Paper III.B: a pixel takes the picture with the largest 1 / ||P_oc - P||. Equal distance: what is there stays.
@@ -108,11 +166,14 @@ def fuse(packed, score, picture, planes, centre, radius, matrix, lens, gsd_m, re
     Args:
         packed: uint32 (T, C), the tile's colours.
         score: float32 (T, C), 1 / squared distance in 1/m^2, 0 = empty.
+        row0: the tile's first row on the canvas.
+        col0: its first column.
         picture: uint32 (H, W), colours R, G, B, 255 in memory order.
-        planes: float64 (K, 3), half planes of the footprint in tile pixels.
-        centre: float64 (2,), nadir point in tile pixels (column, row).
+        planes: float64 (K, 3), half planes of the footprint in canvas pixels.
+        centre: float64 (2,), nadir point in canvas pixels (column, row).
         radius: greatest distance drawn, pixels.
-        matrix: float64 (3, 3), from tile pixel (column, row, 1) to normalised undistorted picture coordinates.
+        matrix: float64 (3, 3), from (column, row) about the nadir point, 1, to homogeneous undistorted normalised
+            picture coordinates.
         lens: float64 (6,), k1, k2, k3, focal length in pixels, principal column and row.
         gsd_m: ground pixel.
         reals: float32 (3, C), scratch.
@@ -131,13 +192,13 @@ def fuse(packed, score, picture, planes, centre, radius, matrix, lens, gsd_m, re
     texels = picture.ravel()
     won = np.int64(0)
     for r in range(packed.shape[0]):
-        first, last = row_span(planes, centre, radius, float(r), columns)
+        first, last = row_span(planes, centre, radius, row0 + r, col0, col0 + columns)
         count = last - first
         if count <= 0:
             continue
-        row_score, row_packed = score[r, first:last], packed[r, first:last]
+        row_score, row_packed = score[r, first - col0 : last - col0], packed[r, first - col0 : last - col0]
         new = reals[0, :count]
-        dx0, dy = np.float32(first - centre[0]), np.float32(r - centre[1])
+        dx0, dy = np.float32(first - centre[0]), np.float32(row0 + r - centre[1])
         dy2 = dy * dy
         wins = np.int32(0)
         for i in range(count):
@@ -154,9 +215,10 @@ def fuse(packed, score, picture, planes, centre, radius, matrix, lens, gsd_m, re
         first, count = first + skip, count - skip
         row_score, row_packed, new = row_score[skip:], row_packed[skip : skip + count], new[skip:]
         us, vs, at, weight = reals[1, :count], reals[2, :count], integers[0, :count], integers[1, :count]
-        x0 = np.float32(matrix[0, 0] * first + matrix[0, 1] * r + matrix[0, 2])
-        y0 = np.float32(matrix[1, 0] * first + matrix[1, 1] * r + matrix[1, 2])
-        w0 = np.float32(matrix[2, 0] * first + matrix[2, 1] * r + matrix[2, 2])
+        east, south = first - centre[0], row0 + r - centre[1]
+        x0 = np.float32(matrix[0, 0] * east + matrix[0, 1] * south + matrix[0, 2])
+        y0 = np.float32(matrix[1, 0] * east + matrix[1, 1] * south + matrix[1, 2])
+        w0 = np.float32(matrix[2, 0] * east + matrix[2, 1] * south + matrix[2, 2])
         for i in range(count):
             step = np.float32(i)
             inverse = one / (w0 + mw * step)

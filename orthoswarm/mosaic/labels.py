@@ -198,3 +198,12 @@ def label_windows(local: Labels, count: int) -> NDArray[np.int32]:
     windows = np.zeros((count, 5), np.int32)
     _windows(local, count, windows)
     return windows
+
+
+@kernel
+def write_labels(local, ids, plane):  # type: ignore[no-untyped-def]
+    """Put ids[k - 1] + 1 where a tile's local label is k > 0."""
+    for r in range(local.shape[0]):
+        for c in range(local.shape[1]):
+            if local[r, c] > 0:
+                plane[r, c] = ids[local[r, c] - 1] + 1

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.geo import GroundGrid
-from orthoswarm.mosaic.labels import label_tile, label_windows
+from orthoswarm.mosaic.labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.lattice import Shots, heights
 from orthoswarm.mosaic.reduce import reduced
-from orthoswarm.mosaic.sample import sample
+from orthoswarm.mosaic.sample import WEIGHTS, sample
 from orthoswarm.mosaic.tiles import Key, TileStore
 from orthoswarm.picture import PictureError
 from orthoswarm.placement import Terrain
@@ -24,6 +24,7 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
 Read = Callable[[Path], Bytes]
 
+_UNCHANGED = np.tile(np.arange(256, dtype=np.uint8), (3, 1))
 THUMBNAIL = (12, 16)
 """Rows and columns of a picture's thumbnail."""
 
@@ -108,8 +109,7 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
     if len(won):
         tile = store.get(task.key, create=True)
         assert tile is not None
-        mine = local > 0
-        tile.plane[:rows, :cols][mine] = (task.ids + 1)[local[mine] - 1]
+        write_labels(local, task.ids, tile.plane[:rows, :cols])
     return [(int(task.ids[k]), Window(task.key, *map(int, boxes[k]))) for k in won]
 
 
@@ -169,6 +169,7 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
             results.append(Sampled(shot.index, None, str(error)))
             continue
         small, factor = reduced(picture, shot.factor)
+        levels = _levels(shot.gain)
         for w in shot.windows:
             tile = store.get(w.key)
             assert tile is not None
@@ -176,7 +177,7 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
             window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
             sample(
                 tile.rgba, tile.plane, shot.index + 1, window, position[k], rotation[k], lens, lattices[w.key],
-                place.grid.gsd_m, small, factor, shot.gain,
+                place.grid.gsd_m, small, factor, levels, WEIGHTS,
             )  # fmt: skip
         results.append(Sampled(shot.index, thumbnail(small)))
     return results
@@ -192,8 +193,16 @@ def _read(read: Read, path: Path, size: Ints) -> Bytes:
     return np.ascontiguousarray(picture[..., :3])
 
 
+def _levels(gain: NDArray[np.float32]) -> Bytes:
+    """What each level 0 to 255 becomes under gains (3,): uint8 (3, 256)."""
+    if (gain == 1.0).all():
+        return _UNCHANGED
+    return np.asarray(np.clip(np.rint(gain[:, None] * np.arange(256)), 0, 255), np.uint8)
+
+
 def thumbnail(picture: Bytes) -> Bytes:
-    """The means of a picture's parts, uint8 (12, 16, 3)."""
+    """The means of a picture's parts, uint8 (12, 16, 3), from 160 x 120 of its pixels."""
     import cv2
 
-    return np.asarray(cv2.resize(picture, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA))
+    small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(small, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA))

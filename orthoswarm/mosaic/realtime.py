@@ -6,6 +6,7 @@ the smallest that any camera has), so no picture is matched to anything and each
 map pixel only once.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from orthoswarm.camera import Camera
 from orthoswarm.errors import InputError
 from orthoswarm.mosaic.canvas import Canvas
-from orthoswarm.mosaic.footprint import convex, footprint, half_planes, reach, rejection
-from orthoswarm.mosaic.fuse import fuse, touches
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
+from orthoswarm.mosaic.fuse import aim, fuse, touches
+from orthoswarm.mosaic.lattice import INNER, OUTER, lens_row
 from orthoswarm.mosaic.passes import Read
 from orthoswarm.mosaic.reduce import pack, reduction
 from orthoswarm.mosaic.render import Progress, RenderStats, Run, render, serial
@@ -66,7 +68,7 @@ class RealtimeMosaic:
         """Draw one frame.
 
         Args:
-            picture: uint8 (H, W, 3) RGB, or (H, W, 4) RGBA with alpha 255 (saves a copy), as read by read_rgb.
+            picture: uint8 (H, W, 4) RGBA with alpha 255, as read by read_rgba, or (H, W, 3) RGB (costs a copy).
             camera: where it was; its lens has the picture's size.
             ground_z_m: height of the ground plane, same datum as the camera.
 
@@ -74,63 +76,56 @@ class RealtimeMosaic:
             ValueError: if the picture has not the lens's size.
             OrthoSwarmError: if the disk is full.
         """
-        canvas, lens = self.canvas, camera.lens
+        grid, lens = self.canvas.grid, camera.lens
         if picture.shape[:2] != (lens.height, lens.width):
             raise ValueError(f"the picture is {picture.shape[1::-1]}, its lens {(lens.width, lens.height)} pixels")
-        reason = rejection(camera, ground_z_m, canvas.grid.gsd_m)
+        reason = rejection(camera, ground_z_m, grid.gsd_m)
         if reason is not None:
             return Added([], 0, reason)
-        polygon = footprint(camera, ground_z_m)
-        polygon = canvas.grid.to_pixel(polygon if lens.is_pinhole else convex(polygon))
-        window = _tile_window(polygon, canvas)
-        if window is None:
+        planes, box = np.empty((8, 3)), np.empty(4)
+        outer = np.array(lens_row(lens, 0.0)[OUTER:INNER])
+        number = aim(
+            camera.position, camera.rotation, outer, ground_z_m, LEAST_DESCENT, grid.west, grid.north, grid.gsd_m,
+            planes, box,
+        )  # fmt: skip
+        keys = self._tiles_in(box) if number else []
+        if not keys:
             return Added([], 0, "it lies outside the map's area")
         height = float(camera.position[2]) - ground_z_m
-        packed, factor = pack(picture, reduction(canvas.grid.gsd_m, height / lens.focal_px))
+        packed, factor = pack(picture, reduction(grid.gsd_m, height / lens.focal_px))
         shot = _Shot(
             picture=packed,
-            planes=half_planes(polygon),
-            centre=canvas.grid.to_pixel(camera.nadir),
-            radius=reach(camera, ground_z_m) / canvas.grid.gsd_m,
-            matrix=ground_to_camera(camera, ground_z_m, canvas.grid.gsd_m),
+            planes=planes[:number],
+            centre=grid.to_pixel(camera.position[:2]),
+            radius=reach(camera, ground_z_m) / grid.gsd_m,
+            matrix=ground_to_camera(camera, ground_z_m, grid.gsd_m),
             lens=_reduced_lens(camera, factor),
         )
-        changed, won = [], 0
-        for key in [(r, c) for r in range(*window[:2]) for c in range(*window[2:])]:
-            count = self._draw(key, shot)
-            if count:
-                changed.append(key)
-                won += count
-        return Added(changed, won)
+        counts = [self._draw(key, shot) for key in keys]
+        return Added([key for key, count in zip(keys, counts) if count], sum(counts))
+
+    def _tiles_in(self, box: Array) -> list[Key]:
+        """Tiles under a box (column low and high, row low and high), in canvas pixels."""
+        grid, t = self.canvas.grid, self.canvas.tile_px
+        c0, c1 = max(0, math.ceil(box[0])), min(grid.width - 1, math.floor(box[1]))
+        r0, r1 = max(0, math.ceil(box[2])), min(grid.height - 1, math.floor(box[3]))
+        if c0 > c1 or r0 > r1:
+            return []
+        return [(r, c) for r in range(r0 // t, r1 // t + 1) for c in range(c0 // t, c1 // t + 1)]
 
     def _draw(self, key: Key, shot: "_Shot") -> int:
-        canvas, t = self.canvas, self.canvas.tile_px
+        grid, t = self.canvas.grid, self.canvas.tile_px
         row, column = key[0] * t, key[1] * t
-        rows, columns = min(t, canvas.grid.height - row), min(t, canvas.grid.width - column)
-        centre, planes = shot.centre - (column, row), shot.planes.copy()
-        planes[:, 2] -= planes[:, 0] * column + planes[:, 1] * row
-        if not touches(planes, centre, shot.radius, rows, columns):
+        rows, columns = min(t, grid.height - row), min(t, grid.width - column)
+        if not touches(shot.planes, shot.centre, shot.radius, row, column, rows, columns):
             return 0
-        matrix = shot.matrix.copy()
-        matrix[:, 2] -= matrix[:, :2] @ centre
-        tile = canvas.begin(key)
-        packed, score = tile.packed[:rows, :columns], tile.plane[:rows, :columns]
-        gsd = canvas.grid.gsd_m
+        tile = self.canvas.begin(key)
         won = fuse(
-            packed,
-            score,
-            shot.picture,
-            planes,
-            centre,
-            shot.radius,
-            matrix,
-            shot.lens,
-            gsd,
-            self._reals,
-            self._integers,
-        )
+            tile.packed[:rows, :columns], tile.plane[:rows, :columns], row, column, shot.picture, shot.planes,
+            shot.centre, shot.radius, shot.matrix, shot.lens, grid.gsd_m, self._reals, self._integers,
+        )  # fmt: skip
         if won:
-            canvas.commit(key)
+            self.canvas.commit(key)
         return int(won)
 
 
@@ -160,17 +155,6 @@ def _reduced_lens(camera: Camera, factor: int) -> Array:
     lens = camera.lens
     u, v = ((c + 0.5) / factor - 0.5 for c in lens.principal_point)
     return np.array([lens.k1, lens.k2, lens.k3, lens.focal_px / factor, u, v])
-
-
-def _tile_window(polygon: Array, canvas: Canvas) -> tuple[int, int, int, int] | None:
-    """Tiles (row0, row1, col0, col1) under the box of a polygon of canvas pixels; None outside the canvas."""
-    low, high = np.ceil(polygon.min(0)), np.floor(polygon.max(0))
-    c0, r0 = max(0, int(low[0])), max(0, int(low[1]))
-    c1, r1 = min(canvas.grid.width - 1, int(high[0])), min(canvas.grid.height - 1, int(high[1]))
-    if c0 > c1 or r0 > r1:
-        return None
-    t = canvas.tile_px
-    return r0 // t, r1 // t + 1, c0 // t, c1 // t + 1
 
 
 def mosaic(

@@ -19,7 +19,7 @@ from orthoswarm.errors import InputError
 from orthoswarm.geo import GroundGrid
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.coverage import by_tile, coverage
-from orthoswarm.mosaic.footprint import rejection
+from orthoswarm.mosaic.footprint import rejections
 from orthoswarm.mosaic.lattice import Shots, crop
 from orthoswarm.mosaic.passes import LabelTask, Place, Read, SampleTask, Shot, Window, label_pass, sample_pass
 from orthoswarm.mosaic.reduce import reduction
@@ -34,9 +34,9 @@ Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
 """Applies a module-level function to every argument, in this process or in others; results in any order."""
 Progress = Callable[[int, int], None]
 
-_FRAMES_PER_TASK = 32
+_FRAMES_PER_TASK = 64
 _STAGING = "staging"
-_COARSE_CELLS = 4_000_000
+_COARSE_CELLS = 1_000_000
 
 
 def serial(function: Callable[[Any], Any], arguments: Sequence[Any]) -> Iterable[Any]:
@@ -50,7 +50,7 @@ class RenderStats:
 
     Attributes:
         pixels: int64 (N,), map pixels taken from each frame.
-        seen_m2: ground that any frame sees (that was not rejected), measured at 8 or 64 pixels. drawn_m2: ground
+        seen_m2: ground that any frame sees (that was not rejected), measured on cells of up to 64 pixels. drawn_m2: ground
             that was drawn. Both within what was rendered.
         rejected: image -> why it was left out although it was placed (absurd pose, damaged picture).
         thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
@@ -141,10 +141,9 @@ class _Job:
         position = np.nan_to_num(self.shots.position)
         self.ground = self.terrain.height(position[:, :2])
         self.usable = np.ones(len(self.frames), bool)
-        for i, (frame, z) in enumerate(zip(self.frames, self.ground)):
-            reason = rejection(frame.camera, float(z), self.canvas.grid.gsd_m)
-            if reason is not None:
-                self.reject(i, reason)
+        reasons = rejections([f.camera for f in self.frames], self.ground, self.canvas.grid.gsd_m)
+        for i, reason in reasons.items():
+            self.reject(i, reason)
 
     def reject(self, i: int, reason: str) -> None:
         self.rejected[self.frames[i].frame.image] = reason
@@ -231,9 +230,16 @@ class _Job:
     def seen_m2(self, keys: set[Key] | None) -> float:
         """Ground that the usable frames see, measured on coarse cells."""
         grid, t = self.canvas.grid, self.canvas.tile_px
-        factor = 8 if grid.width * grid.height <= 64 * _COARSE_CELLS else 64
+        factor = 1
+        while factor < 64 and grid.width * grid.height > factor * factor * _COARSE_CELLS:
+            factor *= 2
         coarse = GroundGrid(
-            grid.epsg, grid.west, grid.north, grid.gsd_m * factor, -(-grid.width // factor), -(-grid.height // factor)
+            grid.epsg,
+            grid.west,
+            grid.north,
+            grid.gsd_m * factor,
+            max(1, (grid.width + factor // 2) // factor),  # cells whose centre lies in the grid
+            max(1, (grid.height + factor // 2) // factor),
         )
         mask = coverage([f.camera for f, good in zip(self.frames, self.usable) if good], coarse, self.terrain)
         if keys is not None:
