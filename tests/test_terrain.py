@@ -51,8 +51,7 @@ def test_flat_ground_under_houses_and_rubble_stays_flat_and_low(seed):
     assert fit.is_flat and fit.shrink == 0.0
     assert abs(np.median(error)) < 0.1
     assert np.abs(error).max() < 0.3
-    np.testing.assert_allclose(fit.prior(0.25, anchored=False).z, 0.25)
-    np.testing.assert_allclose(fit.prior(0.25).z, 0.25 + fit.pull_m, atol=1e-6)
+    np.testing.assert_allclose(fit.prior(0.25).z, 0.25)
     assert abs(fit.ground_m) < 0.12
 
 
@@ -128,7 +127,7 @@ def test_rendering_keeps_the_median_and_shrinks_about_it():
     shown = fit.rendering(-0.2)
     assert abs(np.median(shown.height(probe())) - np.median(fit.terrain.height(probe())) + 0.2) < 0.05
     assert shown.height(probe()).std() < fit.terrain.height(probe()).std()
-    assert abs(np.median(fit.prior(anchored=False).height(probe(30)))) < 0.5
+    assert abs(np.median(fit.prior().height(probe(30)))) < 0.5
 
 
 def test_a_height_prior_moved_by_the_pull_lets_the_ground_settle_at_zero():

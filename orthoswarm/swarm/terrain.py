@@ -53,15 +53,12 @@ class TerrainFit:
         """True where the relief cannot be told from noise, so that the prior is a level plane."""
         return self.shrink == 0.0
 
-    def prior(self, level_m: float = 0.0, *, anchored: bool = True) -> Terrain:
+    def prior(self, z0_m: float = 0.0) -> Terrain:
         """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
 
-        Args:
-            level_m: where the ground (its median where there is relief) shall settle: the takeoff level.
-            anchored: z0 = level + pull, so that the ground and not the centre of all points settles there; False
-                takes z0 = level.
+        With z0 = level + pull the ground itself settles at the level, and not the centre of all points.
         """
-        return _about(self.terrain, self.median_m, self.shrink, level_m + (self.pull_m if anchored else 0.0))
+        return _about(self.terrain, self.median_m, self.shrink, z0_m)
 
     def rendering(self, lift_m: float = 0.0) -> Terrain:
         """T shrunk about its own median for rectifying pictures (never about zero), plus a lift."""
