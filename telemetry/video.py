@@ -71,6 +71,8 @@ def open_video(path: Path | str, **options: Any) -> Any:
     try:
         container = av.open(str(path), **options)
     except (av.error.FFmpegError, OSError, ValueError) as error:
+        if "://" in str(path):
+            raise NotAVideo(f"the stream {path} cannot be opened ({_reason(error)}); check its address") from None
         raise NotAVideo(
             f"the file is no video that can be read ({_reason(error)}); check it with a player or leave it out"
         ) from None
