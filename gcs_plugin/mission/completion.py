@@ -101,6 +101,16 @@ class CompletionDetector:
         self._new_total = None
         self._restart(hot=bool(self.armed))
 
+    def knows_mission(self, mission: Mission) -> None:
+        """Tell what lies in the vehicle, without anything having changed there."""
+        self._commands = [item.command for item in mission.items]
+        self.total, self._new_total = len(mission) - self._first_seq, None
+
+    @property
+    def knows(self) -> bool:
+        """True while it is known what lies in the vehicle."""
+        return self._commands is not None
+
     def rebooted(self) -> list[MissionEvent]:
         """The vehicle has started anew: a mission that was under way has ended without completing."""
         under_way = self.phase in (Phase.ACTIVE, Phase.SUSPENDED)

@@ -71,6 +71,11 @@ class Exchange(abc.ABC):
         """The vehicle has started anew; returns what is to be sent. Most dialogues just go on asking."""
         return []
 
+    def cancel(self, why: str) -> None:
+        """End it without success; nothing more is sent."""
+        if self.outcome is None:
+            self._end(False, f"vehicle {self.vehicle.system}: {why}")
+
     @property
     def progress(self) -> float:
         """How far it is, 0 to 1."""

@@ -5,7 +5,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 Cargo = TypeVar("Cargo")
 
@@ -32,6 +32,9 @@ class Faults:
     def any(self) -> bool:
         """True if the link does anything at all."""
         return bool(self.loss or self.duplicate or self.delay_s[1] or self.silent)
+
+
+NO_FAULTS: Final = Faults()
 
 
 @dataclass(slots=True)

@@ -1,0 +1,336 @@
+"""Commands to a vehicle: start, pause, resume, return. Each is sent because a person asked for it, never on its own.
+
+Start is what was measured to work with both autopilots: a mode that can be armed (ArduPilot stays in AUTO after a
+mission and refuses to arm there), arm, MAV_CMD_MISSION_START. Before that the mission is read from the vehicle, because
+an autopilot that refuses MISSION_START has been armed already by then.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.download import MissionDownload
+from gcs_plugin.mission.exchange import Address, Exchange
+from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
+from gcs_plugin.mission.modes import Modes, mode_params
+
+_ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
+_IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)
+_UNSUPPORTED: Final = int(dialect.MAV_RESULT_UNSUPPORTED)
+_AGAIN_S: Final = 1.0
+_ARM_S: Final = 60.0
+_AIRBORNE_COMMANDS: Final = frozenset({TAKEOFF, int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)})
+
+
+@dataclass(slots=True)
+class Command(Exchange):
+    """One COMMAND_LONG, repeated until it is acknowledged.
+
+    Attributes:
+        command: MAV_CMD.
+        params: parameters 1 to 7, missing ones 0.
+        verb: what it does, for messages: "arm".
+        insist_s: how long a refusal is answered by asking again (arming: until the position is good).
+        patience_s: silence after which it gives up.
+        reasons: what the vehicle said meanwhile, in its own words.
+    """
+
+    command: int = field(kw_only=True)
+    params: tuple[float, ...] = field(default=(), kw_only=True)
+    verb: str = field(kw_only=True)
+    insist_s: float = field(default=0.0, kw_only=True)
+    patience_s: float = field(default=10.0, kw_only=True)
+    reasons: list[str] = field(default_factory=list, init=False)
+    _began: float = field(default=0.0, init=False)
+    _heard: float = field(default=0.0, init=False)
+    _sent: int = field(default=0, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Send it."""
+        self._began = self._heard = now
+        return self._send(now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Take COMMAND_ACK, and remember texts that may say why not."""
+        kind = message.get_type()
+        if self.outcome is not None:
+            return []
+        if kind == "STATUSTEXT" and message.severity <= dialect.MAV_SEVERITY_WARNING:
+            text = str(message.text).strip("\x00 ")
+            if text and text not in self.reasons:
+                self.reasons = [*self.reasons[-2:], text]
+        if kind != "COMMAND_ACK" or message.command != self.command or not self._meant(message):
+            return []
+        self._heard = now
+        result = int(message.result)
+        if result == _ACCEPTED:
+            self._end(True, f"vehicle {self.vehicle.system}: {self.verb} accepted")
+        elif result == _IN_PROGRESS:
+            self.deadline = now + self.patience_s
+        elif now - self._began < self.insist_s and result != _UNSUPPORTED:
+            self.deadline = now + _AGAIN_S
+        else:
+            self._refuse(result)
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Send it again, or give up."""
+        if self.outcome is not None or now < self.deadline:
+            return []
+        if now - self._heard >= self.patience_s:
+            self._end(False, f"vehicle {self.vehicle.system} did not answer to '{self.verb}'; check the link")
+            return []
+        return self._send(now)
+
+    def _meant(self, message: Message) -> bool:
+        # Autopilots that do not fill the target leave 0.
+        return message.target_system in (0, self.own.system) and message.target_component in (0, self.own.component)
+
+    def _send(self, now: float) -> list[Message]:
+        self.deadline = now + _AGAIN_S
+        values = (*self.params, *(0.0,) * 7)[:7]
+        confirmation, self._sent = min(self._sent, 255), self._sent + 1
+        to = self.vehicle
+        return [dialect.MAVLink_command_long_message(to.system, to.component, self.command, confirmation, *values)]
+
+    def _refuse(self, result: int) -> None:
+        entry = dialect.enums["MAV_RESULT"].get(result)
+        name = str(entry.name).removeprefix("MAV_RESULT_").lower().replace("_", " ") if entry else str(result)
+        why = "; ".join(self.reasons) or "it gives no reason"
+        self._end(False, f"vehicle {self.vehicle.system} refuses to {self.verb} ({name}): {why}")
+
+
+@dataclass(slots=True)
+class Confirm(Exchange):
+    """Waits until the vehicle's messages show that something is so; sends nothing."""
+
+    shown: Callable[[Message], bool] = field(kw_only=True)
+    what: str = field(kw_only=True)
+    patience_s: float = field(default=15.0, kw_only=True)
+
+    def start(self, now: float) -> list[Message]:
+        """Begin to wait."""
+        self.deadline = now + self.patience_s
+        return []
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Look at a message."""
+        if self.outcome is None and self.shown(message):
+            self._end(True, f"vehicle {self.vehicle.system} {self.what}")
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Give up in the end."""
+        if self.outcome is None and now >= self.deadline:
+            self._end(
+                False, f"vehicle {self.vehicle.system} accepted, but nothing shows that it {self.what}; look at it"
+            )
+        return []
+
+
+@dataclass(slots=True)
+class CheckMission(Exchange):
+    """Reads the mission and says whether the vehicle can start it from the ground.
+
+    Attributes:
+        mission: what the vehicle holds, once it is read.
+    """
+
+    autopilot: Autopilot = field(kw_only=True)
+    in_air: bool = field(default=False, kw_only=True)
+    mission: Mission | None = field(default=None, init=False)
+    _reading: MissionDownload = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Prepare the download."""
+        self._reading = MissionDownload(self.vehicle, self.own, patience_s=15.0)
+
+    def start(self, now: float) -> list[Message]:
+        """Ask for the mission."""
+        return self._follow(self._reading.start(now))
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Take items."""
+        return self._follow(self._reading.feed(message, now)) if self.outcome is None else []
+
+    def tick(self, now: float) -> list[Message]:
+        """Ask again."""
+        return self._follow(self._reading.tick(now)) if self.outcome is None else []
+
+    def _follow(self, messages: list[Message]) -> list[Message]:
+        reading = self._reading
+        self.deadline = reading.deadline
+        if reading.outcome is None:
+            return messages
+        if reading.items is None:
+            self._end(False, reading.outcome.text)
+            return messages
+        self.mission = Mission(self.autopilot, tuple(reading.items))
+        wrong = unflyable(reading.items, self.autopilot, in_air=self.in_air)
+        self._end(not wrong, f"vehicle {self.vehicle.system} {wrong or 'has a mission that it can start'}")
+        return messages
+
+
+def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: bool) -> str:
+    """Why a stored mission cannot be started, in words; empty if it can."""
+    first = 1 if autopilot is Autopilot.ARDUPILOT else 0
+    flown = [item for item in items[first:] if item.is_nav]
+    if not flown:
+        return "has no mission; upload one first"
+    if not in_air and flown[0].command not in _AIRBORNE_COMMANDS:
+        return f"has a mission that begins with {flown[0].name} instead of a takeoff; upload one that takes off"
+    return ""
+
+
+@dataclass(slots=True)
+class InOrder(Exchange):
+    """Steps one after the other; the first that fails ends it.
+
+    Attributes:
+        steps: the steps.
+        done: what to say at the end.
+    """
+
+    steps: list[Exchange] = field(kw_only=True)
+    done: str = field(kw_only=True)
+    _at: int = field(default=0, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Begin with the first step."""
+        return self._follow(self.steps[0].start(now), now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Hand a message to the present step."""
+        return self._follow(self.steps[self._at].feed(message, now), now) if self.outcome is None else []
+
+    def tick(self, now: float) -> list[Message]:
+        """Let time pass for the present step."""
+        return self._follow(self.steps[self._at].tick(now), now) if self.outcome is None else []
+
+    @property
+    def progress(self) -> float:
+        """Share of the steps that are done."""
+        return 1.0 if self.outcome is not None else self._at / len(self.steps)
+
+    def _follow(self, messages: list[Message], now: float) -> list[Message]:
+        while (outcome := self.steps[self._at].outcome) is not None:
+            if not outcome.ok:
+                self._end(False, outcome.text)
+                return messages
+            if self._at + 1 == len(self.steps):
+                self._end(True, f"vehicle {self.vehicle.system} {self.done}")
+                return messages
+            self._at += 1
+            messages = messages + self.steps[self._at].start(now)
+        self.deadline = self.steps[self._at].deadline
+        return messages
+
+
+@dataclass(slots=True)
+class Either(Exchange):
+    """A way of doing something, and another one where the vehicle refuses the first."""
+
+    ways: list[Exchange] = field(kw_only=True)
+    _at: int = field(default=0, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Try the first way."""
+        return self._follow(self.ways[0].start(now), now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Hand a message to the present way."""
+        return self._follow(self.ways[self._at].feed(message, now), now) if self.outcome is None else []
+
+    def tick(self, now: float) -> list[Message]:
+        """Let time pass for the present way."""
+        return self._follow(self.ways[self._at].tick(now), now) if self.outcome is None else []
+
+    def _follow(self, messages: list[Message], now: float) -> list[Message]:
+        while (outcome := self.ways[self._at].outcome) is not None:
+            if outcome.ok or self._at + 1 == len(self.ways):
+                self._end(outcome.ok, outcome.text)
+                return messages
+            self._at += 1
+            messages = messages + self.ways[self._at].start(now)
+        self.deadline = self.ways[self._at].deadline
+        return messages
+
+
+@dataclass(frozen=True, slots=True)
+class Pilot:
+    """Makes the commands for one vehicle.
+
+    Attributes:
+        vehicle: its address; own: ours.
+        autopilot: its dialect; modes: its modes.
+    """
+
+    vehicle: Address
+    own: Address
+    autopilot: Autopilot
+    modes: Modes
+
+    def set_mode(self, custom_mode: int) -> Command:
+        """Change the mode."""
+        return Command(
+            self.vehicle, self.own, command=dialect.MAV_CMD_DO_SET_MODE,
+            params=mode_params(self.autopilot, custom_mode), verb=f"change to {self.modes.name(custom_mode)}",
+            insist_s=3.0,
+        )  # fmt: skip
+
+    def start(self, *, in_air: bool = False, check: bool = True) -> Exchange:
+        """Fly the mission from its beginning: check it, then mode, arm, MISSION_START, and wait until it flies."""
+        steps: list[Exchange] = []
+        if check:
+            steps.append(CheckMission(self.vehicle, self.own, autopilot=self.autopilot, in_air=in_air))
+        arm = Command(
+            self.vehicle, self.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(1.0,), verb="arm",
+            insist_s=_ARM_S,
+        )  # fmt: skip
+        go = Command(
+            self.vehicle, self.own, command=dialect.MAV_CMD_MISSION_START, verb="start the mission", insist_s=3.0
+        )
+        flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
+        return InOrder(
+            self.vehicle, self.own, steps=[*steps, self.set_mode(self.modes.ready), arm, go, flies],
+            done="flies its mission",
+        )  # fmt: skip
+
+    def pause(self) -> Exchange:
+        """Stay where it is. ArduPilot's own pause works on the way between waypoints only, BRAKE everywhere."""
+        ways: list[Exchange] = [self.set_mode(self.modes.hold)]
+        if self.autopilot is Autopilot.ARDUPILOT:
+            ways.insert(0, self._pause_continue(0.0, "pause"))
+        return Either(self.vehicle, self.own, ways=ways)
+
+    def resume(self, *, in_mission_mode: bool) -> Exchange:
+        """Go on with the mission from where it was."""
+        if self.autopilot is Autopilot.ARDUPILOT and in_mission_mode:
+            return self._pause_continue(1.0, "resume")
+        return self.set_mode(self.modes.mission)
+
+    def rtl(self) -> Exchange:
+        """Fly home and land."""
+        home = Command(
+            self.vehicle, self.own, command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, verb="return to launch", insist_s=2.0
+        )
+        return Either(self.vehicle, self.own, ways=[home, self.set_mode(self.modes.rtl)])
+
+    def _pause_continue(self, go_on: float, verb: str) -> Command:
+        return Command(
+            self.vehicle,
+            self.own,
+            command=dialect.MAV_CMD_DO_PAUSE_CONTINUE,
+            params=(go_on,),
+            verb=verb,
+            patience_s=5.0,
+        )
+
+    def _flies(self, message: Message) -> bool:
+        return bool(
+            message.get_type() == "HEARTBEAT"
+            and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
+            and message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED
+            and message.custom_mode == self.modes.mission
+        )
