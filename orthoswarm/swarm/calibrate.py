@@ -84,7 +84,7 @@ def _with_scale(
     height = h0 / scale
     if usable:
         warnings.append(
-            f"the recorded height of {h0:.0f} m contradicts the pictures and the distance flown; {height:.0f} m is assumed"
+            f"the recorded height of {h0:.0f} m contradicts the pictures and the path; {height:.0f} m is assumed"
         )
     return Calibration(f0, height, offset, False, pairs, warnings)
 
@@ -96,25 +96,22 @@ def _heading(
     offset = np.zeros(len(leg))
     warnings: list[str] = []
     angle = -np.angle(ratio)  # picture flow turned against prediction = camera turned the other way
-    last = 0.0
+    usual = float(np.median(np.abs(ratio)))
     for k in range(int(leg.max()) + 1):
-        mine = angle[owner == k]
-        if len(mine):
+        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < 0.25)]
+        last = 0.0
+        if len(mine) >= 3:
             turn = float(np.angle(np.median(np.cos(mine)) + 1j * np.median(np.sin(mine))))
             spread = float(np.median(np.abs(wrap(mine - turn))))
-            last = 0.0
-            if spread < np.radians(25.0):
-                if not records.has_yaw.any():
-                    last = turn
-                elif abs(turn) > np.radians(40.0):
-                    last = turn
-                    what = (
-                        "turned by 180 deg" if abs(turn) > np.radians(150.0) else f"off by {np.degrees(turn):.0f} deg"
-                    )
-                    first = int(np.flatnonzero(leg == k)[0])
-                    warnings.append(
-                        f"the yaw tags of the leg from frame {first} on are {what}; corrected from the pictures"
-                    )
+            if not records.has_yaw.any() and spread < np.radians(20.0):
+                last = turn
+            elif abs(turn) > np.radians(40.0) and spread < np.radians(8.0):
+                last = turn
+                what = "turned by 180 deg" if abs(turn) > np.radians(150.0) else f"off by {np.degrees(turn):.0f} deg"
+                first = int(np.flatnonzero(leg == k)[0])
+                warnings.append(
+                    f"the yaw tags of the leg from frame {first} on are {what}; corrected from the pictures"
+                )
         members = np.flatnonzero(leg == k)
         offset[members] = last
     _fill_turns(offset, leg)

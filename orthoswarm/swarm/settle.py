@@ -61,7 +61,8 @@ def tie_round(
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
-    return match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+    level = surface.height(adj.points[:, :2])
+    return match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach, level)
 
 
 def accepted(matches: MapMatches, peak: float = 0.2, ratio: float = 0.75) -> MapMatches:
@@ -81,10 +82,15 @@ def mode_shift(shift: Array) -> Array:
     return np.asarray(centre)
 
 
-def as_ties(matches: MapMatches, points: Array) -> Ties:
-    """Ties for the adjustment: where the map shows each point now."""
-    sigma = np.full(len(matches.point), TIE_SIGMA_M)
-    return Ties(matches.point, points[matches.point, :2] + matches.shift, sigma)
+def as_ties(matches: MapMatches, points: Array, surface: GroundModel) -> Ties:
+    """Ties for the adjustment: where the map would show each point if it leaned by its height over the ground.
+
+    The match is the ground's, which does not lean; the adjustment's model adds the lean of the point itself.
+    """
+    own = points[matches.point]
+    height = own[:, 2] - surface.height(own[:, :2])
+    xy = own[:, :2] + matches.shift + height[:, None] * np.asarray(surface.lean)
+    return Ties(matches.point, xy, np.full(len(matches.point), TIE_SIGMA_M))
 
 
 def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
@@ -148,7 +154,7 @@ def settle(
     matches = accepted(tie_round(flight, surface, ground, 50.0, 14.0))
     shift_cameras(flight, np.broadcast_to(mode_shift(matches.shift), (len(flight.frames), 2)).copy())
     matches = replace(matches, shift=matches.shift - mode_shift(matches.shift))
-    ties = as_ties(matches, flight.adjustment.points)
+    ties = as_ties(matches, flight.adjustment.points, surface)
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
         if k in (1, 3):
@@ -176,7 +182,7 @@ def _second_round(
     flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
 ) -> tuple[GroundModel, Ties, MapMatches]:
     matches = accepted(tie_round(flight, surface, ground, 30.0, 5.0))
-    ties = as_ties(matches, flight.adjustment.points)
+    ties = as_ties(matches, flight.adjustment.points, surface)
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
         if k % 2 == 0:

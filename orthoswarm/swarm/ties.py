@@ -43,37 +43,40 @@ def match_points(
     ground: LoadedMap,
     half: int = 20,
     reach: int = 28,
-    guess: Array | None = None,
+    level: Array | None = None,
 ) -> MapMatches:
     """Find the surroundings of points on the map.
+
+    What surrounds a corner is mostly ground, although the corner itself sits on something raised: so the surroundings
+    are rectified on the ground where the camera sees the point, not at the point's own height.
 
     Args:
         chosen: (Q,) indices of points; camera: (P,) the picture to take for each point.
         gray: working-scale picture of a camera (the rig's lenses are in its pixels).
         half: half the patch in map pixels; reach: search in map pixels.
-        guess: float64 (Q, 2) expected shift in metres, None for zero.
+        level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
     """
     order = np.argsort(camera[chosen], kind="stable")
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
     rows: list[tuple[int, int, float, float, float, float]] = []
     for k in order:
         p, i = int(chosen[k]), int(camera[chosen[k]])
-        gx, gy = (0.0, 0.0) if guess is None else (float(guess[k, 0]), float(guess[k, 1]))
         x, y, z = points[p]
-        row, column, cx, cy = ground.pixel_centre(x + gx, y + gy)
+        plane = z if level is None else float(level[p])
+        along = (points[p, :2] - rig.position[i, :2]) / max(rig.position[i, 2] - z, 1.0)
+        x, y = x + along[0] * (z - plane), y + along[1] * (z - plane)
+        row, column, cx, cy = ground.pixel_centre(x, y)
         window = ground.window(row, column, half + reach + 1)
         if window is None or window[1] < 0.7:
             continue
         lens = rig.lens[rig.lens_id[i]]
-        seen = rectify(
-            rig.position[i], rig.rotation[i], lens, gray(i), cx - gx, cy - gy, z, ground.gsd_m, half + 1, patch
-        )
+        seen = rectify(rig.position[i], rig.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch)
         if seen < 0.85:
             continue
         template = gradient_field(patch)[1:-1, 1:-1]
         dc, dr, peak, second = match(np.ascontiguousarray(template), gradient_field(window[0])[1:-1, 1:-1])
         if peak > 0:
-            rows.append((p, i, gx + dc * ground.gsd_m, gy - dr * ground.gsd_m, peak, second / peak))
+            rows.append((p, i, dc * ground.gsd_m, -dr * ground.gsd_m, peak, second / peak))
     if not rows:
         return MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     a = np.array(rows)
@@ -131,7 +134,7 @@ def link_legs(
     """Find points of one leg in the pictures of other legs.
 
     Args:
-        camera: (P,) reference picture of each point. leg: (N,) leg of each camera. candidates: cameras that may be linked.
+        camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
 
     Returns:
         Camera (K,), point (K,), pixel (K, 2) of new observations, and how many were tried.
