@@ -355,10 +355,14 @@ def _lot(b: _Builder, area: tuple[float, float, float, float], front: float) -> 
     if rng.random() < 0.4:  # a wing
         b.building(u + rng.uniform(-2, 2), v - front * hv, 3.0, 3.5, eave * 0.7, rise * 0.6, shape, color, turn=turn)
     if rng.random() < 0.5:
-        b.building(u + rng.uniform(-hu, hu) * 0.5, v + rng.uniform(-1, 1), 0.5, 0.5, eave + rise + 0.8, 0, FLAT, (110, 84, 74))
+        b.building(
+            u + rng.uniform(-hu, hu) * 0.5, v + rng.uniform(-1, 1), 0.5, 0.5, eave + rise + 0.8, 0, FLAT, (110, 84, 74)
+        )
     back = v1 if front < 0 else v0
     if rng.random() < 0.5:
-        b.building(rng.uniform(u0 + 3, u1 - 3), back + front * 3.5, 2.2, 1.8, 2.4, 0.5, GABLE, _pick(rng, ROOFS), windows=False)
+        b.building(
+            rng.uniform(u0 + 3, u1 - 3), back + front * 3.5, 2.2, 1.8, 2.4, 0.5, GABLE, _pick(rng, ROOFS), windows=False
+        )
     if rng.random() < 0.12:
         b.polygon(_rect(u - 3, back + front * 9 - 2, u + 3, back + front * 9 + 2), (92, 168, 190), kinds.CONCRETE)
     for _ in range(int(rng.integers(0, 4))):

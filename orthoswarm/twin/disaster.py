@@ -57,36 +57,90 @@ def zone_depth(scene: Scene, zone: Zone, step: int, seed: int) -> Floats:
 
 
 @kernel
+def _wreckage(x, y, seed, piece):  # type: ignore[no-untyped-def]
+    """What lies on the mud at x, y: piece[0] its height, piece[1:4] its colour; False where there is only mud.
+
+    Boards, fragments of roofs and boulders, one candidate in each cell of 4 m, any direction.
+    """
+    size = 4.0
+    ci, cj = int(np.floor(x / size)), int(np.floor(y / size))
+    piece[0] = 0.0
+    for i in range(ci - 1, ci + 2):
+        for j in range(cj - 1, cj + 2):
+            kind = hash01(i, j, seed)
+            if kind > 0.72:
+                continue
+            dx = x - (i + hash01(i, j, seed + 1)) * size
+            dy = y - (j + hash01(i, j, seed + 2)) * size
+            big, tone = hash01(i, j, seed + 3), hash01(i, j, seed + 4)
+            if kind < 0.2:  # a boulder
+                radius = 0.35 + 1.5 * big * big
+                d = (dx * dx + dy * dy) / (radius * radius)
+                h = 1.1 * radius * np.sqrt(max(0.0, 1.0 - d))
+                if d < 1.0 and h > piece[0]:
+                    grey = 88.0 + 80.0 * tone + 20.0 * lattice(x / 0.6, y / 0.6, seed + 9)
+                    piece[0], piece[1], piece[2], piece[3] = h, grey, 0.97 * grey, 0.92 * grey
+                continue
+            turn = 3.1416 * hash01(i, j, seed + 5)
+            u, v = dx * np.cos(turn) + dy * np.sin(turn), dy * np.cos(turn) - dx * np.sin(turn)
+            long, wide = 0.6 + 2.6 * big, 0.12 + 0.25 * tone
+            if kind >= 0.5:
+                long, wide = 0.4 + 2.0 * big * big, 0.3 + 1.4 * tone * big
+            if abs(u) > long or abs(v) > wide or 0.25 + 0.5 * big < piece[0]:
+                continue
+            piece[0] = 0.25 + 0.5 * big
+            paint = hash01(i, j, seed + 6)
+            if kind < 0.5:  # timber
+                piece[1], piece[2], piece[3] = 120.0 + 90.0 * paint, 104.0 + 84.0 * paint, 84.0 + 76.0 * paint
+            elif paint < 0.4:
+                piece[1], piece[2], piece[3] = 150.0, 84.0, 66.0
+            elif paint < 0.6:
+                piece[1], piece[2], piece[3] = 86.0, 98.0, 118.0
+            else:
+                piece[1], piece[2], piece[3] = 190.0 * paint + 30.0, 188.0 * paint + 28.0, 184.0 * paint + 24.0
+    return piece[0] > 0.0
+
+
+@kernel
 def _bury(albedo, kind, dsm, dtm, wall, facade, depth, flow_x, flow_y, seed):  # type: ignore[no-untyped-def]
     """Rubble and mud on every cell of positive depth: heights 0 to 3 m, streaks along the flow."""
     rows, cols = dsm.shape
+    piece = np.zeros(4)
     for r in range(rows):
         for c in range(cols):
             if depth[r, c] <= 0.0:
                 continue
-            x, y = c * CELL_M, r * CELL_M
-            u, v = x * flow_x + y * flow_y, y * flow_x - x * flow_y
-            swell = 0.5 + 0.5 * lattice(u / 38.0, v / 17.0, seed)
-            rough = lattice(x / 5.5, y / 5.5, seed + 1)
-            block = lattice(x / 1.6, y / 1.6, seed + 2)
-            h = 1.5 * swell + 0.55 * rough + (0.9 * (block - 0.45) if block > 0.45 else 0.0)
-            h = min(3.0, max(0.0, h)) * min(1.0, depth[r, c] / 9.0)
-            dsm[r, c] = dtm[r, c] + h
-            facade[r, c] = 0
-            tone = 108.0 + 26.0 * (swell - 0.5) + 20.0 * rough + 26.0 * lattice(u / 24.0, v / 2.6, seed + 3)
-            for i in range(3):
-                wall[r, c, i] = min(max(tone * (1.0 - 0.13 * i), 0.0), 255.0)
+            top = 0.0
             for k in range(4):
                 rr, cc = 2 * r + (k >> 1), 2 * c + (k & 1)
-                xx, yy = cc * TEXEL_M, rr * TEXEL_M
-                fine = 17.0 * (2.0 * hash01(cc, rr, seed) - 1.0) + 24.0 * lattice(xx / 0.8, yy / 0.8, seed + 4)
-                fine += 22.0 * lattice(xx / 2.7, yy / 2.7, seed + 5)
-                plank = lattice(xx / 3.1, yy / 0.7, seed + 6)  # wreckage: pale and dark slivers
-                if abs(plank) > 0.72:
-                    fine += 60.0 * np.sign(plank)
+                x, y = cc * TEXEL_M, rr * TEXEL_M
+                # bend the ground's coordinates, so that nothing lines up with the grid
+                x += 4.0 * lattice(x / 21.0, y / 21.0, seed + 11)
+                y += 4.0 * lattice(x / 21.0 + 7.3, y / 21.0, seed + 12)
+                u, v = x * flow_x + y * flow_y, y * flow_x - x * flow_y
+                p, q = 0.83 * x + 0.56 * y, 0.83 * y - 0.56 * x
+                swell = 0.5 + 0.5 * lattice(u / 46.0, v / 15.0, seed)
+                rough = lattice(p / 5.5, q / 5.5, seed + 1)
+                h = 1.3 * swell + 0.5 * rough + 0.25 * lattice(q / 1.9, p / 1.9, seed + 2)
+                tone = 104.0 + 30.0 * (swell - 0.5) + 18.0 * rough + 22.0 * lattice(u / 30.0, v / 2.4, seed + 3)
+                tone += 12.0 * (2.0 * hash01(cc, rr, seed) - 1.0) + 17.0 * lattice(p / 0.9, q / 0.9, seed + 4)
+                tone += 16.0 * lattice(q / 2.7, p / 2.7, seed + 5)
+                wet = max(0.0, lattice(p / 33.0, q / 33.0, seed + 6) - 0.3)
+                red, green, blue = tone * (1.05 - 0.5 * wet), tone * (0.93 - 0.4 * wet), tone * (0.79 - 0.3 * wet)
+                if _wreckage(x, y, seed + 20, piece):
+                    h += piece[0]
+                    mud = 0.35 * (tone - 104.0)
+                    red, green, blue = piece[1] + mud, piece[2] + mud, piece[3] + mud
                 kind[rr, cc] = kinds.RUBBLE
-                for i in range(3):
-                    albedo[rr, cc, i] = min(max((tone + fine) * (1.05 - 0.13 * i), 0.0), 255.0)
+                albedo[rr, cc, 0] = min(max(red, 0.0), 255.0)
+                albedo[rr, cc, 1] = min(max(green, 0.0), 255.0)
+                albedo[rr, cc, 2] = min(max(blue, 0.0), 255.0)
+                top = max(top, h)
+            top = min(3.0, max(0.0, top)) * min(1.0, depth[r, c] / 9.0)
+            dsm[r, c] = dtm[r, c] + top
+            facade[r, c] = 0
+            for i in range(3):
+                wall[r, c, i] = 0.7 * albedo[2 * r, 2 * c, i]
 
 
 def debris_flow(scene: Scene, zone: Zone, seed: int) -> None:

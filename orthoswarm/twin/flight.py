@@ -199,9 +199,7 @@ def fly(
         body[:, axis] += smooth_noise(rng, n, 3.0, calm) + rng.normal(0, jitter, n)
     body[:, 1] -= np.radians(1.0)  # nose down at cruise
     # the mount holds the camera level but for a share of the airframe's motion
-    angles = np.stack(
-        [body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1
-    )
+    angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
     time = start_s + 7.0 * vehicle + seconds * np.arange(n)
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.kernels import kernel
 from orthoswarm.twin import scene as kinds
+from orthoswarm.twin.grain import add_detail
 from orthoswarm.twin.scene import CELL_M, Scene
 
 Pixels = NDArray[np.uint8]
@@ -137,4 +138,10 @@ def change_season(scene: Scene, seed: int, strength: float = 1.0) -> None:
         offset[kind] = strength * rng.uniform(-12, 12)
     offset[kinds.SOIL] = offset[kinds.FIELD] + strength * rng.uniform(-10, 10)
     offset[kinds.ASPHALT] = strength * rng.uniform(-10, 14)
+    offset[kinds.PHOTO] = strength * rng.uniform(-14, 14, 3)
     _tone(scene.albedo, scene.kind, matrix, offset, 1.0 + strength * float(rng.uniform(-0.12, 0.08)))
+    amplitude = np.zeros((kinds.KINDS, 5), np.float32)
+    # bare and grown ground never looks twice the same: weeds, wear, wet spots
+    amplitude[[kinds.PHOTO, kinds.TREE]] = (5, 6, 7, 8, 10)
+    amplitude[[kinds.GRASS, kinds.SOIL, kinds.FIELD]] = (3, 4, 5, 6, 8)
+    add_detail(scene.albedo, scene.kind, strength * amplitude, np.ones((kinds.KINDS, 3), np.float32), seed * 613 + 9)

@@ -119,9 +119,9 @@ class _Site:
     @classmethod
     def of(cls, spec: TwinSpec) -> "_Site":
         if spec.ground is not None:
-            from orthoswarm.twin.photo_ground import ground_center
+            from orthoswarm.twin.photo_ground import ground_place
 
-            epsg, center = ground_center(spec.ground)
+            epsg, center, _ = ground_place(spec.ground)
             return cls(LocalGrid(epsg), center, spec.plan.heading_rad)
         grid = LocalGrid(utm_epsg(spec.lat_deg, spec.lon_deg))
         east, north = np.round(grid.to_grid(spec.lat_deg, spec.lon_deg))
@@ -135,9 +135,7 @@ class _Site:
             from orthoswarm.twin.photo_ground import load_ground
 
             return load_ground(spec.ground, self.center, half), []
-        return build_city(
-            scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m
-        )
+        return build_city(scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m)
 
 
 def _zone(spec: TwinSpec, site: _Site) -> Zone | None:
@@ -171,6 +169,12 @@ def suns(seed: int) -> tuple[Sun, Sun]:
     )
 
 
+def _sun(spec: TwinSpec, which: int) -> Sun:
+    """The light of the map (0) or of the photos (1); a real orthoimage has shadows already, so they are weaker."""
+    sun = suns(spec.seed)[which]
+    return sun if spec.ground is None else replace(sun, ambient=0.72)
+
+
 def map_lean(spec: TwinSpec) -> tuple[float, float]:
     """The basemap's lean (east, north), metres of shift per metre of height."""
     rng = np.random.default_rng([spec.seed, 67])
@@ -186,7 +190,7 @@ def _write_basemap(spec: TwinSpec, scene: Scene, slots: list[Any], path: Path, t
     before = scene.copy()
     place_cars(before, slots, spec.seed * 2 + 1, spec.cars)
     change_season(before, spec.seed)
-    sun = suns(spec.seed)[0] if spec.ground is None else Sun(2.5, 0.9, 0.95)
+    sun = _sun(spec, 0)
     lit = lit_texture(before, sun)
     stage = make_stage(before, lit, sun.direction(), sun.ambient, np.zeros((0, 0), np.float32))
     lean = map_lean(spec)
@@ -194,9 +198,10 @@ def _write_basemap(spec: TwinSpec, scene: Scene, slots: list[Any], path: Path, t
     image = cv2.GaussianBlur(image, (0, 0), 0.55)
     rng = np.random.default_rng([spec.seed, 71])
     haze = np.array([rng.uniform(4, 16), rng.uniform(5, 18), rng.uniform(8, 24)])
-    for rows in range(0, grid.height, 512):
+    gain = np.float32(rng.uniform(0.82, 0.95))
+    for rows in range(0, grid.height, 512):  # in strips, for memory
         part = image[rows : rows + 512]
-        part *= rng.uniform(0.82, 0.95)
+        part *= gain
         part += (haze + rng.normal(0.0, 2.2, part.shape[:2])[..., None]).astype(np.float32)
     _geotiff(path, np.clip(image, 1, 255).astype(np.uint8), grid)
     _replace(truth / "basemap.json", json.dumps({"lean_east": lean[0], "lean_north": lean[1]}).encode())
@@ -212,7 +217,7 @@ def _after(spec: TwinSpec, scene: Scene, slots: list[Any], zone: Zone | None) ->
         flood(scene, zone, spec.seed)
     elif zone is not None:
         haze = haze_opacity(scene, zone, spec.seed)
-    sun = suns(spec.seed)[1] if spec.ground is None else Sun(3.2, 0.9, 0.95)
+    sun = _sun(spec, 1)
     lit = lit_texture(scene, sun)
     return make_stage(scene, lit, sun.direction(), sun.ambient, haze)
 
@@ -308,8 +313,11 @@ def _write_frames(spec: TwinSpec, site: _Site, flights: list[Flight], path: Path
                 + [f"{x:.4f}" for x in flight.position[i]]
                 + [f"{x:.6f}" for x in degrees[i]]
                 + [f"{np.degrees(flight.lens.fov_rad):.6f}", flight.lens.k1, flight.lens.k2, site.grid.epsg]
+                + [flight.lens.width, flight.lens.height]
             )
-    header = "image vehicle time easting northing height yaw_deg pitch_deg roll_deg fov_deg k1 k2 epsg".split()
+    header = (
+        "image vehicle time easting northing height yaw_deg pitch_deg roll_deg fov_deg k1 k2 epsg width height".split()
+    )
     part = path.with_name(".frames.csv.part")
     with part.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -387,7 +395,14 @@ def _degrees(angles: NDArray[np.float64], convergence: float) -> tuple[float, fl
 def with_heading(spec: TwinSpec) -> TwinSpec:
     """A spec whose flight direction is drawn from its seed (the presets fly north)."""
     rng = np.random.default_rng([spec.seed, 97])
-    heading = rng.choice([0.0, np.pi / 2]) + np.radians(rng.uniform(-12.0, 12.0))
+    quarter = float(rng.choice([0.0, np.pi / 2]))
+    if spec.ground is not None:  # the long side of the area along the long side of the place
+        from orthoswarm.twin.photo_ground import ground_place
+
+        size = ground_place(spec.ground)[2]
+        across, along = spec.plan.extent_m
+        quarter = 0.0 if (across >= along) == (size[0] >= size[1]) else np.pi / 2
+    heading = quarter + np.radians(rng.uniform(-12.0, 12.0))
     return replace(spec, plan=replace(spec.plan, heading_rad=float(heading)))
 
 

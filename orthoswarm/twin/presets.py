@@ -67,7 +67,9 @@ class TwinSpec:
         return asdict(self)
 
 
-_TINY = FlightPlan(columns=2, photos=20, legs=2, spacing_m=12.0, leg_spacing_m=80.0, width=320, height=240, height_m=90.0)
+_TINY = FlightPlan(
+    columns=2, photos=20, legs=2, spacing_m=12.0, leg_spacing_m=80.0, width=320, height=240, height_m=90.0
+)
 PRESETS: dict[str, TwinSpec] = {
     "tiny": TwinSpec(preset="tiny", disaster="none", plan=_TINY, margin_m=170.0),
     "debris": TwinSpec(preset="debris", disaster="debris"),

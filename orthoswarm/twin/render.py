@@ -218,17 +218,13 @@ def _shoot(  # type: ignore[no-untyped-def]
                 rgb[0] = rgb[1] = rgb[2] = 190.0
                 if down > 0.05:
                     bx, by = dx / down, dy / down
-                    hr, hc, z, side = _march(
-                        dsm, tiles, cx / CELL_M, cy / CELL_M, cz, bx / CELL_M, by / CELL_M, top
-                    )
+                    hr, hc, z, side = _march(dsm, tiles, cx / CELL_M, cy / CELL_M, cz, bx / CELL_M, by / CELL_M, top)
                     if hr < 0:
                         rgb[0] = rgb[1] = rgb[2] = 120.0
                     else:
                         if side > 0 and dsm[hr, hc] - z > 0.45:
                             gx, gy = cx + bx * (cz - z), cy + by * (cz - z)
-                            _wall_color(
-                                dsm, wall, facade, hr, hc, side, bx, by, gx, gy, z, sun, ambient, ca, sa, rgb
-                            )
+                            _wall_color(dsm, wall, facade, hr, hc, side, bx, by, gx, gy, z, sun, ambient, ca, sa, rgb)
                         else:
                             sx, sy = _slope(dsm, hr, hc)
                             # where the ray meets the column's tilted top
@@ -251,9 +247,7 @@ def _shoot(  # type: ignore[no-untyped-def]
                             if kind[tr, tc] == WATER:
                                 _water_color(noise, gx, gy, motion, rgb)
                     if haze.shape[0] > 0:
-                        _veil(
-                            haze, noise, cx + bx * (cz - HAZE_HEIGHT_M), cy + by * (cz - HAZE_HEIGHT_M), motion, rgb
-                        )
+                        _veil(haze, noise, cx + bx * (cz - HAZE_HEIGHT_M), cy + by * (cz - HAZE_HEIGHT_M), motion, rgb)
                 s0 += rgb[0]
                 s1 += rgb[1]
                 s2 += rgb[2]
@@ -310,9 +304,7 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                     rgb[0] = rgb[1] = rgb[2] = 0.0
                 elif side > 0 and dsm[hr, hc] - z > 0.45:
                     gx, gy = x + lean_x * (ground - z), y + lean_y * (ground - z)
-                    _wall_color(
-                        dsm, wall, facade, hr, hc, side, lean_x, lean_y, gx, gy, z, sun, ambient, ca, sa, rgb
-                    )
+                    _wall_color(dsm, wall, facade, hr, hc, side, lean_x, lean_y, gx, gy, z, sun, ambient, ca, sa, rgb)
                 else:
                     if abs(dsm[hr, hc] - ground) < 0.3 and abs(dtm[hr, hc] - dsm[hr, hc]) < 0.01:
                         z = ground

@@ -41,7 +41,9 @@ def stamp_building(  # type: ignore[no-untyped-def]
             kind[r, c] = ROOF
             if shape == FLAT:
                 edge = min(hu - abs(lu), hv - abs(lv))
-                shade = 14.0 * lattice(lu / 3.5, lv / 3.5, seed) + 9.0 * (2.0 * hash01(int(lu / 4.0), int(lv / 4.0), seed) - 1)
+                shade = 14.0 * lattice(lu / 3.5, lv / 3.5, seed) + 9.0 * (
+                    2.0 * hash01(int(lu / 4.0), int(lv / 4.0), seed) - 1
+                )
                 if edge < 0.5:
                     shade += 28.0
                 elif edge < 0.9:
