@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.placement import Terrain
-from orthoswarm.swarm.locus import SMALL, Gray, LocusPoints, Sweep, dense_ground
+from orthoswarm.swarm.locus import SMALL, Gray, LocusPoints, Sweep, dense_ground, height_above
 from orthoswarm.swarm.rig import Rig
 
 Array = NDArray[np.float64]
@@ -27,7 +27,9 @@ class Lift:
     Attributes:
         lift_m: to be added to the surface wherever height above ground matters (usually negative).
         count: heights found; 0 lift below the minimum.
-        points: what the level was taken from (good ground points by themselves).
+        points: what the level was taken from. They are good ground points by themselves: a surface fitted to them
+            and the tracks together follows the ground where the lift differs from place to place (rubble here,
+            streets there), and then the lift that is left is a few centimetres.
     """
 
     lift_m: float
@@ -51,7 +53,7 @@ def ground_lift(
     positions: Array,
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
-    sweep: Sweep = NEAR,
+    sweep: Sweep | None = None,
     *,
     least: int = 60,
     kernel_m: float = 0.2,
@@ -65,12 +67,14 @@ def ground_lift(
         positions: float64 (C, 2).
         terrain: the surface, within sweep.reach_m of the ground.
         leg_of_camera: int (N,), -1 for cameras that must not be used.
-        sweep: how heights are searched; scale it by `at_height` where the cameras are not 150 m above ground.
+        sweep: how heights are searched; None: NEAR, for the cameras' height above the terrain.
         least: with fewer heights than this the lift is 0.
         kernel_m: width of the kernel whose mode is taken.
         limits_m: the lift is clipped to this range.
     """
-    found = dense_ground(rig, gray, positions, terrain, leg_of_camera, (sweep,))
+    found = dense_ground(
+        rig, gray, positions, terrain, leg_of_camera, (sweep or NEAR.at_height(height_above(rig, terrain)),)
+    )
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
     if len(above) < least:
         return Lift(0.0, len(above), found)

@@ -101,7 +101,7 @@ def dense_ground(
     cells: Array,
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
-    sweeps: Sequence[Sweep] = (SMALL, LARGE),
+    sweeps: Sequence[Sweep] | None = None,
     *,
     slots: int = 64,
 ) -> LocusPoints:
@@ -115,9 +115,12 @@ def dense_ground(
         terrain: where heights are searched around; its slope tilts the patches.
         leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
         sweeps: how to search, one after the other, each at the positions where those before found nothing. Baselines
-            and spacing are the first one's. The default suits 150 m above ground (`Sweep.at_height`).
+            and spacing are the first one's. None: SMALL, then LARGE, for the cameras' height above the terrain.
         slots: number of pictures held at a time (more only where the cells of one reference need more).
     """
+    if sweeps is None:
+        height = height_above(rig, terrain)
+        sweeps = (SMALL.at_height(height), LARGE.at_height(height))
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
     plane = _planes(terrain, cells, max(5.0, s.half * s.step_m))
@@ -136,6 +139,13 @@ def dense_ground(
     points = np.empty((len(good), 3))
     kernels.raise_points(rig.position, ref[good], cells[good], plane[good], found[good, 0], points)
     return LocusPoints(points, found[good, 2], found[good, 1], good)
+
+
+def height_above(rig: Rig, terrain: Terrain) -> float:
+    """Median height of cameras above the terrain, metres, at least 1."""
+    if len(rig) == 0:
+        return 150.0
+    return max(1.0, float(np.median(rig.position[:, 2] - terrain.height(rig.position[:, :2]))))
 
 
 @dataclass(frozen=True, slots=True)
