@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap, Bounds
+from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import TILE_PX, write_cog
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.gains import estimate_gains
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.render import RenderStats, render
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
@@ -32,6 +34,7 @@ from orthoswarm.workers import Workers
 from orthoswarm.workspace import Workspace, run_key
 
 Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
 Load = Callable[[Progress], Ingest]
@@ -83,6 +86,10 @@ class _State:
     basemap: Basemap | None
     warnings: list[str] = field(default_factory=list)
     rejected: dict[str, Rejection] = field(default_factory=dict)
+    thumbnails: dict[str, Bytes] = field(default_factory=dict)
+    gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    terrain: Terrain | None = None
+    drawn: tuple[float, float] = (0.0, 1.0)
 
 
 def run(load: Load, out: Path, options: Options, workers: Workers, progress: Progress) -> dict[str, Any]:
@@ -166,7 +173,8 @@ class _Batch:
             if not stats.pixels.any():
                 reason = next(iter(stats.rejected.values()), "no picture sees the ground")
                 raise OrthoSwarmError(f"no picture could be drawn: {reason}")
-            self.space.remember("realtime", (replace(stats, thumbnails={}), stage))
+            self.space.remember("realtime", (stats, stage))
+        state.thumbnails, state.drawn = stats.thumbnails, (stats.drawn_m2, stats.covered_share)
         if self.options.until == "realtime":
             self.leave_out(state, stats.rejected, placed)
         return [p for p in placed if p.frame.image not in stats.rejected]
@@ -213,9 +221,10 @@ class _Batch:
             placed = state.recorded.placed
             with self.clock.stage("final: orthoimage", len(placed)):
                 stats = self.draw(ORTHOIMAGE, placed, Terrain.flat(), state)
+            state.drawn = (stats.drawn_m2, stats.covered_share)
             self.leave_out(state, stats.rejected, placed)
             return [p for p in placed if p.frame.image not in state.rejected]
-        terrain = refinement.terrain
+        terrain = state.terrain = self.ground(state, refinement)
         for solution in refinement.fine:
             reasons = dict(solution.dropped)
             self.leave_out(state, reasons, state.recorded.placed)
@@ -226,6 +235,9 @@ class _Batch:
             state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
         coarse = [p for s in refinement.coarse for p in s.placed]
         fine = [p for s in refinement.fine for p in s.placed]
+        if self.options.gains:
+            with self.clock.stage("final: gains", len(fine)):
+                state.gains = estimate_gains(fine, state.thumbnails, terrain or Terrain.flat())
         if with_map:
             self.picture(state, COARSE, coarse, _coarse_terrain(refinement.coarse))
         if self.options.until == "fine":
@@ -236,18 +248,28 @@ class _Batch:
         self.picture(state, COARSE, fine, terrain)
         return [p for p in fine if p.frame.image not in state.rejected]
 
+    def ground(self, state: _State, refinement: _Refinement) -> Terrain | None:
+        """The ground under the pictures: found from them, or an outside height model brought to their level."""
+        if self.options.dem is None:
+            return refinement.terrain
+        fine = [p for s in refinement.fine for p in s.placed]
+        level = ground_level(fine, refinement.terrain)
+        nadirs = np.array([p.camera.nadir for p in fine])
+        model = read_dem(self.options.dem, state.grid.epsg, _bounds(fine, level, level), takeoff=nadirs)
+        return replace(model, z=model.z + np.float32(level))
+
     def picture(self, state: _State, name: str, placed: Sequence[PlacedFrame], terrain: Terrain | None) -> None:
         """Render one product, unless an interrupted run has."""
         known = self.space.recall(name)
         if known is not None and (self.out / name).exists():
-            rejected, share, stage = known
+            rejected, state.drawn, stage = known
             self.clock.stages.append(stage)
         else:
             label = "orthoimage" if name == ORTHOIMAGE else "coarse picture"
             with self.clock.stage(f"final: {label}", len(placed)) as stage:
                 stats = self.draw(name, placed, terrain or Terrain.flat(), state)
-            rejected, share = stats.rejected, stats.covered_share
-            self.space.remember(name, (rejected, share, stage))
+            rejected, state.drawn = stats.rejected, (stats.drawn_m2, stats.covered_share)
+            self.space.remember(name, (rejected, state.drawn, stage))
         self.leave_out(state, rejected, placed)
 
     def draw(
@@ -272,7 +294,7 @@ class _Batch:
             if realtime:
                 stats = mosaic(placed, canvas, run=self.workers.map, progress=drawn)
             else:
-                stats = render(placed, terrain, canvas, run=self.workers.map, progress=drawn)
+                stats = render(placed, terrain, canvas, gains=state.gains, run=self.workers.map, progress=drawn)
             write_cog(canvas, self.out / name, window=_drawn(canvas), progress=written, threads=self.workers.count)
         self.space.clear_scratch()
         return stats
@@ -302,7 +324,7 @@ class _Batch:
             if name not in self.made(refinement):
                 (self.out / name).unlink(missing_ok=True)
         with self.clock.stage("final: report", len(placed)) as stage:
-            z = ground_level(placed, refinement.terrain if refinement else None)
+            z = ground_level(placed, state.terrain)
             write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
             report = self.report(state, placed, refinement, z)
             write_page(self.out, report, placed, list(state.rejected.values()), state.basemap)
@@ -347,6 +369,8 @@ class _Batch:
             "warnings": list(dict.fromkeys(state.warnings)),
             "epsg": state.grid.epsg,
             "gsd_m": state.gsd_m,
+            "area_ha": state.drawn[0] / 1e4,
+            "covered_share": state.drawn[1],
             "basemap": str(self.options.basemap) if self.options.basemap else None,
             "until": self.options.until,
             "root": _root(state.ingest.frames),

@@ -129,6 +129,7 @@ def test_the_report_has_its_keys(mapped):
     )
     assert all(set(s) == {"name", "wall_s", "cpu_s", "items"} for s in report["stages"])
     assert report["wall_s"] > 0 and report["cpu_s"] > 0 and report["peak_rss_mb"] > 50
+    assert 2.0 < report["area_ha"] < 12.0 and report["covered_share"] > 0.97
     assert math.isfinite(report["ground_z_m"]) and report["refine"] == "swarm" and isinstance(report["warnings"], list)
 
 

@@ -38,7 +38,7 @@ def write_footprints(path: Path, rows: Sequence[Mapping[str, Any]], polygons: Se
 
     kept = [(row, ring) for row, ring in zip(rows, polygons, strict=True) if len(ring) >= 3]
     rings = [ring for _, ring in kept]
-    points = np.concatenate([np.r_[ring, ring[:1]] for ring in rings]) if rings else np.empty((0, 2))
+    points = np.concatenate([part for ring in rings for part in (ring, ring[:1])]) if rings else np.empty((0, 2))
     index = np.repeat(np.arange(len(rings)), [len(ring) + 1 for ring in rings])
     shapes = shapely.polygons(shapely.linearrings(points, indices=index)) if rings else np.empty(0, object)
     fields = [_column([row.get(name) for row, _ in kept], kind) for name, kind in _COLUMNS.items()]

@@ -9,10 +9,12 @@ from orthoswarm.geo import GroundGrid
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 _BLOCK_PX = 72
 _SEARCH_PX = 14
+_MOST_BLOCKS = 700
 _LEAST_PEAK = 0.35
 _LEAST_LEAD = 1.25
 
@@ -36,7 +38,7 @@ class Displacements:
         return np.asarray(np.hypot(self.shift[:, 0], self.shift[:, 1]))
 
 
-def displacements(ortho: Gray, seen: Mask, basemap: Gray, valid: Mask, grid: GroundGrid) -> Displacements:
+def displacements(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, grid: GroundGrid) -> Displacements:
     """Match blocks of an orthoimage to a map of the same grid by their gradients.
 
     Only clear matches count: the peak of the correlation is high and no other is near it. What changed between the two
@@ -54,8 +56,10 @@ def displacements(ortho: Gray, seen: Mask, basemap: Gray, valid: Mask, grid: Gro
     a, b = _gradient(ortho), _gradient(basemap)
     at, shift, tried = [], [], 0
     step = _BLOCK_PX
-    for r in range(_SEARCH_PX, grid.height - step - _SEARCH_PX, step):
-        for c in range(_SEARCH_PX, grid.width - step - _SEARCH_PX, step):
+    # Blocks side by side, or with gaps where there are more than are worth the time.
+    apart = step * max(1, round((grid.height * grid.width / step**2 / _MOST_BLOCKS) ** 0.5))
+    for r in range(_SEARCH_PX, grid.height - step - _SEARCH_PX, apart):
+        for c in range(_SEARCH_PX, grid.width - step - _SEARCH_PX, apart):
             block = (slice(r, r + step), slice(c, c + step))
             wide = (
                 slice(r - _SEARCH_PX, r + step + _SEARCH_PX),
@@ -73,13 +77,13 @@ def displacements(ortho: Gray, seen: Mask, basemap: Gray, valid: Mask, grid: Gro
     return Displacements(middles, np.array(shift, float).reshape(-1, 2) * grid.gsd_m, tried)
 
 
-def _gradient(gray: Gray) -> Gray:
+def _gradient(gray: Bytes) -> Gray:
     """Gradient size, compressed so that strong edges do not outvote all others."""
     import cv2
 
-    smooth = cv2.GaussianBlur(gray, (0, 0), 1.0)
-    size = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    return np.asarray(np.sqrt(size), np.float32)
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
+    size = cv2.magnitude(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    return np.asarray(cv2.sqrt(size), np.float32)
 
 
 def _clear_peak(scores: NDArray[np.float32]) -> tuple[float, float] | None:

@@ -18,13 +18,13 @@ from orthoswarm.report import charts
 from orthoswarm.report.displacement import Displacements, displacements
 from orthoswarm.report.pictures import (
     Bounds,
+    MapView,
     Picture,
     data_uri,
     draw_arrows,
     draw_lines,
     fill_polygons,
     map_edges,
-    on_paper,
     pale,
     product_bounds,
     product_picture,
@@ -88,9 +88,13 @@ def write_page(
     moved = None
     if best is not None:
         bounds = product_bounds(best)
+        there = None
         if basemap is not None:
-            moved = _against_map(best, bounds, basemap, report)
-        values |= _pictures(out, best, bounds, report, placed, basemap, moved)
+            least = max(float(report["gsd_m"]), basemap.native_gsd_m, 0.25)
+            there = MapView.read(basemap, view_grid(report["epsg"], bounds, 2600, least))
+            moved = _against_map(best, there)
+        values |= _pictures(out, best, bounds, report, placed, there, moved)
+        values["edges"] = _edge_crops(best, there, basemap) if basemap is not None and there is not None else []
     values["verdict"] = _verdict(report, placed, moved)
     values["facts"] = _facts(report, placed, moved)
     values["fov"] = charts.fields_of_view(report["vehicles"])
@@ -105,7 +109,7 @@ def _pictures(
     bounds: Bounds,
     report: Mapping[str, Any],
     placed: Sequence[PlacedFrame],
-    basemap: Basemap | None,
+    there: MapView | None,
     moved: Displacements | None,
 ) -> dict[str, Any]:
     """All figures, largest first."""
@@ -123,8 +127,7 @@ def _pictures(
     return {
         "main": data_uri(main.rgb, 86),
         "stages": stages if len(stages) > 1 else [],
-        "edges": _edge_crops(best, bounds, report, basemap) if basemap is not None else [],
-        "footprints": _footprints(reduced, placed, basemap, float(report["ground_z_m"])),
+        "footprints": _footprints(reduced, placed, there, float(report["ground_z_m"])),
         "arrows": _arrows(reduced, moved) if moved is not None and len(moved.at) else None,
         "paths": _paths(reduced, placed, report) if report["legs"] else None,
     }
@@ -137,33 +140,26 @@ def _same_as_coarse(report: Mapping[str, Any]) -> bool:
 # -- figures ------------------------------------------------------------------------------------------------------
 
 
-def _against_map(best: Path, bounds: Bounds, basemap: Basemap, report: Mapping[str, Any]) -> Displacements:
-    """Blocks of the orthoimage on the map, at a pixel between the two's own and what fits into memory."""
+def _against_map(best: Path, there: MapView) -> Displacements:
+    """Blocks of the orthoimage on the map."""
     import cv2
 
-    least = max(float(report["gsd_m"]), basemap.native_gsd_m, 0.25)
-    grid = view_grid(report["epsg"], bounds, 2600, least)
-    picture = product_picture(best, grid)
-    gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    there, valid = basemap.gray(grid.bounds, grid.gsd_m)
-    rows, cols = min(gray.shape[0], there.shape[0]), min(gray.shape[1], there.shape[1])
-    cut = (slice(rows), slice(cols))
-    return displacements(gray[cut], picture.seen[cut], there[cut], valid[cut], grid)
+    picture = product_picture(best, there.grid)
+    gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
+    return displacements(gray, picture.seen, there.gray, there.valid, there.grid)
 
 
-def _edge_crops(best: Path, bounds: Bounds, report: Mapping[str, Any], basemap: Basemap) -> list[Figure]:
+def _edge_crops(best: Path, there: MapView, basemap: Basemap) -> list[Figure]:
     """Parts of the orthoimage with the map's edges over them, where the map has most of them."""
-    side = 360
-    gsd = max(float(report["gsd_m"]), 0.5 * basemap.native_gsd_m)
-    overview = view_grid(report["epsg"], bounds, 400, gsd)
-    seen = product_picture(best, overview).seen.astype(np.float32)
-    gray, valid = basemap.gray(overview.bounds, overview.gsd_m)
-    rows, cols = min(seen.shape[0], gray.shape[0]), min(seen.shape[1], gray.shape[1])
     import cv2
 
+    epsg, side = there.grid.epsg, 360
+    gsd = max(0.5 * there.grid.gsd_m, 0.5 * basemap.native_gsd_m, 0.1)
+    overview = view_grid(epsg, there.grid.bounds, 400)
+    seen = product_picture(best, overview).seen.astype(np.float32)
     size = max(3, int(side * gsd / overview.gsd_m))
-    edges = map_edges(gray, valid)[:rows, :cols].astype(np.float32) * seen[:rows, :cols]
-    full = cv2.boxFilter(seen[:rows, :cols], -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9
+    edges = map_edges(there.on(overview)).astype(np.float32) * seen
+    full = cv2.boxFilter(seen, -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9
     score = cv2.boxFilter(edges, -1, (size, size), borderType=cv2.BORDER_CONSTANT) * full
     figures: list[Figure] = []
     while len(figures) < 3 and score.size and score.max() > 0.01:
@@ -171,32 +167,22 @@ def _edge_crops(best: Path, bounds: Bounds, report: Mapping[str, Any], basemap: 
         middle = overview.to_ground([float(c), float(r)])
         half = 0.5 * side * gsd
         window = (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half)
-        grid = view_grid(report["epsg"], window, side, gsd)
-        figures.append(Figure("", data_uri(_with_edges(best, grid, basemap).rgb, 88), ""))
+        picture = _with_edges(best, MapView.read(basemap, view_grid(epsg, window, side, gsd)))
+        figures.append(Figure("", data_uri(picture.rgb, 88), ""))
         score[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
     return figures
 
 
-def _with_edges(best: Path, grid: Any, basemap: Basemap) -> Picture:
-    picture = product_picture(best, grid)
-    gray, valid = basemap.gray(grid.bounds, grid.gsd_m)
-    edges = map_edges(gray, valid)[: grid.height, : grid.width]
-    rows, cols = edges.shape
-    picture.rgb[:rows, :cols][edges] = _EDGE
+def _with_edges(best: Path, there: MapView) -> Picture:
+    picture = product_picture(best, there.grid)
+    picture.rgb[map_edges(there)] = _EDGE
     scale_bar(picture)
     return picture
 
 
-def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], basemap: Basemap | None, ground_z_m: float) -> Figure:
+def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView | None, ground_z_m: float) -> Figure:
     """Each vehicle's footprints on the map, or on the orthoimage where there is none."""
-    under, on = reduced, "the orthoimage"
-    if basemap is not None:
-        rgb, valid = basemap.rgb(reduced.grid.bounds, reduced.grid.gsd_m)
-        rows, cols = min(rgb.shape[0], reduced.rgb.shape[0]), min(rgb.shape[1], reduced.rgb.shape[1])
-        seen = np.zeros(reduced.seen.shape, bool)
-        full = np.zeros_like(reduced.rgb)
-        full[:rows, :cols], seen[:rows, :cols] = rgb[:rows, :cols], valid[:rows, :cols]
-        under, on = on_paper(full, seen, reduced.grid), "the map"
+    under, on = (reduced, "the orthoimage") if there is None else (there.on(reduced.grid).picture(), "the map")
     picture = under.copy()
     vehicles = list(dict.fromkeys(p.frame.vehicle for p in placed))
     for i, vehicle in enumerate(vehicles):
@@ -277,8 +263,8 @@ def _facts(
         (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),
         (f"{gsd * 100:.1f} cm" if gsd < 1 else f"{gsd:.2f} m", "ground pixel"),
     ]
-    if "area_ha" in report:
-        facts.append((f"{report['area_ha']:,.1f} ha", "mapped"))
+    area = float(report["area_ha"])
+    facts.append((f"{area:,.1f} ha" if area < 1000 else f"{area / 100:,.1f} km²", "mapped"))
     if moved is not None and len(moved.at):
         facts.append((f"{np.median(moved.size_m):.2f} m", "from the map (median)"))
     return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.geo import GroundGrid
+from orthoswarm.placement import MapWindow
+from orthoswarm.resample import resample
 
 Bytes = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -67,22 +69,54 @@ def product_bounds(path: Path) -> Bounds:
 
 
 def product_picture(path: Path, grid: GroundGrid) -> Picture:
-    """A product on a grid."""
+    """A product on a grid (to half a pixel: for looking at)."""
     import rasterio
     from rasterio.enums import Resampling
-    from rasterio.windows import from_bounds
+    from rasterio.windows import Window
 
-    west, south, east, north = grid.bounds
+    rgba = np.zeros((4, grid.height, grid.width), np.uint8)
     with rasterio.open(path) as source:
-        window = from_bounds(west, south, east, north, source.transform)
-        rgba = source.read(
-            window=window,
-            out_shape=(4, grid.height, grid.width),
-            boundless=True,
-            fill_value=0,
-            resampling=Resampling.average,
-        )
+        step = source.res[0]
+        left, top = (grid.west - source.bounds.left) / step, (source.bounds.top - grid.north) / step
+        scale = grid.gsd_m / step
+        # Whole pixels of the answer that lie within the product.
+        c0, c1 = max(0, round(-left / scale)), min(grid.width, round((source.width - left) / scale))
+        r0, r1 = max(0, round(-top / scale)), min(grid.height, round((source.height - top) / scale))
+        if c0 < c1 and r0 < r1:
+            x0, y0 = max(0.0, left + c0 * scale), max(0.0, top + r0 * scale)
+            x1, y1 = min(source.width, left + c1 * scale), min(source.height, top + r1 * scale)
+            how = Resampling.average if scale > 1 else Resampling.bilinear
+            shape, window = (4, r1 - r0, c1 - c0), Window(x0, y0, x1 - x0, y1 - y0)
+            rgba[:, r0:r1, c0:c1] = source.read(window=window, out_shape=shape, resampling=how)
     return on_paper(np.ascontiguousarray(rgba[:3].transpose(1, 2, 0)), rgba[3] > 127, grid)
+
+
+@dataclass(frozen=True, slots=True)
+class MapView:
+    """The map in grey on a grid: uint8 (rows, columns), and where it means something."""
+
+    gray: Bytes
+    valid: NDArray[np.bool_]
+    grid: GroundGrid
+
+    @classmethod
+    def read(cls, basemap: MapWindow, grid: GroundGrid) -> "MapView":
+        """Read a window of a map."""
+        gray, valid = basemap.gray(grid.bounds, grid.gsd_m)
+        whole = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m)
+        return cls(np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid, whole).on(grid)
+
+    def on(self, grid: GroundGrid) -> "MapView":
+        """The same on another grid, as far as it reaches."""
+        step = self.grid.gsd_m
+        first = ((grid.west - self.grid.west) / step, (self.grid.north - grid.north) / step)
+        scale = grid.gsd_m / step
+        gray, valid = resample(self.gray[None], self.valid, first, (scale, scale), (grid.width, grid.height))
+        return MapView(gray[0], valid, grid)
+
+    def picture(self) -> Picture:
+        """To draw on."""
+        return on_paper(np.repeat(self.gray[..., None], 3, axis=2), self.valid, self.grid)
 
 
 def on_paper(rgb: Bytes, seen: NDArray[np.bool_], grid: GroundGrid) -> Picture:
@@ -150,16 +184,16 @@ def scale_bar(picture: Picture) -> None:
     cv2.putText(picture.rgb, text, (x, y - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 24, 30), 1, cv2.LINE_AA)
 
 
-def map_edges(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def map_edges(view: MapView) -> NDArray[np.bool_]:
     """Strong edges of a map, the upper part of its own gradients."""
     import cv2
 
-    smooth = cv2.GaussianBlur(gray, (0, 0), 1.0)
+    smooth = cv2.GaussianBlur(view.gray, (0, 0), 1.0)
     gx, gy = cv2.Sobel(smooth, cv2.CV_16S, 1, 0), cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
-    inside = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    inside = cv2.erode(view.valid.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     size = np.hypot(gx, gy, dtype=np.float32)
     if not inside.any():
-        return np.zeros(gray.shape, bool)
+        return np.zeros(view.gray.shape, bool)
     high = float(np.percentile(size[inside], 92))
     edges = np.asarray(cv2.Canny(gx, gy, 0.4 * high, max(high, 1.0), L2gradient=True), np.uint8)
     return np.asarray((edges > 0) & inside)
