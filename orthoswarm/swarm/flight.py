@@ -1,7 +1,7 @@
 """One vehicle's dense flight up to the map: records, calibration, tracks, relative adjustment (RECIPE.md 1 to 3)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.camera import fov_rad
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
-from orthoswarm.swarm.adjust import Adjustment, Ground, log_rotation
+from orthoswarm.swarm.adjust import Adjustment, log_rotation
 from orthoswarm.swarm.calibrate import Calibration, calibrate
 from orthoswarm.swarm.legs import split_legs
 from orthoswarm.swarm.pictures import Pictures
@@ -22,7 +22,9 @@ from orthoswarm.swarm.tracks import follow, predicted_homography
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-RELATIVE_SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
+HEIGHT_SIGMA_M = (0.1, 2.0)
+ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
+"""Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
 
 
 @dataclass(slots=True)
@@ -69,25 +71,25 @@ def open_flight(
     return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))
 
 
-def relative_adjustment(flight: Flight, schedule: Sequence[float] = RELATIVE_SCHEDULE) -> None:
-    """Adjust without a map: the ground is level within a few metres at height 0."""
+def weigh_records(flight: Flight) -> None:
+    """Give heights and attitudes the sigmas that they show: pictures tell well how one differs from the next."""
     adj = flight.adjustment
-    for k, c in enumerate(schedule):
-        adj.step(c, level_ground(len(adj.points), 3.0 if k < 2 else 2.0, 1e3 if k < 2 else 4.0))
+    p = adj.priors
+    height = adj.rig.position[:, 2] - p.position[:, 2]
+    attitude = log_rotation(np.swapaxes(p.rotation, 1, 2) @ adj.rig.rotation)
+    z = float(np.clip(_jitter(height[:, None])[0], *HEIGHT_SIGMA_M))
+    turn = np.clip(_jitter(attitude), *ATTITUDE_SIGMA_RAD)
+    sigma = p.position_sigma.copy()
+    if flight.calibration.trusted_height:
+        sigma[:, 2] = z
+    known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
+    adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
 
-def level_ground(points: int, sigma: float = 2.0, c: float = 4.0) -> Ground:
-    """All points near height 0."""
-    zero = np.zeros(points)
-    return Ground(zero, sigma, 20.0, zero, c=c)
-
-
-def attitude_scatter(flight: Flight) -> Array:
-    """Robust scatter (3,) in radians of recorded attitude minus bias about the adjusted one."""
-    adj = flight.adjustment
-    bias = adj.group_values(0)[0]
-    r = log_rotation(np.swapaxes(adj.priors.rotation, 1, 2) @ adj.rig.rotation) - bias
-    return np.asarray(1.4826 * np.median(np.abs(r - np.median(r, axis=0)), axis=0))
+def _jitter(values: Array) -> Array:
+    """Robust sigma of each column of a sequence's noise from one picture to the next."""
+    step = np.diff(values, axis=0)
+    return np.asarray(1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0) / np.sqrt(2.0))
 
 
 def _track(records: Records, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:
@@ -115,7 +117,7 @@ def _begin(records: Records, pictures: Pictures, calibration: Calibration, track
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     rig = Rig(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
     horizontal = np.where(np.isfinite(records.position_sigma), np.maximum(records.position_sigma, 0.02), 1.5)
-    z_sigma = 0.15 if calibration.trusted_height else 0.5
+    z_sigma = 0.5
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
     model = GroupModel(
@@ -147,13 +149,12 @@ def first_points(rig: Rig, tracks: Tracks) -> Array:
 
 
 def _height_prior(records: Records, calibration: Calibration) -> Array:
-    """Heights over the ground: the vehicle's median where it flew level, else its smoothed record."""
+    """Heights over the ground as recorded, without spikes; one height where the record cannot be trusted."""
     z = records.position[:, 2]
     if not calibration.trusted_height:
         return np.full(len(z), calibration.height_m)
-    smooth = np.array([np.median(z[max(0, i - 10) : i + 11]) for i in range(len(z))])
-    low, high = np.percentile(smooth, [5, 95])
-    return np.full(len(z), float(np.median(z))) if high - low < 2.0 else smooth
+    smooth = np.array([np.median(z[max(0, i - 3) : i + 4]) for i in range(len(z))])
+    return np.where(np.abs(z - smooth) > 5.0, smooth, z)
 
 
 def fov_deg(flight: Flight) -> float:

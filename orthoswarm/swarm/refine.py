@@ -17,7 +17,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow, Solution, Terrain
 from orthoswarm.swarm.adjust import Ties
-from orthoswarm.swarm.flight import Flight, open_flight
+from orthoswarm.swarm.flight import Flight, open_flight, weigh_records
 from orthoswarm.swarm.ground import GroundModel, fit_surface, ground_points
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.levels import level_network
@@ -115,6 +115,8 @@ def _relative(flight: Flight) -> GroundModel:
         flight.adjustment.step(
             c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
         )
+        if k == 3:
+            weigh_records(flight)
         if k >= 3:
             surface = fit_surface(flight.adjustment, surface)
     return surface
