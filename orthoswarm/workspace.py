@@ -57,6 +57,8 @@ class Workspace:
 
     def begin(self, key: str) -> bool:
         """Get ready for a run with a key; True if results of an interrupted one with the same key are there."""
+        for part in self.out.glob(".*.part*"):  # of a run that was killed
+            _remove(part)
         marker = self._work / "key"
         with contextlib.suppress(OSError):
             if marker.read_text() == key:

@@ -198,6 +198,13 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
     assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
 
 
+def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".orthoimage.part4711.tif").write_bytes(b"half")
+    make(flight[2] / "photos" / "a", tmp_path / "out", Options(until="realtime"))
+    assert {p.name for p in (tmp_path / "out").iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+
+
 def test_two_runs_do_not_write_to_one_folder(flight, tmp_path):
     with Workspace(tmp_path / "out"), pytest.raises(InputError, match="another run"):
         make(flight[2] / "photos", tmp_path / "out")
