@@ -195,3 +195,9 @@ def test_the_banded_solver_solves(n, width, seed):
     x = b.copy()
     solve_banded(band, width, x)
     np.testing.assert_allclose(full @ x, b, atol=1e-8)
+
+
+def test_the_ground_is_the_lowest_of_several_modes():
+    rng = np.random.default_rng(0)
+    z = np.r_[rng.normal(0, 0.15, 1000), rng.normal(1.3, 0.12, 1300), rng.uniform(3, 12, 500), rng.normal(-2, 1, 40)]
+    assert abs(lower_flank(z, np.full(len(z), 0.15))) < 0.12

@@ -12,6 +12,9 @@ Array = NDArray[np.float64]
 SPREAD_FLAT_M, SPREAD_RELIEF_M = 0.8, 1.6
 """Spread of the levels up to which the zero is the least lifted vehicle's, and from which it is the mean's."""
 
+ENOUGH = 400
+"""Points of each vehicle that are compared in a pair: a median of more is no better."""
+
 
 @dataclass(frozen=True, slots=True)
 class LevelNetwork:
@@ -79,10 +82,13 @@ def _common_difference(
     """
     if tree_a is None or tree_b is None:
         return np.empty(0)
-    low, high = np.maximum(a.min(0), b.min(0)) - radius, np.minimum(a.max(0), b.max(0)) + radius
+    low, high = np.maximum(tree_a.mins, tree_b.mins) - radius, np.minimum(tree_a.maxes, tree_b.maxes) + radius
+    if (low > high).any():
+        return np.empty(0)
     difference, beside = [np.empty(0)], [np.empty(0)]
     for points, other, tree, sign in ((a, b, tree_b, 1.0), (b, a, tree_a, -1.0)):
-        near = points[((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2])).all(1)]
+        near = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
+        near = near[:: max(1, len(near) // ENOUGH)]
         distance, index = tree.query(near[:, :2], k=k, distance_upper_bound=radius)
         ok = np.isfinite(distance).reshape(len(near), k).all(1)
         around = other[index.reshape(len(near), k)[ok]]

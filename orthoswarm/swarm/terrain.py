@@ -113,7 +113,8 @@ def lower_flank(height: Array, sigma: Array | None = None, kernel_m: float = 0.1
     """Level of the ground among heights of which most are on it and the rest above it.
 
     The half-maximum point on the lower side of the mode, moved up by the half width that a peak of the heights' own
-    noise would have: a symmetric peak returns its mode, one that is smeared upwards returns its lower edge.
+    noise would have: a symmetric peak returns its mode, one that is smeared upwards returns its lower edge. Of
+    several peaks the lowest counts that has at least 0.4 of the highest one's density: corners crowd on car roofs.
     """
     z = np.asarray(height, float)
     if len(z) == 0:
@@ -124,7 +125,9 @@ def lower_flank(height: Array, sigma: Array | None = None, kernel_m: float = 0.1
     counts = np.histogram(z - centre, edges)[0].astype(float)
     reach = np.arange(-int(5 * kernel_m / 0.05), int(5 * kernel_m / 0.05) + 1) * 0.05
     density = np.convolve(counts, np.exp(-0.5 * (reach / kernel_m) ** 2), mode="same")
-    top = int(density.argmax())
+    peak = np.r_[False, (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:]), False]
+    peak &= density >= 0.4 * density.max()
+    top = int(np.flatnonzero(peak)[0]) if peak.any() else int(density.argmax())
     below = np.flatnonzero(density[:top] < 0.5 * density[top])
     if len(below) == 0:
         return centre + float(edges[top]) + 0.025
