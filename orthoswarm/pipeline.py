@@ -18,6 +18,7 @@ from orthoswarm.basemap import Basemap, Bounds
 from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import TILE_PX, write_cog
+from orthoswarm.export.partial import disk_error, written_whole
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
@@ -141,7 +142,10 @@ class _Batch:
 
     def load(self, load: Load) -> _State:
         """Frames, grid, recorded cameras, ground pixel, basemap."""
-        ingest = load(self.progress)
+        try:
+            ingest = load(self.progress)
+        except OSError as error:  # pictures of videos are written
+            raise disk_error(error, self.out) from None
         if not ingest.frames:
             raise InputError(_nothing_to_map(ingest))
         grid = area_grid(ingest.frames)
@@ -301,8 +305,6 @@ class _Batch:
 
     def copy_coarse(self, state: _State) -> None:
         """Without a map the orthoimage is the coarse product, too."""
-        from orthoswarm.export.partial import written_whole
-
         with written_whole(self.out / COARSE) as part:
             shutil.copyfile(self.out / ORTHOIMAGE, part)
         if state.basemap is None:

@@ -16,6 +16,9 @@ from orthoswarm.frame import Frame
 
 Result = TypeVar("Result")
 
+VIDEO = "video"
+"""Sub-folder of `.work` for pictures that were taken out of videos."""
+
 
 def run_key(frames: Sequence[Frame], options: Any) -> str:
     """What a run is made of: pictures (name, size, date, fix) and options; a run with another key starts afresh."""
@@ -23,7 +26,8 @@ def run_key(frames: Sequence[Frame], options: Any) -> str:
     for frame in frames:
         with contextlib.suppress(OSError):
             stat = frame.path.stat()
-            digest.update(f"{stat.st_size} {stat.st_mtime_ns}".encode())
+            # Pictures of videos are taken out anew each time.
+            digest.update(f"{stat.st_size} {0 if '#' in frame.image else stat.st_mtime_ns}".encode())
         digest.update(repr((frame.image, frame.vehicle, frame.time_s, frame.fix, frame.fov_hint_rad)).encode())
     return digest.hexdigest()
 
@@ -64,7 +68,7 @@ class Workspace:
             if marker.read_text() == key:
                 return any(self._work.glob("*.pickle"))
         for entry in self._work.iterdir():
-            if entry.name != "lock":
+            if entry.name not in ("lock", VIDEO):
                 _remove(entry)
         with written_whole(marker) as part:
             part.write_text(key)

@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm import pipeline
     from orthoswarm.errors import InputError
     from orthoswarm.frame import Ingest
+    from orthoswarm.workspace import VIDEO
 
     _check(args)
     options = pipeline.Options(
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     )
 
     def load(progress: pipeline.Progress) -> Ingest:
-        reading = telemetry.LoadOptions(exclude=(args.out,))
+        reading = telemetry.LoadOptions(exclude=(args.out,), cache=args.out / ".work" / VIDEO)
         return telemetry.load(args.inputs, progress=progress, options=reading)
 
     if args.out.is_file():
