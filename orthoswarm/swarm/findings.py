@@ -12,6 +12,9 @@ from orthoswarm.swarm.start2d import Start2D
 _FLIP = float(np.radians(150.0))
 _HEADING_OFFSET_DEG = 5.0
 _TILT_DEG = 2.0
+_ONE_WAY = 0.9
+"""Length of the mean of headings from which on a tilt cannot be told from a slope of the ground."""
+_SLOPE_DEG = 6.0
 _OBLIQUE_DEG = 35.0
 _HEIGHT_SHARE = 0.2
 _LAG_M = 1.0
@@ -96,7 +99,8 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
         sigma = np.degrees(start.tilt_sigma[records.segment[rows]].max())
         off, seen = float(np.median(between[rows])), float(np.degrees(np.median(tilt_of(start.level[rows]))))
         who = frames[int(np.argmax(rows))].vehicle
-        if off < max(_TILT_DEG, 3.0 * sigma):
+        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY
+        if off < max(_SLOPE_DEG if one_way else _TILT_DEG, 3.0 * sigma):
             continue
         if np.isfinite(records.pitch[rows]).any():
             tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))

@@ -135,12 +135,12 @@ def focal_by_height(records: Records, heights: Heights, metres: Array, lens_of: 
 
 
 def focal_by_hint(records: Records) -> tuple[Array, Array]:
-    """Log of the focal length in pixels of each lens, and its one sigma: tags to 10 %, else 75 degrees to 35 %."""
+    """Log of the focal length in pixels of each lens, and its one sigma: tags to 6 %, else 75 degrees to 35 %."""
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
     with np.errstate(invalid="ignore"):
         good = (records.fov_hint > PLAUSIBLE_FOV_RAD[0]) & (records.fov_hint < PLAUSIBLE_FOV_RAD[1])
     view = np.where(good, records.fov_hint, DEFAULT_FOV_RAD)
-    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, 0.10, 0.35)
+    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, 0.06, 0.35)
 
 
 def weighted_median(value: Array, weight: Array) -> float:

@@ -8,6 +8,8 @@ Ints = NDArray[np.int32]
 
 GAP_S = 180.0
 JUMP_M = 5.0
+LEG_GAP_S = 60.0
+STILL_M = 1.5
 TILT_JUMP_RAD = float(np.radians(1.5))
 
 
@@ -50,3 +52,29 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
             jump[known[k]] = True
             level = k
     return jump
+
+
+def photo_legs(
+    position: NDArray[np.complex128], segment: Ints, time_s: Array, turn_rad: float = float(np.radians(35.0))
+) -> Ints:
+    """Leg of each photo, int32 (N,), numbered in order: runs of photos flown straight on; every photo has one.
+
+    Made for photos far apart: two photos are a leg, and the way from the last photo of one to the first of the next
+    belongs to neither.
+
+    Args:
+        position: complex (N,), east + i north, in order of time.
+        segment: int32 (N,); a leg lies in one segment.
+        time_s: float64 (N,), NaN where unknown; a pause of more than 60 s ends a leg.
+        turn_rad: a leg ends where a step leaves the mean of its steps by more than this.
+    """
+    leg = np.zeros(len(position), np.int32)
+    way = 0j
+    for k in range(1, len(position)):
+        step = complex(position[k] - position[k - 1])
+        still = abs(step) < STILL_M
+        turned = not still and abs(way) > 0 and abs(np.angle(step * np.conj(way))) > turn_rad
+        new = segment[k] != segment[k - 1] or time_s[k] - time_s[k - 1] > LEG_GAP_S or turned
+        leg[k] = leg[k - 1] + int(new)
+        way = 0j if new else way + (0j if still else step)
+    return leg

@@ -4,7 +4,7 @@ For photos that overlap too little, or too irregularly, to be followed from one 
 80 %, corners, crosshatches, several sorties. What tags say is evidence; the pictures decide.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +12,11 @@ import numpy as np
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm.chains import build_tracks, thin_tracks
+from orthoswarm.swarm.features import Features
 from orthoswarm.swarm.findings import findings, flipped_yaw, unplaced_reasons
 from orthoswarm.swarm.matching import PairGraphBuilder, Progress, ReadGray, build_pair_graph
 from orthoswarm.swarm.network import LAG_SPREAD_S
+from orthoswarm.swarm.pairs import Pair
 from orthoswarm.swarm.plane import Array, Flags, Ints, Records
 from orthoswarm.swarm.rig import HEIGHT, K1, WIDTH, F, Rig, Tracks
 from orthoswarm.swarm.scales import focal_by_hint
@@ -22,6 +24,7 @@ from orthoswarm.swarm.segments import split_segments
 from orthoswarm.swarm.start2d import Start2D
 
 _OUTLIER_SIGMA_M = 5.0
+_STATED_FLOOR_M = 0.03
 _PER_CELL = 2
 _RECORDED_HEIGHT_SIGMA_M = 0.3
 _FREE_HEIGHT_SIGMA_M = 1.5
@@ -39,7 +42,8 @@ class SparseStart:
         position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
             and possible. velocity: float64 (N, 2), metres per second.
         log_focal: float64 (L,) belief from tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
-        placed: bool (N,), False where no picture holds the photo. reasons: photo -> why it cannot be placed.
+        placed: bool (N,), False where no picture holds the photo. reasons: photo -> why it is not held.
+        damaged: photos that cannot be decoded.
         yaw_flipped: bool (N,), the recorded yaw is turned by 180 degrees.
         metres_per_pixel: float64 (N,). warnings: findings in plain words. plane: all that the start in 2-D found.
         records: what the photos recorded. pairs: pairs tried and matched.
@@ -57,6 +61,7 @@ class SparseStart:
     log_focal_sigma: Array
     placed: Flags
     reasons: dict[int, str]
+    damaged: frozenset[int]
     yaw_flipped: Flags
     metres_per_pixel: Array
     warnings: list[str]
@@ -121,9 +126,31 @@ def sparse_start(
     """
     builder = PairGraphBuilder(frames, records, read_gray, workers, progress)
     start = build_pair_graph(builder)
-    pairs = builder.pairs()
+    return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
+
+
+def assemble(
+    frames: Sequence[Frame],
+    records: Records,
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    start: Start2D,
+    damaged: Mapping[int, str],
+    tried: int,
+) -> SparseStart:
+    """Put together what the adjustment needs.
+
+    Args:
+        frames: N photos.
+        records: what they recorded.
+        features: of each photo.
+        pairs: E matched pairs.
+        start: found from these pairs.
+        damaged: photos that could not be read, and why.
+        tried: how many pairs were tried.
+    """
     trusted = [pair for pair, ok in zip(pairs, start.pair_ok, strict=True) if ok]
-    tracks = thin_tracks(build_tracks(builder.features, trusted), records.width, records.rows, _PER_CELL)
+    tracks = thin_tracks(build_tracks(features, trusted), records.width, records.rows, _PER_CELL)
     position, sigma, known = _position_priors(records, start)
     log_focal, log_focal_sigma = focal_by_hint(records)
     held = np.zeros(len(frames), bool)
@@ -141,13 +168,14 @@ def sparse_start(
         log_focal=log_focal,
         log_focal_sigma=log_focal_sigma,
         placed=held,
-        reasons=unplaced_reasons(frames, records, held, builder.damaged),
+        reasons=unplaced_reasons(frames, records, held, damaged),
+        damaged=frozenset(damaged),
         yaw_flipped=flipped_yaw(records, start),
         metres_per_pixel=start.metres,
         warnings=findings(frames, records, start),
         plane=start,
         records=records,
-        pairs=(len(builder.tried), len(pairs)),
+        pairs=(tried, len(pairs)),
     )
 
 
@@ -163,14 +191,14 @@ def _rig(records: Records, start: Start2D) -> Rig:
 def _position_priors(records: Records, start: Start2D) -> tuple[Array, Array, Flags]:
     """Recorded positions with their sigmas (N, 3) east, north, up, and where heights are recorded and possible.
 
-    A position that states its own sigma (RTK) was taken at the exposure; others may lag by an unknown time.
+    A position that states its own sigma (RTK) lags by the same time on all photos; others by a time that varies.
     """
     position = np.stack([records.position.real, records.position.imag, start.height], axis=1)
     known = np.isfinite(records.height_m) & np.isfinite(start.recorded_focal)[records.lens]
     position[known, 2] = records.height_m[known]
     velocity = records.velocity()
     stated = np.isfinite(records.position_sigma)
-    across = np.where(stated, records.gps_sigma(), 1.0)
+    across = np.where(stated, np.hypot(records.position_sigma, _STATED_FLOOR_M), 1.0)
     along = np.where(stated, 0.0, LAG_SPREAD_S)
     up = np.where(known, np.where(stated, np.maximum(across, 0.05), _RECORDED_HEIGHT_SIGMA_M), _FREE_HEIGHT_SIGMA_M)
     sigma = np.stack([np.hypot(across, along * velocity.real), np.hypot(across, along * velocity.imag), up], axis=1)
@@ -192,6 +220,3 @@ def _column(frames: Sequence[Frame], name: str) -> Array:
 
 def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else float("nan")
-
-
-__all__ = ["SparseStart", "read_records", "sparse_start"]
