@@ -7,6 +7,7 @@ has one clear peak. Pure functions on arrays; files are read by the caller.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,8 @@ def gradient_field(gray: Floats, valid: Mask) -> tuple[NDArray[np.complex64], Fl
     """Gradients east + i south, zero where invalid, and their squared length before normalisation.
 
     Args:
-        gray: float32 (rows, columns). valid: bool of the same shape.
+        gray: float32 (rows, columns).
+        valid: bool of the same shape.
 
     Returns:
         complex64 of the same shape, normalised by |g| + the median |g| of valid pixels; float32 |g|^2.
@@ -100,9 +102,7 @@ def gradient_field(gray: Floats, valid: Mask) -> tuple[NDArray[np.complex64], Fl
     )
 
 
-def _correlate(
-    template: NDArray[np.complex64], mask: Mask, window: NDArray[np.complex64], cover: Mask
-) -> tuple[Array, Array]:
+def _correlate(template: NDArray[Any], mask: Mask, window: NDArray[Any], cover: Mask) -> tuple[Array, Array]:
     """Normalised correlation of a block at all places in a larger window, and the energy share compared there."""
     from scipy import fft
 
@@ -160,8 +160,10 @@ def displacement_field(
 
     Args:
         ortho: float32 (rows, columns), grey; either as large as the reference or larger by the search radius in
-            pixels on every side. ortho_valid: where it shows ground.
-        reference: float32 (rows, columns), grey. reference_valid: where it may be compared.
+            pixels on every side.
+        ortho_valid: where it shows ground.
+        reference: float32 (rows, columns), grey.
+        reference_valid: where it may be compared.
         settings: how to measure.
         offset: row and column of the reference's first pixel on a larger grid.
 
@@ -232,7 +234,8 @@ class Accuracy:
     """The figures of an orthoimage against a reference; lengths in metres.
 
     Attributes:
-        median_m: median displacement of the matched blocks; p90_m, p95_m: 90 and 95 % of them are below; max_m: largest.
+        median_m: median displacement of the matched blocks.
+        p90_m: 90 % of them are below; p95_m: 95 %; max_m: the largest.
         mean_east_m: mean shift east; mean_north_m: north.
         unmatched_share: share of the covered blocks that found no place.
         share_within_1m: share of all covered blocks, unmatched ones included, that lie within a metre.

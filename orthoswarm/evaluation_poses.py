@@ -117,7 +117,8 @@ def pose_errors(
     """Compare placed frames with their true cameras, in the same grid and order.
 
     Args:
-        placed: frames as placed. truth: the true camera of each.
+        placed: frames as placed.
+        truth: the true camera of each.
         ground_z_m: height of the plane of the homographies, in the product's heights.
         true_ground_z_m: the mean ground level in the truth's heights.
     """

@@ -4,11 +4,11 @@ import argparse
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from orthoswarm.camera import Camera
-    from orthoswarm.evaluation import Accuracy, FieldSettings
+    from orthoswarm.evaluation import Accuracy, FieldSettings, Floats, Mask
     from orthoswarm.evaluation_poses import PoseErrors
 
 
@@ -21,7 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("ortho", type=Path, metavar="ORTHO.tif", help="the orthoimage (alpha or nodata says where it has ground)")
     add("--reference", type=Path, required=True, metavar="REF.tif", help="what it is measured against")
-    add("--mask", type=Path, metavar="MASK.tif", help="compare only where this raster is not 0")
+    add(
+        "--mask",
+        metavar="MASK.tif",
+        help="compare only where this is not 0 (default: ground_mask.tif beside the reference; none: no mask)",
+    )
     add("--poses", type=Path, metavar="FRAMES.jsonl", help="placed frames of the same product")
     add("--truth", type=Path, metavar="FRAMES.csv", help="the true cameras")
     add("--gsd", type=float, metavar="M", help="pixel at which both are compared (default 0.3, or what they have)")
@@ -37,8 +41,10 @@ def run(args: argparse.Namespace) -> int:
 
     if (args.poses is None) != (args.truth is None):
         raise InputError("--poses and --truth belong together; give both or none")
-    result = evaluate_ortho(args.ortho, args.reference, args.mask, FieldSettings(search_m=args.search), args.gsd)
+    mask = find_mask(args.reference, args.mask)
+    result = evaluate_ortho(args.ortho, args.reference, mask, FieldSettings(search_m=args.search), args.gsd)
     figures: dict[str, Any] = dict(result.figures())
+    figures["mask"] = None if mask is None else mask.name
     if args.poses is not None:
         figures["poses"] = evaluate_poses(args.poses, args.truth).figures()
     if args.field is not None:
@@ -48,6 +54,17 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(figures)
     return 0
+
+
+def find_mask(reference: Path, given: str | None) -> Path | None:
+    """The mask to use: the one given; without one, a twin's mask of level ground beside its reference.
+
+    Roofs and crowns lean in every orthoimage that is rectified on the ground, so they say nothing about its position.
+    """
+    if given is not None:
+        return None if given == "none" else Path(given)
+    beside = reference.with_name("ground_mask.tif")
+    return beside if beside.exists() else None
 
 
 def evaluate_ortho(
@@ -60,7 +77,8 @@ def evaluate_ortho(
     """Measure an orthoimage file against a reference file; memory stays small whatever their size.
 
     Args:
-        ortho: RGB(A) or grey GeoTIFF. reference: the same, any CRS.
+        ortho: RGB(A) or grey GeoTIFF.
+        reference: the same, any CRS.
         mask: raster that is not 0 where blocks may be compared.
         settings: how to measure; its gsd_m is replaced.
         gsd_m: pixel of the comparison, None for 0.3 m or the coarser of both if that is more.
@@ -73,26 +91,37 @@ def evaluate_ortho(
     import numpy as np
 
     from orthoswarm.errors import InputError
-    from orthoswarm.evaluation import Completeness, Displacements, FieldSettings, accuracy, displacement_field
+    from orthoswarm.evaluation import Displacements, FieldSettings, accuracy, completeness, displacement_field
 
-    chosen = settings or FieldSettings()
+    parts, own_ortho, own_ground = [], [], []
     with _Pair(ortho, reference, mask, gsd_m) as pair:
-        s = dataclasses.replace(chosen, gsd_m=pair.gsd_m)
-        parts, covers = [], []
-        for offset, arrays, core in pair.strips(s):
-            parts.append(displacement_field(*arrays, s, offset))
-            covers.append(core)
-        step = max(1, round(s.step_m / s.gsd_m))
-        field = Displacements.joined(parts)
-        if not covers or not any(o.any() for o, _ in covers):
-            raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
+        s = dataclasses.replace(settings or FieldSettings(), gsd_m=pair.gsd_m)
         thin = max(1, round(1.2 / s.gsd_m))
-        ortho_valid = np.concatenate([o for o, _ in covers])[::thin, ::thin]
-        ground = np.concatenate([g for _, g in covers])[::thin, ::thin]
-        from orthoswarm.evaluation import completeness
+        for strip in pair.strips(s):
+            args = (strip.ortho, strip.ortho_valid, strip.reference, strip.comparable)
+            parts.append(displacement_field(*args, settings=s, offset=(strip.first_row, 0)))
+            own_ortho.append(strip.own_ortho[::thin, ::thin])
+            own_ground.append(strip.own_ground[::thin, ::thin])
+    covered, ground = np.concatenate(own_ortho), np.concatenate(own_ground)
+    if not (covered & ground).any():
+        raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
+    step = max(1, round(s.step_m / s.gsd_m))
+    return accuracy(Displacements.joined(parts), completeness(covered, ground, s.gsd_m * thin), float(step))
 
-        cover: Completeness = completeness(ortho_valid, ground, s.gsd_m * thin)
-        return accuracy(field, cover, float(step))
+
+class _Strip(NamedTuple):
+    """Some rows of blocks: pictures with validity, and the validity of the rows that belong to this strip alone.
+
+    The orthoimage is larger than the reference by the search radius on every side.
+    """
+
+    first_row: int
+    ortho: "Floats"
+    ortho_valid: "Mask"
+    reference: "Floats"
+    comparable: "Mask"
+    own_ortho: "Mask"
+    own_ground: "Mask"
 
 
 class _Pair:
@@ -128,7 +157,7 @@ class _Pair:
         right, top = min(b[2] for b in boxes), min(b[3] for b in boxes)
         if right - left < 2 or top - low < 2:
             raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
-        west, north = np_floor(left, self.gsd_m), -np_floor(-top, self.gsd_m)
+        west, north = _floor(left, self.gsd_m), -_floor(-top, self.gsd_m)
         self.shape = (int((north - low) / self.gsd_m), int((right - west) / self.gsd_m))
         self._files = files
         self._views = []
@@ -145,10 +174,9 @@ class _Pair:
                     width=self.shape[1],
                     resampling=mode,
                     add_alpha=file.nodata is None and file.count in (1, 3),
-                )  # fmt: skip
+                )
             )
         self._masked = mask is not None
-        self._ground: Any = None
 
     def __enter__(self) -> "_Pair":
         return self
@@ -157,8 +185,8 @@ class _Pair:
         for file in [*self._views, *self._files]:
             file.close()
 
-    def strips(self, s: "FieldSettings") -> Iterator[tuple[tuple[int, int], Any, tuple[Any, Any]]]:
-        """Strips of eight rows of blocks: offset, (ortho, valid, reference, valid), validity of rows that are its own."""
+    def strips(self, s: "FieldSettings") -> Iterator[_Strip]:
+        """Strips of eight rows of blocks, from north to south."""
         reach = max(1, round(s.search_m / s.gsd_m))
         side, step = round(s.block_m / s.gsd_m), max(1, round(s.step_m / s.gsd_m))
         rows = 8 * step
@@ -166,12 +194,12 @@ class _Pair:
             stop = min(self.shape[0], start + rows - step + side)
             ortho, ortho_valid = self._read(0, start, stop, reach)
             reference, ground = self._read(1, start, stop)
-            mask = self._mask(start, stop) if self._masked else True
+            comparable = ground & self._mask(start, stop) if self._masked else ground
             own = min(rows, stop - start)
             inner = ortho_valid[reach : reach + own, reach : reach + self.shape[1]]
-            yield (start, 0), (ortho, ortho_valid, reference, ground & mask), (inner, ground[:own])
+            yield _Strip(start, ortho, ortho_valid, reference, comparable, inner, ground[:own])
 
-    def _read(self, which: int, start: int, stop: int, spare: int = 0) -> tuple[Any, Any]:
+    def _read(self, which: int, start: int, stop: int, spare: int = 0) -> "tuple[Floats, Mask]":
         """Grey values and validity of some rows, with `spare` more pixels on every side, invalid beyond the grid."""
         import numpy as np
         from rasterio.windows import Window
@@ -185,13 +213,14 @@ class _Pair:
         gray = data[0] if len(bands) == 1 else 0.299 * data[0] + 0.587 * data[1] + 0.114 * data[2]
         return np.pad(gray, pad), np.pad(view.dataset_mask(window=window) > 0, pad)
 
-    def _mask(self, start: int, stop: int) -> Any:
+    def _mask(self, start: int, stop: int) -> "Mask":
         from rasterio.windows import Window
 
-        return self._views[2].read(1, window=Window(0, start, self.shape[1], stop - start)) > 0
+        mask: Mask = self._views[2].read(1, window=Window(0, start, self.shape[1], stop - start)) > 0
+        return mask
 
 
-def np_floor(value: float, step: float) -> float:
+def _floor(value: float, step: float) -> float:
     """Round down to a multiple of a step."""
     import math
 
@@ -233,8 +262,8 @@ def read_truth(path: Path) -> "dict[str, tuple[str, int, Camera]]":
 
 def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
     """Columns and rows of a picture: from the table, else from the picture beside it, else 640x480."""
-    if row.get("width") and row.get("height"):
-        return int(row["width"]), int(row["height"])
+    if row.get("width_px") and row.get("height_px"):
+        return int(row["width_px"]), int(row["height_px"])
     picture = truth.parent.parent / "photos" / row["image"]
     if picture.exists():
         from PIL import Image

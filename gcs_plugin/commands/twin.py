@@ -29,7 +29,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--dtm", type=Path, metavar="DTM.tif", help="its bare ground, in the same form")
     add("--every", type=int, default=1, metavar="N", help="render every N-th photo only")
     add("--workers", type=int, default=1, metavar="N", help="threads that render (default 1)")
-    add("--lean", type=float, metavar="S", help="lean of the map, metres per metre of height (default drawn, 0.2 to 0.35)")
+    add(
+        "--lean",
+        type=float,
+        metavar="S",
+        help="lean of the map, metres per metre of height (default drawn, 0.2 to 0.35)",
+    )
     add("--lean-deg", type=float, metavar="DEG", help="azimuth of the lean (default drawn)")
     add("--heading-deg", type=float, metavar="DEG", help="azimuth of the legs (default drawn)")
     add("--lat", type=float, metavar="DEG", help="where the city lies")
@@ -121,8 +126,8 @@ def _spec(args: argparse.Namespace) -> Any:
     import math
 
     from orthoswarm.errors import InputError
-    from orthoswarm.twin.make import with_heading
     from orthoswarm.twin.presets import spec
+    from orthoswarm.twin.site import with_heading
 
     given = {
         "disaster": args.disaster, "lens_k": _pair(args.lens, "--lens"), "relief_m": args.relief, "every": args.every,
@@ -135,9 +140,9 @@ def _spec(args: argparse.Namespace) -> Any:
         given["ground"] = (str(args.ground), str(args.surface), str(args.dtm or ""))
     base = spec(args.preset, seed=args.seed, noise=args.noise, **_known(given))
     plan = replace(base.plan, **_known({
-        "columns": args.columns, "rows": args.rows, "photos": args.photos, "legs": args.legs, "spacing_m": args.spacing_m,
-        "leg_spacing_m": args.leg_spacing_m, "height_m": args.height_m, "speed_m_s": args.speed_m_s,
-        "width": args.width, "height": args.height,
+        "columns": args.columns, "rows": args.rows, "photos": args.photos, "legs": args.legs,
+        "spacing_m": args.spacing_m, "leg_spacing_m": args.leg_spacing_m, "height_m": args.height_m,
+        "speed_m_s": args.speed_m_s, "width": args.width, "height": args.height,
     }))  # fmt: skip
     if plan.leg_length_m <= 0:
         raise InputError("the photos do not suffice for so many legs; give more --photos or fewer --legs")

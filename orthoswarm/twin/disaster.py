@@ -9,7 +9,7 @@ from orthoswarm.kernels import kernel
 from orthoswarm.twin import scene as kinds
 from orthoswarm.twin.grain import hash01, lattice, noise_field
 from orthoswarm.twin.render import HAZE_CELL_M
-from orthoswarm.twin.scene import CELL_M, TEXEL_M, Scene
+from orthoswarm.twin.scene import TEXEL_M, Scene
 
 Floats = NDArray[np.float32]
 

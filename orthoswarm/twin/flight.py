@@ -201,7 +201,7 @@ def fly(
     # the mount holds the camera level but for a share of the airframe's motion
     angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
-    time = start_s + 7.0 * vehicle + seconds * np.arange(n)
+    time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
     return Flight(name, lens, (float(mount[0]), float(mount[1])), time, planned, position, velocity, angles, body)
 

@@ -82,7 +82,7 @@ def light_map(scene: Scene, sun: Sun) -> Pixels:
 
 @kernel
 def _lit(albedo, light, gain, out):  # type: ignore[no-untyped-def]
-    """albedo * light / 128 * gain; light lies on cells of two texels, bilinear between their centres."""
+    """Colour = albedo * light / 128 * gain; light lies on cells of two texels, bilinear between their centres."""
     rows, cols = albedo.shape[:2]
     high, wide = light.shape
     for r in range(rows):

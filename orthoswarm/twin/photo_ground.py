@@ -1,6 +1,5 @@
 """A real place as the twin's ground: an orthoimage, a surface model and (if there is one) its bare ground."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,7 +102,7 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
 
 def _solid_part(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
     """Rows and columns (top, left, bottom, right) of a part whose rim has no black wedges."""
-    valid = image[::4, ::4].any(axis=2)
+    valid: NDArray[np.bool_] = np.asarray(image[::4, ::4].any(axis=2))
     top, left, bottom, right = 0, 0, *valid.shape
     while bottom - top > 8 and right - left > 8:
         rim = [
@@ -126,7 +125,7 @@ def _sample(data: Any, place: Any, scene: Scene, step: float, border: tuple[int,
     import cv2
 
     g = scene.grid
-    cols, rows = (int(round(n * TEXEL_M / step)) for n in (g.width, g.height))
+    cols, rows = (round(n * TEXEL_M / step) for n in (g.width, g.height))
     east = g.west + (np.arange(cols) + 0.5) * step
     north = g.north - (np.arange(rows) + 0.5) * step
     width, height = border[1] * frame.a, border[0] * -frame.e

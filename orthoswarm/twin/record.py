@@ -18,7 +18,7 @@ class Noise:
         position_m: half range of the uniform error of each picture's horizontal position (paper IV.A: 1 m).
         drift_per_photo_m: half range of the drift per picture; the drift is index times one draw per vehicle
             and axis (paper IV.A: 0.1 m).
-        heading_bias_deg: one sigma of a vehicle's fixed compass error. tilt_bias_deg: of its fixed pitch and roll error.
+        heading_bias_deg: one sigma of a vehicle's fixed compass error. tilt_bias_deg: of its pitch and roll error.
         angle_deg: one sigma of the angles from picture to picture.
         outlier_share: share of positions that are 5 to 20 m off.
         lag_s: (least, most) seconds by which positions are late, one draw per vehicle.

@@ -278,7 +278,7 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
     _shoot(
         rays, camera.rotation, float(x), float(y), float(camera.position[2]), *stage.levels, s.dsm, stage.tiles, s.kind,
         s.wall, s.facade, np.asarray(stage.sun), stage.ambient, stage.haze, stage.noise, motion,
-        float(np.cos(-s.angle_rad)), float(np.sin(-s.angle_rad)), min(float(stage.tiles.max()), float(camera.position[2])),
+        *s.wall_axis, min(float(stage.tiles.max()), float(camera.position[2])),
         0.5 / camera.lens.focal_px, out,
     )  # fmt: skip
     return out
@@ -334,6 +334,6 @@ def satellite_view(stage: Stage, lean: tuple[float, float], gsd_m: float) -> tup
     out = np.empty((grid.height, grid.width, 3), np.float32)
     _satellite(
         stage.levels[0], s.dsm, s.dtm, stage.tiles, s.wall, s.facade, np.asarray(stage.sun), stage.ambient,
-        float(np.cos(-s.angle_rad)), float(np.sin(-s.angle_rad)), lean[0], -lean[1], float(stage.tiles.max()), gsd_m, out,
+        *s.wall_axis, lean[0], -lean[1], float(stage.tiles.max()), gsd_m, out,
     )  # fmt: skip
     return out, grid

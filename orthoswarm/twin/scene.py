@@ -59,6 +59,11 @@ class Scene:
         )
 
     @property
+    def wall_axis(self) -> tuple[float, float]:
+        """Unit vector (columns, rows) along one of the two directions of the walls."""
+        return float(np.cos(self.angle_rad)), float(-np.sin(self.angle_rad))
+
+    @property
     def cells(self) -> GroundGrid:
         """The grid of the height fields."""
         g = self.grid

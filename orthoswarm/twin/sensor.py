@@ -23,7 +23,7 @@ class Sensor:
         self._vignette = (1.0 - 0.13 * (x[None, :] ** 2 + y[:, None] ** 2))[..., None]
 
     def expose(self, light: Floats, rng: np.random.Generator) -> Pixels:
-        """8-bit colours of a picture: slight blur, darker corners, exposure within 4 %, noise of about 2 grey values."""
+        """8-bit colours of a picture: slight blur, darker corners, exposure within 4 %, noise of 2 grey values."""
         import cv2
 
         image = cv2.GaussianBlur(light, (0, 0), 0.42)

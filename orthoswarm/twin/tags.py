@@ -101,7 +101,7 @@ def _exif(tags: PhotoTags) -> bytes:
     gps[1], gps[2] = ("N" if tags.lat_deg >= 0 else "S"), _sexagesimal(tags.lat_deg)
     gps[3], gps[4] = ("E" if tags.lon_deg >= 0 else "W"), _sexagesimal(tags.lon_deg)
     gps[5], gps[6] = (b"\x00" if tags.altitude_m >= 0 else b"\x01"), _rational(abs(tags.altitude_m), 1000)
-    return exif.tobytes()
+    return bytes(exif.tobytes())
 
 
 def _rational(value: float, denominator: int) -> tuple[int, int] | Fraction:

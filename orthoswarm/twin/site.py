@@ -1,0 +1,107 @@
+"""Where a set lies and under what sky: place, flight direction, disaster zone, suns, the map's lean."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthoswarm.errors import InputError
+from orthoswarm.geo import LocalGrid, utm_epsg
+from orthoswarm.twin.builder import Slot
+from orthoswarm.twin.city import build_city
+from orthoswarm.twin.disaster import SIZES_M, Zone
+from orthoswarm.twin.light import Sun
+from orthoswarm.twin.presets import TwinSpec
+from orthoswarm.twin.scene import Scene, scene_grid
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where the set lies."""
+
+    grid: LocalGrid
+    center: tuple[float, float]
+    heading_rad: float
+
+    @classmethod
+    def of(cls, spec: TwinSpec) -> "Site":
+        """The site of a set."""
+        if spec.ground is not None:
+            from orthoswarm.twin.photo_ground import ground_place
+
+            epsg, center, _ = ground_place(spec.ground)
+            return cls(LocalGrid(epsg), center, spec.plan.heading_rad)
+        grid = LocalGrid(utm_epsg(spec.lat_deg, spec.lon_deg))
+        east, north = np.round(grid.to_grid(spec.lat_deg, spec.lon_deg))
+        return cls(grid, (float(east), float(north)), spec.plan.heading_rad)
+
+    def build(self, spec: TwinSpec) -> tuple[Scene, list[Slot]]:
+        """The ground before anything happens to it, without cars, and the places for cars."""
+        across, along = (0.5 * x + spec.margin_m for x in spec.plan.extent_m)
+        c, s = abs(np.cos(spec.plan.heading_rad)), abs(np.sin(spec.plan.heading_rad))
+        half = (float(across * c + along * s), float(across * s + along * c))
+        if spec.ground is not None:
+            from orthoswarm.twin.photo_ground import load_ground
+
+            return load_ground(spec.ground, self.center, half), []
+        return build_city(scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m)
+
+
+def disaster_zone(spec: TwinSpec, site: Site) -> Zone | None:
+    """Where the disaster strikes: near the middle of the area, its long side along the area's."""
+    if spec.disaster == "none":
+        return None
+    if spec.disaster not in SIZES_M:
+        raise InputError(f"there is no disaster '{spec.disaster}'; choose none, {', '.join(SIZES_M)}")
+    rng = np.random.default_rng([spec.seed, 53])
+    across, along = SIZES_M[spec.disaster]
+    extent = np.array(spec.plan.extent_m)
+    # the long side of the zone lies along the long side of the area; small areas get a smaller zone
+    shrink = min(1.0, 0.8 * extent.max() / max(across, along), 0.8 * extent.min() / min(across, along))
+    lengthwise = spec.plan.heading_rad + (np.pi / 2 if extent[0] >= extent[1] else 0.0)
+    if across > along:
+        lengthwise += np.pi / 2
+    offset = rng.uniform(-0.12, 0.12, 2) * extent
+    east, north = spec.plan.to_grid(offset, site.center)
+    angle = np.pi / 2 - lengthwise + rng.uniform(-0.25, 0.25)
+    return Zone(float(east), float(north), across * shrink, along * shrink, float(angle))
+
+
+def suns(seed: int) -> tuple[Sun, Sun]:
+    """The light of the map and of the photos: two different hours."""
+    rng = np.random.default_rng([seed, 61])
+    first = rng.uniform(0.6, 1.0)
+    azimuth = rng.uniform(1.6, 4.6)
+    turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.6)
+    return (
+        Sun(float(azimuth), float(first), 0.45),
+        Sun(float(azimuth + turn), float(rng.uniform(0.6, 1.05)), 0.45),
+    )
+
+
+def light_of(spec: TwinSpec, which: int) -> Sun:
+    """The light of the map (0) or of the photos (1); a real orthoimage has shadows already, so they are weaker."""
+    sun = suns(spec.seed)[which]
+    return sun if spec.ground is None else replace(sun, ambient=0.72)
+
+
+def map_lean(spec: TwinSpec) -> tuple[float, float]:
+    """The basemap's lean (east, north), metres of shift per metre of height."""
+    rng = np.random.default_rng([spec.seed, 67])
+    size, azimuth = rng.uniform(0.2, 0.35), rng.uniform(0.0, 360.0)
+    size = spec.lean if spec.lean is not None else size
+    azimuth = np.radians(spec.lean_deg if spec.lean_deg is not None else azimuth)
+    return float(size * np.sin(azimuth)), float(size * np.cos(azimuth))
+
+
+def with_heading(spec: TwinSpec) -> TwinSpec:
+    """A spec whose flight direction is drawn from its seed (the presets fly north)."""
+    rng = np.random.default_rng([spec.seed, 97])
+    quarter = float(rng.choice([0.0, np.pi / 2]))
+    if spec.ground is not None:  # the long side of the area along the long side of the place
+        from orthoswarm.twin.photo_ground import ground_place
+
+        size = ground_place(spec.ground)[2]
+        across, along = spec.plan.extent_m
+        quarter = 0.0 if (across >= along) == (size[0] >= size[1]) else np.pi / 2
+    heading = quarter + np.radians(rng.uniform(-12.0, 12.0))
+    return replace(spec, plan=replace(spec.plan, heading_rad=float(heading)))
