@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.camera import Camera, Lens
+from orthoswarm.mosaic.lenses import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def rejections(cameras: Sequence[Camera], ground_z_m: ArrayLike, gsd_m: float) -
     heights = np.broadcast_to(position[:, 2] - np.asarray(ground_z_m, float), len(cameras))
     steepest = np.full(len(cameras), -np.inf)
     for lens, index in _by_lens(cameras).items():
-        steepest[index] = -_rays(lens, rotation[index])[..., 2].min(1)
+        steepest[index] = -(rotation[index, 2] @ _corners(lens).T).min(1)
     reasons = {}
     for i, numbers in enumerate(zip(heights.tolist(), focal.tolist(), steepest.tolist())):
         reason = _reason(*numbers, gsd_m)
@@ -59,9 +60,7 @@ def rejections(cameras: Sequence[Camera], ground_z_m: ArrayLike, gsd_m: float) -
 
 def rejection(camera: Camera, ground_z_m: float, gsd_m: float) -> str | None:
     """Why one frame cannot be drawn on a map, one clause; None if it can. See `rejections`."""
-    border = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, 0.0)
-    down = camera.rotation[2]
-    steepest = -float((border @ down[:2]).min() + down[2])
+    steepest = -float((_corners(camera.lens) @ camera.rotation[2]).min())
     return _reason(float(camera.position[2]) - ground_z_m, camera.lens.focal_px, steepest, gsd_m)
 
 
@@ -84,10 +83,10 @@ def _by_lens(cameras: Sequence[Camera]) -> dict[Lens, list[int]]:
     return groups
 
 
-def _rays(lens: Lens, rotation: Array) -> Array:
-    """Ground directions (N, K, 3), camera depth 1, of the border of a lens's picture under rotations (N, 3, 3)."""
-    xy = _border(lens, 1 if lens.is_pinhole else 8, 0.0)
-    return np.asarray(np.concatenate([xy, np.ones((len(xy), 1))], 1) @ rotation.transpose(0, 2, 1))
+def _corners(lens: Lens) -> Array:
+    """Rays (4, 3), camera depth 1, of the corners of the box that holds all the undistorted picture, clockwise."""
+    x0, x1, y0, y1 = lens_row(lens, 0.0)[OUTER:INNER]
+    return np.array([[x0, y0, 1.0], [x1, y0, 1.0], [x1, y1, 1.0], [x0, y1, 1.0]])
 
 
 @lru_cache(maxsize=256)
@@ -149,23 +148,22 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
 
     West > east where a camera sees nothing.
     """
-    boxes = np.full((len(cameras), 4), np.nan)
+    boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(cameras), 1))
     for lens, index in _by_lens(cameras).items():
         position = np.stack([cameras[i].position for i in index]).astype(float)
-        down = _rays(lens, np.stack([cameras[i].rotation for i in index]))
-        border = down.shape[1]
-        level = (-down[..., 2] >= LEAST_DESCENT).all(1)
+        rays = _corners(lens) @ np.stack([cameras[i].rotation for i in index]).transpose(0, 2, 1)
+        level = (-rays[..., 2] >= LEAST_DESCENT).all(1)
+        descent = np.maximum(-rays[..., 2:], LEAST_DESCENT)
         for z in (z_low, z_high):
-            drop = (position[:, 2] - z)[:, None, None] / np.maximum(-down[..., 2:], LEAST_DESCENT)
-            ground = position[:, None, :2] + down[..., :2] * drop
-            for j in np.nonzero(~level)[0]:
-                oblique = footprint(cameras[index[j]], z)
-                ground[j] = oblique[np.arange(border) % len(oblique)] if len(oblique) else np.nan
-                if len(oblique) > border:  # clipping adds a corner
-                    ground[j, :2] = oblique.min(0), oblique.max(0)
-            low, high = ground.min(1), ground.max(1)
-            if not lens.is_pinhole:  # the border bows out between the points
-                low, high = low - 0.01 * (high - low), high + 0.01 * (high - low)
-            old = boxes[index]
-            boxes[index] = np.concatenate([np.fmin(old[:, :2], low), np.fmax(old[:, 2:], high)], 1)
-    return np.where(np.isnan(boxes), np.array([np.inf, np.inf, -np.inf, -np.inf]), boxes)
+            height = position[:, 2] - z
+            ground = position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
+            low, high, seen = ground.min(1), ground.max(1), level & (height > 0)
+            for j in np.nonzero(~level & (height > 0))[0]:
+                clipped = _clip(rays[j], LEAST_DESCENT)
+                if len(clipped) >= 3:
+                    cut = position[j, :2] + clipped[:, :2] * (height[j] / -clipped[:, 2:])
+                    low[j], high[j], seen[j] = cut.min(0), cut.max(0), True
+            some = np.array(index)[seen]
+            boxes[some, :2] = np.minimum(boxes[some, :2], low[seen])
+            boxes[some, 2:] = np.maximum(boxes[some, 2:], high[seen])
+    return boxes

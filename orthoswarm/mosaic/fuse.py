@@ -174,7 +174,8 @@ def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, len
         radius: greatest distance drawn, pixels.
         matrix: float64 (3, 3), from (column, row) about the nadir point, 1, to homogeneous undistorted normalised
             picture coordinates.
-        lens: float64 (6,), k1, k2, k3, focal length in pixels, principal column and row.
+        lens: float64 (10,), k1, k2, k3, focal length in pixels, principal column and row, least and greatest column
+            used, least and greatest row used (they may lie half a pixel beyond the outermost centres).
         gsd_m: ground pixel.
         reals: float32 (3, C), scratch.
         integers: uint32 (2, C), scratch.
@@ -185,7 +186,9 @@ def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, len
     distorted = lens[0] != 0.0 or lens[1] != 0.0 or lens[2] != 0.0
     # in 1/256 pixels, rounded
     focal, pu, pv = np.float32(256.0 * lens[3]), np.float32(256.0 * lens[4] + 0.5), np.float32(256.0 * lens[5] + 0.5)
-    u_end, v_end = np.float32(256 * (width - 1)), np.float32(256 * (height - 1))
+    u_low, u_high = np.float32(256.0 * lens[6] + 0.5), np.float32(256.0 * lens[7] + 0.5)
+    v_low, v_high = np.float32(256.0 * lens[8] + 0.5), np.float32(256.0 * lens[9] + 0.5)
+    u_last, v_last = np.float32(256 * (width - 1) - 1), np.float32(256 * (height - 1) - 1)
     area, least = np.float32(gsd_m * gsd_m), np.float32(1e-6)
     zero, one, stride = np.float32(0.0), np.float32(1.0), np.uint32(width)
     mx, my, mw = np.float32(matrix[0, 0]), np.float32(matrix[1, 0]), np.float32(matrix[2, 0])
@@ -229,9 +232,9 @@ def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, len
         hits = wins - wins
         for i in range(count):
             fu, fv = us[i] * focal + pu, vs[i] * focal + pv
-            inside = (fu >= zero) & (fv >= zero) & (fu < u_end) & (fv < v_end) & (new[i] > row_score[i])
+            inside = (fu >= u_low) & (fv >= v_low) & (fu <= u_high) & (fv <= v_high) & (new[i] > row_score[i])
             new[i] = new[i] if inside else zero
-            ui, vi = np.uint32(fu if inside else zero), np.uint32(fv if inside else zero)
+            ui, vi = np.uint32(min(max(fu, zero), u_last)), np.uint32(min(max(fv, zero), v_last))
             at[i] = (vi >> _8) * stride + (ui >> _8)
             weight[i] = (ui & _FRACTION) | ((vi & _FRACTION) << _8)
             hits += np.int32(inside)

@@ -10,19 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.kernels import kernel
-from orthoswarm.mosaic.lattice import (
-    INNER,
-    OUTER,
-    STEP,
-    TAN2_LIMIT,
-    U_HIGH,
-    U_LOW,
-    V_HIGH,
-    V_LOW,
-    Shots,
-    height_at,
-    project,
-)
+from orthoswarm.mosaic.lattice import STEP, TAN2_LIMIT, Shots, height_at, project
+from orthoswarm.mosaic.lenses import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
 
 Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]

@@ -18,7 +18,7 @@ from orthoswarm.errors import InputError
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
 from orthoswarm.mosaic.fuse import aim, fuse, touches
-from orthoswarm.mosaic.lattice import INNER, OUTER, lens_row
+from orthoswarm.mosaic.lenses import INNER, OUTER, lens_row
 from orthoswarm.mosaic.passes import Read
 from orthoswarm.mosaic.reduce import pack, reduction
 from orthoswarm.mosaic.render import Progress, RenderStats, Run, render, serial
@@ -153,8 +153,8 @@ def ground_to_camera(camera: Camera, ground_z_m: float, gsd_m: float) -> Array:
 
 def _reduced_lens(camera: Camera, factor: int) -> Array:
     lens = camera.lens
-    u, v = ((c + 0.5) / factor - 0.5 for c in lens.principal_point)
-    return np.array([lens.k1, lens.k2, lens.k3, lens.focal_px / factor, u, v])
+    edges = (*lens.principal_point, 0.0, lens.width - 1.0, 0.0, lens.height - 1.0)
+    return np.array([lens.k1, lens.k2, lens.k3, lens.focal_px / factor, *((e + 0.5) / factor - 0.5 for e in edges)])
 
 
 def mosaic(

@@ -50,8 +50,8 @@ class RenderStats:
 
     Attributes:
         pixels: int64 (N,), map pixels taken from each frame.
-        seen_m2: ground that any frame sees (that was not rejected), measured on cells of up to 64 pixels. drawn_m2: ground
-            that was drawn. Both within what was rendered.
+        seen_m2: ground that any frame sees (that was not rejected), measured on cells of up to 64 pixels.
+        drawn_m2: ground that was drawn; both within what was rendered.
         rejected: image -> why it was left out although it was placed (absurd pose, damaged picture).
         thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
     """

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.kernels import kernel
-from orthoswarm.mosaic.lattice import K1, K2, K3, F, U, V, height_at
+from orthoswarm.mosaic.lattice import height_at
+from orthoswarm.mosaic.lenses import K1, K2, K3, F, U, V
 
 UNIT = 128
 """Sum of the weights, and number of steps of a fraction of a pixel."""
