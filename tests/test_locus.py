@@ -200,7 +200,7 @@ def test_too_few_heights_give_no_lift(hilly):
 
 def test_positions_are_drawn_alike_every_time():
     xy = np.c_[np.arange(50.0), np.arange(50.0)]
-    a, b = draw_positions(xy), draw_positions(xy)
+    a, b = draw_positions(xy, spread_m=45.0), draw_positions(xy, spread_m=45.0)
     np.testing.assert_array_equal(a, b)
     assert a.shape == (900, 2)
     assert (a.min(0) > -46).all() and (a.max(0) < 96).all()

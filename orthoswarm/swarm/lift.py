@@ -37,10 +37,11 @@ class Lift:
     points: LocusPoints
 
 
-def draw_positions(camera_xy: Array, *, count: int = 900, spread_m: float = 45.0, seed: int = 0) -> Array:
+def draw_positions(camera_xy: Array, *, count: int = 900, spread_m: float = 100.0, seed: int = 0) -> Array:
     """Free positions, float64 (count, 2): around pictures' positions (N, 2) evenly in a square of +-spread_m.
 
-    Drawn once and kept, so that the lift changes with the surface and not with the draw.
+    Drawn once and kept, so that the lift changes with the surface and not with the draw. The default spread, for
+    150 m above ground, reaches to the border of what the outer pictures see.
     """
     rng = np.random.default_rng(seed)
     at = np.asarray(camera_xy, float)[np.linspace(0, len(camera_xy) - 1, count).round().astype(int)]
