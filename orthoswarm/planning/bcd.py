@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7
-_SLIVER_M = 0.02
 _TOOTH = 0.1
 
 
@@ -79,7 +78,7 @@ class _Sweep:
     """The lines of one cell.
 
     Attributes:
-        legs: per line, its legs from low to high y, float64 (k, 2, 2).
+        lines: per line, its legs from low to high y, float64 (k, 2, 2).
     """
 
     lines: list[Array]
@@ -94,7 +93,7 @@ class _Sweep:
         return result
 
 
-def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router) -> Array:
+def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, multiple: int = 1) -> Array:
     """Legs of all cells in flying order.
 
     Args:
@@ -102,24 +101,19 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router) ->
         angle_rad: direction of the sweep, from grid east, counter-clockwise.
         foot: footprint of the narrowest camera.
         router: measures the ways between cells.
+        multiple: make the number of lines a multiple of this, by laying them closer.
 
     Returns:
         float64 (n, 2, 2), start and end of each leg, grid metres.
     """
     frame = Turned(angle_rad, (field.ground.centroid.x, field.ground.centroid.y))
     local = field.turned(frame)
-    # A ragged coast has a critical point at every tooth: cut a smoothed outline, but fly to the true one.
-    tooth = _TOOTH * foot.spacing_m
-    smooth = local.ground.simplify(tooth)
-    ragged = shapely.get_num_coordinates(smooth) < shapely.get_num_coordinates(local.ground)
-    sweeps = []
-    for cell in cells(smooth):
-        body = cell.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
-        for part in shapely.get_parts(body):
-            ground = part.buffer(tooth, join_style="mitre").intersection(local.ground) if ragged else part
-            lines = _cell_lines(part.bounds, Field(ground, local.obstacles), foot)
-            if lines:
-                sweeps.append(_Sweep([frame.to_grid(np.array(legs)) for legs in lines]))
+    # A ragged coast has a critical point at every tooth, so cells are cut from a smoothed outline.
+    parts = cells(local.ground.simplify(_TOOTH * foot.spacing_m))
+    sweeps = [
+        _Sweep([frame.to_grid(np.array(line)) for line in lines])
+        for lines in _by_cell(_lines(local, foot, multiple), parts)
+    ]
     if not sweeps:
         return np.empty((0, 2, 2))
     variants = [sweep.variants() for sweep in sweeps]
@@ -130,15 +124,29 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router) ->
     return np.concatenate([variants[k // 4][k % 4] for k in order])
 
 
-def _cell_lines(bounds: tuple[float, float, float, float], field: Field, foot: Footprint) -> list[list[Array]]:
-    x0, y0, x1, y1 = bounds
-    edges = np.linspace(x0, x1, line_count(x1 - x0, foot.spacing_m) + 1)
-    more = 1.0 + foot.spacing_m  # the true outline may reach beyond the smoothed one
-    lines = [
-        strip_legs(field, (left, y0 - more, right, y1 + more), foot, 0.5 * foot.spacing_m)
-        for left, right in itertools.pairwise(edges)
-    ]
-    return [line for line in lines if line]
+def _lines(field: Field, foot: Footprint, multiple: int) -> list[list[Array]]:
+    """The legs of each line over the whole area, from low to high y."""
+    x0, y0, x1, y1 = field.ground.bounds
+    edges = np.linspace(x0, x1, -(-line_count(x1 - x0, foot.spacing_m) // multiple) * multiple + 1)
+    pairs = itertools.pairwise(edges)
+    return [strip_legs(field, (a, y0 - 1.0, b, y1 + 1.0), foot, 0.5 * foot.spacing_m) for a, b in pairs]
+
+
+def _by_cell(lines: list[list[Array]], parts: list[Geometry]) -> list[list[list[Array]]]:
+    """The lines within each cell: a leg belongs to the cell at its middle.
+
+    All lines are laid on one raster, not anew in every cell: so a cell narrower than the space between lines costs
+    no line of its own.
+    """
+    tree = shapely.STRtree(parts)
+    found: list[list[list[Array]]] = [[] for _ in parts]
+    for line in lines:
+        of_cell: dict[int, list[Array]] = {}
+        for leg in line:
+            of_cell.setdefault(int(tree.nearest(shapely.Point(leg.mean(0)))), []).append(leg)
+        for cell, legs in of_cell.items():
+            found[cell].append(legs)
+    return [lines for lines in found if lines]
 
 
 def order_cells(ways: Array) -> list[int]:

@@ -11,7 +11,7 @@ from orthoswarm.planning.sweep import Field, Turned, line_count, strip_legs
 Array = NDArray[np.float64]
 
 
-def column_legs(field: Field, angle_rad: float, foot: Footprint) -> Array:
+def column_legs(field: Field, angle_rad: float, foot: Footprint, multiple: int = 1) -> Array:
     """Legs of all columns in flying order.
 
     A column that an obstacle or a bay of the outline interrupts is flown to its end (around the obstacle) before
@@ -21,6 +21,7 @@ def column_legs(field: Field, angle_rad: float, foot: Footprint) -> Array:
         field: ground and obstacles, grid metres.
         angle_rad: direction of the sweep, from grid east, counter-clockwise.
         foot: footprint of the narrowest camera.
+        multiple: make the number of columns a multiple of this, by laying them closer.
 
     Returns:
         float64 (n, 2, 2), start and end of each leg, grid metres.
@@ -30,7 +31,7 @@ def column_legs(field: Field, angle_rad: float, foot: Footprint) -> Array:
     local = field.turned(frame)
     x0, y0, x1, y1 = local.ground.bounds
     count = line_count(x1 - x0, foot.spacing_m)
-    edges = np.linspace(x0, x1, count + 1)
+    edges = np.linspace(x0, x1, -(-count // multiple) * multiple + 1)
     found: list[Array] = []
     up = True
     for left, right in itertools.pairwise(edges):

@@ -57,16 +57,19 @@ class Flight:
         return len(self.points) + int(np.count_nonzero(self.camera)) + 4
 
 
-def make_flight(legs: Array, home: Array, altitude_m: float, layer_m: float, router: Router, returns: bool) -> Flight:
+def make_flight(
+    legs: Array, home: Array, altitude_m: float, router: Router, returns: bool, out_m: float = 0.0, home_m: float = 0.0
+) -> Flight:
     """The flight over a row of legs.
 
     Args:
         legs: float64 (n, 2, 2) in flying order.
         home: float64 (2,).
         altitude_m: height of the legs and of the ways between them.
-        layer_m: how much higher the way out and the way home are.
         router: finds ways around obstacles.
         returns: fly back above home at the end.
+        out_m: how much higher the way out is.
+        home_m: how much higher the way home is.
     """
     points: list[Array] = []
     camera: list[int] = []
@@ -77,18 +80,18 @@ def make_flight(legs: Array, home: Array, altitude_m: float, layer_m: float, rou
             camera.append(mark)
 
     far = float(np.hypot(*(legs[0, 0] - home))) > _SAME_M
-    high = altitude_m + layer_m
+    climb = altitude_m + (out_m if far else 0.0)
     if far:
-        add(router.path(home, legs[0, 0])[1:-1], high)
-        if layer_m > 0.0:
-            add(legs[:1, 0], high)
+        add(router.path(home, legs[0, 0])[1:-1], climb)
+        if out_m > 0.0:
+            add(legs[:1, 0], climb)
     for k, (start, end) in enumerate(legs):
         if k:
             add(router.path(legs[k - 1, 1], start)[1:-1], altitude_m)
         add(start[None], altitude_m, 1)
         add(end[None], altitude_m, -1)
     if returns:
-        if layer_m > 0.0:
-            add(legs[-1:, 1], high)
-        add(router.path(legs[-1, 1], home)[1:], high)
-    return Flight(home, high if far else altitude_m, np.array(points), np.array(camera, np.int8), returns)
+        if home_m > 0.0:
+            add(legs[-1:, 1], altitude_m + home_m)
+        add(router.path(legs[-1, 1], home)[1:], altitude_m + home_m)
+    return Flight(home, climb, np.array(points), np.array(camera, np.int8), returns)

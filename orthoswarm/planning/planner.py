@@ -1,9 +1,6 @@
 """From an area, or given lines, to a plan for a swarm (paper III.A)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -13,49 +10,23 @@ from orthoswarm.errors import InputError
 from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.planning import coverage
 from orthoswarm.planning.area import Area
-from orthoswarm.planning.bcd import bcd_legs
-from orthoswarm.planning.columns import column_legs
-from orthoswarm.planning.flights import Flight, make_flight
+from orthoswarm.planning.candidates import METHODS, Method, candidates
+from orthoswarm.planning.crew import Crew, Options, Work
+from orthoswarm.planning.flights import Flight
 from orthoswarm.planning.footprint import Footprint
 from orthoswarm.planning.motion import Motion
-from orthoswarm.planning.order import shorten
 from orthoswarm.planning.routes import Router, make_obstacles
-from orthoswarm.planning.schedule import Separation, Slot, separate
+from orthoswarm.planning.schedule import Separation, Slot
 from orthoswarm.planning.shapes import Ring
-from orthoswarm.planning.split import Limits, cut, share, sorties
-from orthoswarm.planning.sweep import Field, rank_directions
-from orthoswarm.planning.tmstc import tmstc_legs
-from orthoswarm.planning.types import End, Gap, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.planning.sweep import Field, stretches
+from orthoswarm.planning.types import Gap, Plan, Sortie, VehiclePlan, Waypoint
+
+__all__ = ["METHODS", "Method", "Options", "plan_area", "plan_lines"]
 
 Array = NDArray[np.float64]
-Method = Literal["columns", "bcd", "tmstc"]
+Progress = Callable[[str], None]
 
-METHODS: tuple[str, ...] = get_args(Method)
-MOST_VEHICLES = 250  # MAVLink system ids
-
-
-@dataclass(frozen=True)
-class Options:
-    """Everything about the flights that has a good default.
-
-    Attributes:
-        motion: speeds of the vehicles.
-        end: what a sortie does at last: return to launch, land at home, or hover at the end of its last leg.
-        starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
-            begins), one for all, or several that vehicles are given in turn.
-        endurance_s: longest flight on one battery; infinite without a limit.
-        clearance_m: distance that paths keep from no-fly zones.
-        separation: how far apart vehicles stay.
-        most_items: mission items that the autopilot can hold.
-    """
-
-    motion: Motion = field(default_factory=Motion)
-    end: End = "rtl"
-    starts: Sequence[tuple[float, float]] = ()
-    endurance_s: float = float("inf")
-    clearance_m: float = 2.0
-    separation: Separation = field(default_factory=Separation)
-    most_items: int = 650
+_FAIR_ENOUGH = 1.25
 
 
 def plan_area(
@@ -65,7 +36,7 @@ def plan_area(
     foot: Footprint,
     method: Method = "tmstc",
     options: Options | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> Plan:
     """Missions that cover an area.
 
@@ -82,31 +53,48 @@ def plan_area(
         InputError: more vehicles than lines, a start in a no-fly zone, an endurance too short for the area.
     """
     options = options or Options()
-    _check(vehicles, options)
+    options.check()
     clearance = max(0.1, min(options.clearance_m, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
-    reach = min(foot.reach_m, 2.0 * clearance)
+    crew = Crew(vehicles, altitude_m, foot, area.grid, router, options)
     progress("lines")
-    legs, lines = _lines(Field(area.ground, router.obstacles), vehicles, foot, method, options.motion, router, reach)
-    if lines < vehicles:
-        raise InputError(
-            f"{vehicles} vehicles are more than the {lines} lines that this area needs; "
-            f"use at most {lines}, or fly lower so that lines lie closer"
-        )
-    slots, warnings = _assign(
-        legs, vehicles, altitude_m, foot, area.grid, options, router, progress, reorder=method != "columns"
-    )
+    best = _best_work(area, crew, foot, method, options.motion, router, min(foot.reach_m, 2.0 * clearance))
+    progress("separation")
+    slots = crew.schedule(best)
     progress("coverage")
     flown = np.concatenate([_legs_of(s.flight) for row in slots for s in row])
     left = coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
-    gaps = [_gap(p, area.grid) for p in coverage.pieces(left)]
-    share_seen = 1.0 - float(left.area) / area.size_m2
-    if share_seen < coverage.COMPLETE:
+    gaps = tuple(_gap(p, area.grid) for p in coverage.pieces(left))
+    seen = 1.0 - float(left.area) / area.size_m2
+    warnings = _warnings(slots, best, options)
+    if seen < coverage.COMPLETE:
         warnings.append(
-            f"only {100 * share_seen:.2f} % of the area is covered, {len(gaps)} gaps are left beside no-fly zones: "
-            "this plan is not complete"
+            f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
+            "reduce the clearance or the no-fly zones, or fly lower"
         )
-    return _plan(method, slots, altitude_m, foot, area.grid, options, warnings, area.size_m2, share_seen, tuple(gaps))
+    return _plan(method, slots, altitude_m, foot, area.grid, options, warnings, (area.size_m2, seen, gaps))
+
+
+def _best_work(
+    area: Area, crew: Crew, foot: Footprint, method: Method, motion: Motion, router: Router, reach_m: float
+) -> Work:
+    """The fairest and shortest work among the method's candidates."""
+    field = Field(area.ground, router.obstacles)
+    best: Work | None = None
+    most = 0
+    for candidate in candidates(field, crew.vehicles, foot, method, motion.turn_m, router, reach_m):
+        most = max(most, candidate.stretches)
+        if candidate.stretches >= crew.vehicles:
+            work = crew.share(candidate.legs, method != "columns")
+            best = work if best is None or work.score < best.score else best
+    if best is not None:
+        return best
+    if not most:
+        raise InputError("all of the area lies within the clearance of no-fly zones; reduce the clearance")
+    raise InputError(
+        f"{crew.vehicles} vehicles are more than the {most} lines that this area has for them; "
+        f"use at most {most} vehicles, or fly lower so that lines lie closer"
+    )
 
 
 def plan_lines(
@@ -116,7 +104,7 @@ def plan_lines(
     foot: Footprint,
     no_fly: Area | None = None,
     options: Options | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = lambda _: None,
 ) -> Plan:
     """Missions along given lines, with pictures on their straight stretches.
 
@@ -134,12 +122,12 @@ def plan_lines(
         InputError: no stretch is long enough, more vehicles than stretches, or a line crosses a no-fly zone.
     """
     options = options or Options()
-    _check(vehicles, options)
+    options.check()
     points = np.concatenate(lines)
     grid = no_fly.grid if no_fly else LocalGrid(area_epsg(points[:, 0], points[:, 1]))
     paths = [grid.to_grid(line[:, 0], line[:, 1]) for line in lines]
-    stretches = np.concatenate([np.stack([p[:-1], p[1:]], axis=1) for p in paths])
-    legs = stretches[np.hypot(*(stretches[:, 1] - stretches[:, 0]).T) >= 2.0 * foot.trigger_m]
+    straight = np.concatenate([np.stack([p[:-1], p[1:]], axis=1) for p in paths])
+    legs = straight[np.hypot(*(straight[:, 1] - straight[:, 0]).T) >= 2.0 * foot.trigger_m]
     if not len(legs):
         raise InputError(
             f"no stretch of the line is as long as two picture distances ({2 * foot.trigger_m:.0f} m); "
@@ -148,179 +136,33 @@ def plan_lines(
     router = Router(make_obstacles(no_fly.no_fly, options.clearance_m) if no_fly else shapely.MultiPolygon())
     if router.blocked(legs[:, 0], legs[:, 1]).any() or router.inside(legs.reshape(-1, 2)).any():
         raise InputError("a line crosses a no-fly zone; redraw the line or the zone")
-    if len(legs) < vehicles:
+    most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
+    if most < vehicles:
         raise InputError(
-            f"{vehicles} vehicles are more than the {len(legs)} straight stretches; use at most {len(legs)}"
+            f"{vehicles} vehicles are more than the {most} straight stretches; use at most {most} vehicles"
         )
-    slots, warnings = _assign(legs, vehicles, altitude_m, foot, grid, options, router, progress, reorder=False)
-    return _plan("lines", slots, altitude_m, foot, grid, options, warnings, None, None, ())
-
-
-def _check(vehicles: int, options: Options) -> None:
-    if not 1 <= vehicles <= MOST_VEHICLES:
-        raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")
-    positive = {
-        "speed": options.motion.speed_m_s,
-        "endurance": options.endurance_s,
-        "clearance": options.clearance_m,
-        "separation": options.separation.distance_m,
-        "height step": options.separation.height_m,
-    }
-    for name, value in positive.items():
-        if not value > 0.0:
-            raise InputError(f"the {name} is {value:g}; give a number larger than 0")
-
-
-def _lines(
-    field_: Field, vehicles: int, foot: Footprint, method: Method, motion: Motion, router: Router, reach_m: float
-) -> tuple[Array, int]:
-    """The method's legs in flying order for the best of several directions, gaps mended; and how many lines it laid."""
-    angles = rank_directions(field_, foot, motion.turn_m, vehicles)
-    if method == "tmstc":  # a grid looks the same after a right angle
-        quarter = [a % (0.5 * np.pi) for a in angles]
-        angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < 0.02 for b in quarter[:k])]
-    best: tuple[tuple[bool, float], Array, float] | None = None
-    for angle in angles[: {"columns": 3, "bcd": 5, "tmstc": 4}[method]]:
-        legs = _raw_legs(field_, angle, foot, method, router)
-        if len(legs):
-            cost = (len(legs) < vehicles, _cost(legs, router, motion))
-            if best is None or cost < best[0]:
-                best = (cost, legs, angle)
-    if best is None:
-        raise InputError("all of the area lies within the clearance of no-fly zones; reduce the clearance")
-    _, legs, angle = best
-    lines = len(legs)
-    legs = coverage.mend(field_, legs, foot, router, reach_m, angle)
-    return legs if method == "columns" else shorten(legs, router), lines
-
-
-def _raw_legs(field_: Field, angle: float, foot: Footprint, method: Method, router: Router) -> Array:
-    if method == "columns":
-        return column_legs(field_, angle, foot)
-    if method == "bcd":
-        legs = bcd_legs(field_, angle, foot, router)
-    else:
-        legs = _chained(tmstc_legs(field_, angle, foot))
-    return shorten(coverage.prune(field_, legs, foot), router) if len(legs) else legs
-
-
-def _chained(loops: list[Array]) -> Array:
-    """Closed rows of legs one after the other: each opened where it comes near the one before."""
-    if not loops:
-        return np.empty((0, 2, 2))
-    first, *rest = loops
-    gaps = np.hypot(*(first[:, 0] - np.roll(first[:, 1], 1, axis=0)).T)
-    rows = [np.roll(first, -int(np.argmax(gaps)), axis=0)]
-    while rest:
-        here = rows[-1][-1, 1]
-        near = [float(np.hypot(*(loop[:, 0] - here).T).min()) for loop in rest]
-        loop = rest.pop(int(np.argmin(near)))
-        rows.append(np.roll(loop, -int(np.argmin(np.hypot(*(loop[:, 0] - here).T))), axis=0))
-    return np.concatenate(rows)
-
-
-def _cost(legs: Array, router: Router, motion: Motion) -> float:
-    """Metres to fly a row of legs, turns counted as metres."""
-    ways = router.each(legs[:-1, 1], legs[1:, 0]).sum()
-    return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + motion.turn_m * len(legs))
-
-
-def _assign(
-    legs: Array,
-    vehicles: int,
-    altitude_m: float,
-    foot: Footprint,
-    grid: LocalGrid,
-    options: Options,
-    router: Router,
-    progress: Callable[[str], None],
-    *,
-    reorder: bool,
-) -> tuple[list[list[Slot]], list[str]]:
-    """Vehicles' sorties with their layers and takeoff times, and warnings."""
-    motion, returns = options.motion, options.end != "hover"
-    starts = _starts(options.starts, vehicles, grid, router)
-    limits = _limits(altitude_m, options, returns)
-    progress("shares")
-    least = 4.0 * foot.trigger_m
-    row = cut(legs, router, motion, vehicles, least)
-    pieces = share(row, vehicles, starts, returns, router, motion, limits)
-    if pieces is None:
-        raise _too_short(options)
-    makers: list[list[Callable[[float], Flight]]] = []
-    warnings: list[str] = []
-    for vehicle, (begin, end) in enumerate(pieces):
-        mine = row.legs(begin, end)
-        home = mine[0, 0] if starts is None else starts[vehicle]
-        if reorder:
-            mine = shorten(mine, router, home) if starts is not None and returns else mine
-        flights = _flights(mine, home, altitude_m, foot, options, limits, router)
-        if len(flights) > 1 and not np.isfinite(options.endurance_s):
-            warnings.append(
-                f"vehicle v{vehicle + 1} flies {len(flights)} sorties because one mission holds at most "
-                f"{options.most_items} items"
-            )
-        makers.append([partial(_maker, f, home, altitude_m, router, returns) for f in flights])
+    progress("lines")
+    crew = Crew(vehicles, altitude_m, foot, grid, router, options)
+    work = crew.share(legs, reorder=False)
     progress("separation")
-    return separate(makers, motion, options.separation), warnings
+    slots = crew.schedule(work)
+    warnings = _warnings(slots, work, options)
+    return _plan("lines", slots, altitude_m, foot, grid, options, warnings, (None, None, ()))
 
 
-def _maker(legs: Array, home: Array, altitude_m: float, router: Router, returns: bool, layer_m: float) -> Flight:
-    return make_flight(legs, home, altitude_m, layer_m, router, returns)
-
-
-def _starts(given: Sequence[tuple[float, float]], vehicles: int, grid: LocalGrid, router: Router) -> Array | None:
-    if not given:
-        return None
-    lat_lon = np.asarray(given, np.float64)
-    if not np.isfinite(lat_lon).all() or (np.abs(lat_lon) > [90.0, 180.0]).any():
-        raise InputError("a start is no latitude and longitude; give it as LAT,LON in degrees")
-    places = grid.to_grid(lat_lon[:, 0], lat_lon[:, 1])
-    if router.inside(places).any():
-        raise InputError("a start lies in a no-fly zone; move it out")
-    return places[np.arange(vehicles) % len(places)]
-
-
-def _limits(altitude_m: float, options: Options, returns: bool) -> Limits:
-    motion, apart = options.motion, options.separation
-    top = altitude_m + apart.layers * apart.height_m  # whatever layer the schedule gives
-    fixed = top / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
-    fixed += (top / motion.descent_m_s + apart.layers * apart.height_m / motion.climb_m_s) if returns else 0.0
-    return Limits(options.endurance_s, fixed, apart.swap_s, max(1, (options.most_items - 40) // 4))
-
-
-def _flights(
-    legs: Array, home: Array, altitude_m: float, foot: Footprint, options: Options, limits: Limits, router: Router
-) -> list[Array]:
-    """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
-    returns, motion = options.end != "hover", options.motion
-    top = options.separation.layers * options.separation.height_m
-    least = 4.0 * foot.trigger_m
-    for _ in range(12):
-        step = least
-        if np.isfinite(limits.endurance_s):
-            step = min(max(limits.endurance_s * motion.speed_m_s / 40.0, foot.trigger_m), least)
-        total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
-        row = cut(legs, router, motion, 1, min(least, step), max(step, total / 2000.0))
-        found = sorties(row, home, returns, router, motion, limits)
-        if found is None:
-            raise _too_short(options)
-        result = [row.legs(a, b) for a, b in found]
-        made = [make_flight(f, home, altitude_m, top, router, returns) for f in result]
-        longest, most = max(f.time_s(motion) for f in made), max(f.items for f in made)
-        if longest <= options.endurance_s and most <= options.most_items:
-            return result
-        shorter = 0.995 * limits.endurance_s * min(1.0, options.endurance_s / longest)
-        fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
-        limits = Limits(shorter, limits.fixed_s, limits.swap_s, max(1, fewer))
-    raise _too_short(options)
-
-
-def _too_short(options: Options) -> InputError:
-    return InputError(
-        f"the endurance of {options.endurance_s / 60:.1f} min is too short to reach the far end and come back; "
-        "start nearer, fly faster or lower, or use larger batteries"
-    )
+def _warnings(slots: list[list[Slot]], work: Work, options: Options) -> list[str]:
+    result = []
+    if work.balance > _FAIR_ENOUGH:
+        result.append(
+            f"the longest path is {work.balance:.2f} times the mean: few lines, or long ways out and home, "
+            "cannot be shared more evenly"
+        )
+    several = [f"v{number}" for number, row in enumerate(slots, start=1) if len(row) > 1]
+    if several and not np.isfinite(options.endurance_s):
+        result.append(
+            f"one mission holds at most {options.most_items} items, so {', '.join(several)} must fly several sorties"
+        )
+    return result
 
 
 def _legs_of(flight: Flight) -> Array:
@@ -336,24 +178,24 @@ def _gap(piece: coverage.Geometry, grid: LocalGrid) -> Gap:
 def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sortie:
     flight = slot.flight
     home = grid.to_geographic(flight.home)
-    places = grid.to_geographic(flight.points[:, :2])
     marks = {1: True, -1: False, 0: None}
     waypoints = tuple(
         Waypoint(float(lat), float(lon), float(height), marks[int(mark)])
-        for (lat, lon), height, mark in zip(places, flight.points[:, 2], flight.camera, strict=True)
+        for (lat, lon), height, mark in zip(
+            grid.to_geographic(flight.points[:, :2]), flight.points[:, 2], flight.camera, strict=True
+        )
     )
-    legs = _legs_of(flight)
-    photos = int((np.hypot(*(legs[:, 1] - legs[:, 0]).T) / foot.trigger_m + 1e-6).astype(int).sum()) + len(legs)
+    length = np.hypot(*np.diff(_legs_of(flight), axis=1)[:, 0].T)
     return Sortie(
-        float(home[0]),
-        float(home[1]),
-        flight.climb_m,
-        waypoints,
-        slot.start_s,
-        flight.time_s(motion),
-        flight.length_m,
-        flight.turns,
-        photos,
+        home_lat_deg=float(home[0]),
+        home_lon_deg=float(home[1]),
+        takeoff_height_m=flight.climb_m,
+        waypoints=waypoints,
+        start_s=slot.start_s,
+        time_s=flight.time_s(motion),
+        length_m=flight.length_m,
+        turns=flight.turns,
+        photos=int((length / foot.trigger_m + 1e-6).astype(int).sum()) + len(length),
     )
 
 
@@ -365,10 +207,9 @@ def _plan(
     grid: LocalGrid,
     options: Options,
     warnings: list[str],
-    area_m2: float | None,
-    covered: float | None,
-    gaps: tuple[Gap, ...],
+    covered: tuple[float | None, float | None, tuple[Gap, ...]],
 ) -> Plan:
+    area_m2, share, gaps = covered
     made = tuple(
         VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion) for s in row))
         for number, row in enumerate(slots, start=1)
@@ -384,7 +225,7 @@ def _plan(
         end=options.end,
         epsg=grid.epsg,
         area_m2=area_m2,
-        covered_share=covered,
+        covered_share=share,
         gaps=gaps,
         separation=_separation_text(slots, altitude_m, options.separation),
         warnings=tuple(warnings),
@@ -392,18 +233,22 @@ def _plan(
 
 
 def _separation_text(slots: list[list[Slot]], altitude_m: float, apart: Separation) -> str:
-    first = [row[0] for row in slots]
-    if len(first) == 1:
+    if len(slots) == 1:
         return "a single vehicle"
-    layers = [s.layer for row in slots for s in row]
-    delays = [s.start_s for s in first]
+    layers = [max(s.out_layer, s.home_layer) for row in slots for s in row]
+    delays = [row[0].start_s for row in slots]
     text = (
         f"at any time at least {apart.distance_m:g} m apart, or {apart.height_m:g} m in height, "
         f"even {apart.slack_s:g} s off schedule"
     )
+    homes = np.array([row[0].flight.home for row in slots])
+    if any(np.hypot(*(homes[:k] - homes[k]).T).min() < apart.distance_m for k in range(1, len(homes))):
+        text += (
+            f"; at one start they stand some metres apart and take off and land {apart.launch_s:g} s after each other"
+        )
     if any(layers):
         top = altitude_m + max(layers) * apart.height_m
-        text += f"; {sum(map(bool, layers))} sorties fly out and home higher than the lines, up to {top:g} m"
+        text += f"; {sum(map(bool, layers))} sorties fly out or home higher than the lines, up to {top:g} m"
     if any(delays):
         text += f"; {sum(map(bool, delays))} vehicles take off later than the first, up to {max(delays):g} s"
     return text

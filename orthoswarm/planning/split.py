@@ -1,8 +1,8 @@
 """Sharing a row of legs among vehicles, and a vehicle's legs among sorties, evenly.
 
 The row is cut into consecutive pieces, as MSTC* does with its round trip (Tang, Sun, Zhang 2021, TMSTC* section V).
-Dynamic programming over possible cuts finds pieces whose times, ways out and home included, are as equal as can be;
-a cut within a leg costs a little, so that legs stay whole where that hardly matters.
+Dynamic programming over possible cuts makes the longest piece, ways out and home included, as short as can be; then,
+hardly longer than that, pieces even and legs whole.
 """
 
 import itertools
@@ -18,8 +18,8 @@ from orthoswarm.planning.routes import Router
 
 Array = NDArray[np.float64]
 
-_EVENNESS = 8.0  # power of a piece's time in the sum that is minimised: the larger, the more the longest counts
-_CUT_PRICE = 0.06
+_CUT_PRICE = 0.25
+_LEEWAY = 1.04  # how much longer than it must be the longest piece may get so that legs stay whole
 _PARTS = 24  # possible cuts per share
 
 
@@ -96,25 +96,33 @@ class Limits:
 
 
 @kernel
-def _cut_evenly(parts, leg, when, out, home, own, single, back, mean, limits):  # type: ignore[no-untyped-def]
-    """Cuts (vehicles + 1,) of the row; [0] is -1 where no cut keeps within the limits.
+def _cut_evenly(parts, leg, when, out, home, own, single, back, limits, cap, shortest):  # type: ignore[no-untyped-def]
+    """Cuts (vehicles + 1,) of the row, [0] is -1 where no cut keeps within the limits; and the longest piece's time.
 
     when[k]: seconds at which part k begins and ends; out[j, p] and home[j, q]: seconds from vehicle j's start to part
     p, and from part q back; limits: endurance, fixed time, time between flights, most legs. With `own`, the start is
     where the piece begins and `back` the seconds per metre of the way home. With `single`, a piece is one flight.
+    No piece takes longer than `cap`. With `shortest` the longest piece is as short as can be; else the sum of the sixth
+    powers of times over `cap`, and of a price per cut within a leg, is least.
     """
     limit, fixed, swap, most = limits
     vehicles, n = out.shape[0], len(leg)
     cost = np.full((vehicles + 1, n + 1), np.inf)
     prior = np.full((vehicles + 1, n + 1), -1, np.int64)
     cost[0, 0] = 0.0
+    longest_way = 0.0  # ways between pieces are nobody's work
+    for k in range(1, n):
+        longest_way = max(longest_way, when[k, 0] - when[k - 1, 1])
     for j in range(vehicles):
         for q in range(j + 1, n - (vehicles - j - 1) + 1):
+            done, left = when[q - 1, 1] - when[0, 0], when[n - 1, 1] - when[q - 1, 1]
+            if done > (j + 1) * (cap + longest_way) or (q < n and left > (vehicles - j - 1) * (cap + longest_way)):
+                continue
             price = _CUT_PRICE if q < n and leg[q] == leg[q - 1] else 0.0
             for p in range(q - 1, j - 1, -1):
                 work = when[q - 1, 1] - when[p, 0]
-                if work > 4.0 * mean and cost[j + 1, q] < np.inf:
-                    break
+                if work > cap or (shortest and work >= cost[j + 1, q]):
+                    break  # longer pieces only get worse
                 if cost[j, p] == np.inf:
                     continue
                 if own:
@@ -130,8 +138,14 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, mean, limits):  
                     continue
                 else:
                     flights = max(1.0, np.ceil(legs / most), np.ceil(work / room))
-                time = work + flights * (way + fixed) + (flights - 1.0) * swap
-                total = cost[j, p] + (time / mean) ** _EVENNESS + price
+                time = work + flights * way + (flights - 1.0) * (fixed + swap)  # what all pay alike is left out
+                if time > cap:
+                    continue
+                if shortest:
+                    total = max(cost[j, p], time)
+                else:
+                    cube = (time / cap) ** 3
+                    total = cost[j, p] + cube * cube + price
                 if total < cost[j + 1, q]:
                     cost[j + 1, q] = total
                     prior[j + 1, q] = p
@@ -140,16 +154,13 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, mean, limits):  
         cuts[vehicles] = n
         for j in range(vehicles, 0, -1):
             cuts[j - 1] = prior[j, cuts[j]]
-    return cuts
+    return cuts, cost[vehicles, n]
 
 
 def _evenly(
     row: Row, out: Array, home: Array, motion: Motion, limits: Limits, *, own: bool, returns: bool, single: bool
 ) -> NDArray[np.int64] | None:
-    pieces = len(out)
-    ways = 0.0 if own else float(np.min(out, axis=1).mean() + np.min(home, axis=1).mean())
-    mean = (row.end_s[-1] - row.begin_s[0]) / pieces + ways + limits.fixed_s
-    cuts = _cut_evenly(
+    given = (
         np.ascontiguousarray(row.parts),
         row.leg,
         np.stack([row.begin_s, row.end_s], axis=1),
@@ -158,10 +169,15 @@ def _evenly(
         own,
         single,
         1.0 / motion.speed_m_s if returns else 0.0,
-        max(mean, 1e-6),
         np.array([limits.endurance_s, limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
-    return cuts if cuts[0] >= 0 else None
+    # A cap that is met keeps the search narrow, so try small ones first.
+    share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
+    for cap in (*(share_s * 1.3 * 1.5 ** np.arange(8)), np.inf):
+        cuts, longest = _cut_evenly(*given, cap, True)
+        if cuts[0] >= 0:
+            return np.asarray(_cut_evenly(*given, _LEEWAY * longest + 1e-6, False)[0])
+    return None
 
 
 def _pairs(cuts: NDArray[np.int64]) -> list[tuple[int, int]]:

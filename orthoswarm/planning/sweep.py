@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 MOST_LINES = 20_000
 _CRUMB_M2 = 0.05
+_STRETCH = 5.0
 
 
 @dataclass(frozen=True)
@@ -172,19 +173,25 @@ def candidate_angles(ground: Geometry, spacing_m: float) -> Array:
 
 
 def direction_cost(field: Field, angle_rad: float, spacing_m: float, turn_m: float) -> tuple[float, int]:
-    """Rough metres to fly, turns counted as metres, and the number of lines, for a sweep along an angle."""
+    """Rough metres to fly, turns counted as metres, and how many vehicles can share the lines of a sweep."""
     ground = Turned(angle_rad, (0.0, 0.0)).turn(field.ground)
     x0, y0, x1, y1 = ground.bounds
     count = line_count(x1 - x0, spacing_m)
     x = x0 + (x1 - x0) * (np.arange(count) + 0.5) / count
     ends = np.stack([np.stack([x, np.full(count, y0 - 1)], -1), np.stack([x, np.full(count, y1 + 1)], -1)], 1)
     cut = shapely.intersection(shapely.linestrings(ends), ground)
-    legs = int(shapely.get_num_geometries(cut).sum())
-    return float(shapely.length(cut).sum()) + legs * turn_m + count * spacing_m, max(legs, count)
+    lengths = shapely.length(shapely.get_parts(cut))
+    cost = float(lengths.sum()) + len(lengths) * turn_m + count * spacing_m
+    return cost, max(count, stretches(lengths, spacing_m))
+
+
+def stretches(lengths_m: Array, spacing_m: float) -> int:
+    """Among how many vehicles legs can be shared: one takes a leg, or a stretch five spacings long of a long leg."""
+    return int(np.maximum(1, np.floor(lengths_m / (_STRETCH * spacing_m))).sum())
 
 
 def rank_directions(field: Field, foot: Footprint, turn_m: float, vehicles: int) -> list[float]:
-    """Sweep angles in radians from the cheapest on; those with fewer lines than vehicles come last."""
+    """Sweep angles in radians from the cheapest on; those with too few lines for the vehicles come last."""
     outline = Field(field.ground.simplify(0.05 * foot.spacing_m), field.obstacles)
     ranked = []
     for angle in candidate_angles(outline.ground, foot.spacing_m):

@@ -1,0 +1,203 @@
+"""Who flies what: legs shared among the vehicles of a crew, and cut into sorties."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.errors import InputError
+from orthoswarm.geo import LocalGrid
+from orthoswarm.planning.flights import Flight, make_flight
+from orthoswarm.planning.footprint import Footprint
+from orthoswarm.planning.motion import Motion
+from orthoswarm.planning.order import shorten
+from orthoswarm.planning.routes import Router
+from orthoswarm.planning.schedule import Maker, Separation, Slot, separate
+from orthoswarm.planning.split import Limits, cut, share, sorties
+from orthoswarm.planning.types import End
+
+Array = NDArray[np.float64]
+
+MOST_VEHICLES = 250  # MAVLink system ids
+_ITEMS_A_LEG = 4
+_SPARE_ITEMS = 40
+_FAIR, _UNFAIR = 1.15, 1.22
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything about the flights that has a good default.
+
+    Attributes:
+        motion: speeds of the vehicles.
+        end: what a sortie does at last: return to launch, land at home, or hover at the end of its last leg.
+        starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
+            begins), one for all, or several that vehicles are given in turn.
+        endurance_s: longest flight on one battery; infinite without a limit.
+        clearance_m: distance that paths keep from no-fly zones.
+        separation: how far apart vehicles stay.
+        most_items: mission items that the autopilot can hold.
+    """
+
+    motion: Motion = field(default_factory=Motion)
+    end: End = "rtl"
+    starts: Sequence[tuple[float, float]] = ()
+    endurance_s: float = float("inf")
+    clearance_m: float = 2.0
+    separation: Separation = field(default_factory=Separation)
+    most_items: int = 650
+
+    def check(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            InputError: a value that is not larger than 0, or a start that is no position.
+        """
+        positive = {
+            "speed": self.motion.speed_m_s,
+            "endurance": self.endurance_s,
+            "clearance": self.clearance_m,
+            "separation": self.separation.distance_m,
+            "height step": self.separation.height_m,
+        }
+        for name, value in positive.items():
+            if not value > 0.0:
+                raise InputError(f"the {name} is {value:g}; give a number larger than 0")
+        for lat, lon in self.starts:
+            if not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
+                raise InputError(f"the start {lat:g},{lon:g} is no position; give latitude,longitude in degrees")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What each vehicle of a crew flies.
+
+    Attributes:
+        sorties: per vehicle, its sorties' legs, float64 (n, 2, 2) each, in flying order.
+        homes: per vehicle, where it takes off, float64 (2,).
+        longest_s: time in the air of the busiest vehicle.
+        balance: longest over mean path length of the vehicles.
+    """
+
+    sorties: list[list[Array]]
+    homes: list[Array]
+    longest_s: float
+    balance: float
+
+    @property
+    def score(self) -> float:
+        """Less is better: the makespan, dearer where the work is shared unevenly."""
+        price = 2.0 * max(0.0, self.balance - _FAIR) + 6.0 * max(0.0, self.balance - _UNFAIR)
+        return self.longest_s * (1.0 + price)
+
+
+class Crew:
+    """Vehicles that take off somewhere and share legs.
+
+    Attributes:
+        vehicles: how many.
+        starts: float64 (vehicles, 2), grid metres; None where each starts at its own first leg.
+    """
+
+    def __init__(
+        self, vehicles: int, altitude_m: float, foot: Footprint, grid: LocalGrid, router: Router, options: Options
+    ) -> None:
+        if not 1 <= vehicles <= MOST_VEHICLES:
+            raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")
+        options.check()
+        self.vehicles = vehicles
+        self._altitude_m, self._foot, self._router, self._options = altitude_m, foot, router, options
+        self._returns = options.end != "hover"
+        self.starts: Array | None = None
+        if options.starts:
+            lat_lon = np.asarray(options.starts, np.float64)
+            places = grid.to_grid(lat_lon[:, 0], lat_lon[:, 1])
+            if router.inside(places).any():
+                raise InputError("a start lies in a no-fly zone; move it out")
+            self.starts = places[np.arange(vehicles) % len(places)]
+        self._limits = self._flight_limits()
+
+    def _flight_limits(self) -> Limits:
+        motion, apart = self._options.motion, self._options.separation
+        above = apart.layers * apart.height_m  # whatever layer the schedule gives
+        fixed = (self._altitude_m + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
+        if self._returns:
+            fixed += (self._altitude_m + above) / motion.descent_m_s + above / motion.climb_m_s
+        most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // _ITEMS_A_LEG)
+        return Limits(self._options.endurance_s, fixed, apart.swap_s, most_legs)
+
+    def share(self, legs: Array, reorder: bool) -> Work:
+        """Share a row of legs.
+
+        Args:
+            legs: float64 (n, 2, 2) in flying order.
+            reorder: a vehicle may fly its legs in another order if that shortens its ways.
+
+        Raises:
+            InputError: the endurance is too short.
+        """
+        options, router = self._options, self._router
+        row = cut(legs, router, options.motion, self.vehicles, self._least_leg_m)
+        pieces = share(row, self.vehicles, self.starts, self._returns, router, options.motion, self._limits)
+        if pieces is None:
+            raise self._too_short()
+        homes, work, lengths, times = [], [], [], []
+        for vehicle, (begin, end) in enumerate(pieces):
+            mine = row.legs(begin, end)
+            home = mine[0, 0] if self.starts is None else self.starts[vehicle]
+            if reorder and self.starts is not None and self._returns:
+                mine = shorten(mine, router, home)
+            flown = self._sorties(mine, home)
+            flights = [self._flight(f, home, 0.0, 0.0) for f in flown]
+            homes.append(home)
+            work.append(flown)
+            lengths.append(sum(f.length_m for f in flights))
+            times.append(sum(f.time_s(options.motion) for f in flights) + (len(flights) - 1) * self._limits.swap_s)
+        return Work(work, homes, max(times), max(lengths) / (sum(lengths) / len(lengths)))
+
+    def schedule(self, work: Work) -> list[list[Slot]]:
+        """Layers and takeoff times of all sorties, so that vehicles stay apart."""
+        makers: list[list[Maker]] = [
+            [partial(self._flight, legs, home) for legs in flown]
+            for flown, home in zip(work.sorties, work.homes, strict=True)
+        ]
+        return separate(makers, self._options.motion, self._options.separation)
+
+    def _flight(self, legs: Array, home: Array, out_m: float, home_m: float) -> Flight:
+        return make_flight(legs, home, self._altitude_m, self._router, self._returns, out_m, home_m)
+
+    @property
+    def _least_leg_m(self) -> float:
+        return 4.0 * self._foot.trigger_m
+
+    def _sorties(self, legs: Array, home: Array) -> list[Array]:
+        """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
+        options, limits, least = self._options, self._limits, self._least_leg_m
+        top = options.separation.layers * options.separation.height_m
+        for _ in range(12):
+            step = least
+            if np.isfinite(limits.endurance_s):
+                step = min(max(limits.endurance_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
+            total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
+            row = cut(legs, self._router, options.motion, 1, step, max(step, total / 2000.0))
+            found = sorties(row, home, self._returns, self._router, options.motion, limits)
+            if found is None:
+                raise self._too_short()
+            result = [row.legs(a, b) for a, b in found]
+            flights = [self._flight(f, home, top, top) for f in result]
+            longest, most = max(f.time_s(options.motion) for f in flights), max(f.items for f in flights)
+            if longest <= options.endurance_s and most <= options.most_items:
+                return result
+            # The cut knows turns and detours only roughly: cut again a little shorter.
+            fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
+            shorter = 0.995 * limits.endurance_s * min(1.0, options.endurance_s / longest)
+            limits = replace(limits, endurance_s=shorter, most_legs=max(1, fewer))
+        raise self._too_short()
+
+    def _too_short(self) -> InputError:
+        return InputError(
+            f"the endurance of {self._options.endurance_s / 60:.1f} min is too short to reach the far end and come "
+            "back; start nearer, fly faster or lower, or use larger batteries"
+        )
