@@ -22,6 +22,9 @@ from orthoswarm.swarm.tracks import follow, predicted_homography
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
+FEWEST = 10
+FOLLOWED_OVERLAP = 0.78
+"""Fewer pictures, or less forward overlap, are matched in pairs instead of being followed."""
 HEIGHT_SIGMA_M = (0.1, 2.0)
 ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
 """Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
@@ -35,7 +38,7 @@ class Flight:
         frames: in order. records: what they recorded (headings already corrected). leg: int32 (N,).
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
         survived: float64 (N,), share of tracks that survived into each picture.
-        warnings: findings in plain words.
+        warnings: findings in plain words. sparse: True where photos were matched in pairs, not followed.
     """
 
     frames: Sequence[Frame]
@@ -46,6 +49,7 @@ class Flight:
     adjustment: Adjustment
     survived: Array
     warnings: list[str]
+    sparse: bool = False
 
     def rig(self) -> Rig:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
@@ -59,14 +63,26 @@ class Flight:
 
 def open_flight(
     frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: Callable[[Frame], Gray], fov_start: float
-) -> Flight:
-    """Track a vehicle's pictures and set up its adjustment; nothing is solved yet."""
+) -> Flight | None:
+    """Track a vehicle's pictures and set up its adjustment; nothing is solved yet.
+
+    None where the pictures cannot be followed from one to the next: too little overlap, or no height and scale that
+    agree (those are matched in pairs instead, see `sparse_flight`).
+    """
+    if len(frames) < FEWEST:
+        return None
     records = read_records(frames, grid, origin)
     leg = split_legs(records.position, records.time_s if records.timed else None)
     pictures = Pictures(frames, read)
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
+    steps = np.hypot(*records.steps()[1:, :2].T)
+    flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
+    if not calibration.trusted_height or calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
+        return None
     records = records.with_yaw(records.yaw + calibration.yaw_offset)
     tracks, survived = _track(records, pictures, calibration)
+    if np.median(survived[1:]) < 0.5 or tracks.count < 3 * len(frames) ** 0.5:
+        return None
     adjustment = _begin(records, pictures, calibration, tracks)
     return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))
 

@@ -1,4 +1,4 @@
-"""Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE.md step 4)."""
+"""Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE 4)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +13,9 @@ from orthoswarm.swarm.flight import Flight
 Array = NDArray[np.float64]
 
 WINDOW = 25
+SPARSE_WINDOW = 3
+ACROSS_PX = 150
+"""A picture's width in pixels of the small mosaics."""
 CONSENSUS_M = 6.0
 TRUSTED_RATIO = 0.85
 
@@ -34,11 +37,14 @@ class CoarseFit:
 
 def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 60.0) -> CoarseFit | None:
     """Register windows of each leg; None where no consensus is found."""
-    rig = flight.adjustment.rig
+    rig = flight.rig()
+    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
+    windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
     matches = [
         m
-        for index in _windows(flight.leg)
-        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m)) is not None
+        for index in windows
+        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd)) is not None
     ]
     if not matches:
         return None
@@ -68,13 +74,13 @@ def shift_cameras(flight: Flight, correction: Array) -> None:
                 adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
 
 
-def _windows(leg: NDArray[np.int32]) -> list[NDArray[np.int64]]:
-    """Runs of about WINDOW pictures of one leg each; short legs are one window."""
+def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
+    """Runs of about `size` pictures of one leg each; short legs are one window."""
     out: list[NDArray[np.int64]] = []
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
         members = np.flatnonzero(leg == k)
-        parts = max(1, round(len(members) / WINDOW))
-        out += [p for p in np.array_split(members, parts) if len(p) >= 3]
+        parts = max(1, round(len(members) / size))
+        out += [p for p in np.array_split(members, parts) if len(p) >= 2]
     return out or ([np.arange(len(leg))] if len(leg) else [])
 
 

@@ -25,6 +25,7 @@ from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
 from orthoswarm.swarm.settle import resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
+from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
@@ -86,8 +87,14 @@ def solo(
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
-    watch.lap("tracks")
-    surface = _relative(flight)
+    if flight is None:
+        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
+        flight.sparse = True
+        watch.lap("tracks")
+        surface = fit_surface(flight.adjustment, GroundModel())
+    else:
+        watch.lap("tracks")
+        surface = _relative(flight)
     adj = flight.adjustment
     belief = surface.belief(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)

@@ -57,7 +57,8 @@ def tie_round(
     adj = flight.adjustment
     seen = flight.sights()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
+    fewest = 2 if flight.sparse else 3
+    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
@@ -151,7 +152,7 @@ def settle(
         lean: the map's lean where it is known from other vehicles, None to vote.
     """
     ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-    matches = accepted(tie_round(flight, surface, ground, 50.0, 14.0))
+    matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
     shift_cameras(flight, np.broadcast_to(mode_shift(matches.shift), (len(flight.frames), 2)).copy())
     matches = replace(matches, shift=matches.shift - mode_shift(matches.shift))
     ties = as_ties(matches, flight.adjustment.points, surface)
@@ -163,7 +164,7 @@ def settle(
     ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
     voted = vote_lean(roofs[0], roofs[1], ground_shift) if lean is None else lean
     surface = replace(surface, lean=voted or (0.0, 0.0))
-    links = add_links(flight, working_gsd(flight))
+    links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
     surface, ties, matches = _second_round(flight, ground, surface, 6)
     return Settled(surface, ties, matches, roofs, ground_shift, links)
@@ -181,7 +182,7 @@ def resettle(
 def _second_round(
     flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
 ) -> tuple[GroundModel, Ties, MapMatches]:
-    matches = accepted(tie_round(flight, surface, ground, 30.0, 5.0))
+    matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, 5.0))
     ties = as_ties(matches, flight.adjustment.points, surface)
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
