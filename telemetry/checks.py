@@ -92,7 +92,7 @@ def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
             f"the times jump {plural(jumps, 'time')} (by up to {hours:.1f} h): several flights or a clock that was set"
         )
         found.append(Finding("time-gap", text))
-    numbers = [_number(f.image) for f in frames]
+    numbers = [number_of(f.image) for f in frames]
     known = [n for n in numbers if n is not None]
     if len(known) == len(frames) and len(frames) > 4:
         back = int((np.diff(np.array(known)) < 0).sum())
@@ -105,7 +105,8 @@ def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
     return found
 
 
-def _number(image: str) -> int | None:
+def number_of(image: str) -> int | None:
+    """The last number in a picture's name, None where there is none."""
     match = re.search(r"(\d{1,9})\D*$", image.rsplit("/", 1)[-1].rsplit(".", 1)[0])
     return int(match[1]) if match else None
 
@@ -119,7 +120,7 @@ def _standing(ground: Array) -> Finding | None:
 
 
 def _missing_numbers(frames: Sequence[Frame]) -> Finding | None:
-    numbers = sorted({n for f in frames if "#" not in f.image and (n := _number(f.image)) is not None})
+    numbers = sorted({n for f in frames if "#" not in f.image and (n := number_of(f.image)) is not None})
     if len(numbers) < 5:
         return None
     steps = np.diff(np.array(numbers))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry import srt
 from telemetry.findings import Finding, plural
 from telemetry.photos import PhotoTags
 from telemetry.picks import Candidate, Picker
@@ -159,7 +158,7 @@ def extract(
     name: str,
     cache: Path,
     *,
-    subtitles: srt.Subtitles | None = None,
+    poses: Poses | None = None,
     every_m: float | None = None,
     every_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -171,7 +170,7 @@ def extract(
         path: the video.
         name: its name relative to the inputs; names its folder in the cache.
         cache: folder for the pictures.
-        subtitles: of an SRT file beside it.
+        poses: of its pictures, with what lies beside it; None for what the file itself holds.
         every_m: spacing in metres.
         every_s: spacing in seconds.
         progress: called with pictures decoded and their number.
@@ -182,7 +181,7 @@ def extract(
         OSError: a picture cannot be written.
     """
     found = found or scan(path)
-    poses = Poses(found, subtitles)
+    poses = poses or Poses(found)
     result = Extraction()
     folder = cache / name.replace("/", "__")
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from telemetry.discover import Discovery, Folder, discover, natural_key
 from telemetry.findings import Finding, plural
 from telemetry.photos import Angles, PhotoTags, read_photos
 from telemetry.sample import Sample
+
+if TYPE_CHECKING:
+    from telemetry.ingest_logs import LogSource
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
@@ -115,12 +119,14 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
     """The same as `load`, source by source, for `inspect`."""
+    from telemetry.ingest_logs import read_logs
     from telemetry.ingest_video import read_videos
 
     options = options or LoadOptions()
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(found.root, found)
     tables = _tables(found, result)
+    logs = read_logs(found, result)
     total = sum(len(folder.pictures) for folder in found.folders)
     done = 0
 
@@ -132,9 +138,9 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
 
     for folder in found.folders:
         if folder.pictures:
-            _photo_folder(folder, found, tables, options, advance, result)
+            _photo_folder(folder, found, tables, logs, options, advance, result)
         if folder.videos or folder.subtitles:
-            read_videos(folder, found, options, progress, result)
+            read_videos(folder, found, logs, options, progress, result)
     _check_vehicles(result)
     return result
 
@@ -161,11 +167,14 @@ def _photo_folder(
     folder: Folder,
     found: Discovery,
     tables: Sequence[tuple[Path, str, posetable.PoseTable]],
+    logs: "Sequence[LogSource]",
     options: LoadOptions,
     advance: Callable[[int], None],
     result: Survey,
 ) -> None:
     """Read one folder's photos into one source."""
+    from telemetry.ingest_logs import add_logs
+
     name = found.name(folder.path)
     source = SourceInfo(folder.path.name if name == "." else name, "photos")
     groups: dict[str, list[PhotoTags]] = {}
@@ -181,19 +190,29 @@ def _photo_folder(
             result.rejected.append(Rejection(name, str(photo), folder.vehicle))
             continue
         vehicle = _merge_tables(photo, path, tables) or folder.vehicle
-        if photo.lat_deg is None or photo.lon_deg is None:
-            reason = "the picture has no position; put a geo.txt or a log beside it"
-            result.rejected.append(Rejection(name, reason, vehicle, photo.time_s))
-            continue
         groups.setdefault(vehicle, []).append(photo)
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
+        add_logs(photos, folder.path, vehicle, logs, source.findings)
+        photos = sorted(_with_position(photos, vehicle, found, result), key=_photo_key)
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
         source.findings += flight_findings(photos, frames, vehicle)
     source.counts["frames"] = len(source.frames)
     if seen:
         result.sources.append(source)
+
+
+def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+    """Those that have a position; the others are rejected."""
+    placed = []
+    for photo in photos:
+        if photo.lat_deg is not None and photo.lon_deg is not None:
+            placed.append(photo)
+        else:
+            reason = "the picture has no position; put a geo.txt or a log beside it"
+            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
+    return placed
 
 
 def _photo_key(photo: PhotoTags) -> tuple[object, ...]:

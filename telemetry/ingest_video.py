@@ -3,6 +3,7 @@
 import hashlib
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +15,22 @@ from telemetry.findings import Finding
 from telemetry.poses import Poses
 from telemetry.sample import Sample
 from telemetry.video import NotAVideo, VideoScan, scan
+from telemetry.videolog import add_log
 
 if TYPE_CHECKING:
     from telemetry.ingest import LoadOptions, Progress, SourceInfo, Survey
+    from telemetry.ingest_logs import LogSource
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT or a log beside it"
 
 
 def read_videos(
-    folder: Folder, found: Discovery, options: "LoadOptions", progress: "Progress | None", result: "Survey"
+    folder: Folder,
+    found: Discovery,
+    logs: "Sequence[LogSource]",
+    options: "LoadOptions",
+    progress: "Progress | None",
+    result: "Survey",
 ) -> None:
     """Read the videos of a folder, each with the SRT of its name; SRT files without a video are named only."""
     from telemetry.ingest import SourceInfo
@@ -40,10 +48,14 @@ def read_videos(
         source.counts["sei"] = scanned.sei_count
         source.counts["klv"] = len(scanned.klv_packets)
         result.sources.append(source)
+        poses = Poses(scanned, srt.read_srt(subtitles) if subtitles is not None else None)
+        near = [entry for entry in logs if folder.path.is_relative_to(entry.folder)]
+        if near and not (poses.has_positions and poses.has_angles):
+            poses.findings += add_log(poses, scanned, near)
         if options.decode:
-            _take(path, name, scanned, subtitles, options, progress, source, result)
+            _take(path, name, scanned, poses, options, progress, source, result)
         else:
-            _look(path, scanned, subtitles, source)
+            _look(path, scanned, poses, source)
     for path in beside.values():
         _lone_subtitles(path, found.name(path), result)
 
@@ -58,7 +70,7 @@ def _take(
     path: Path,
     name: str,
     scanned: VideoScan,
-    subtitles: Path | None,
+    poses: Poses,
     options: "LoadOptions",
     progress: "Progress | None",
     source: "SourceInfo",
@@ -67,15 +79,14 @@ def _take(
     """Take pictures and make frames of them."""
     from telemetry.ingest import frames_of
 
-    cues = srt.read_srt(subtitles) if subtitles is not None else None
-    if not Poses(scanned, cues).has_positions:
+    if not poses.has_positions:
         result.rejected.append(Rejection(name, NO_POSITION, path.stem))
         return
     taken = extract(
         path,
         name,
         options.cache or cache_folder(result.root),
-        subtitles=cues,
+        poses=poses,
         every_m=options.every_m,
         every_s=options.every_s,
         progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
@@ -87,10 +98,8 @@ def _take(
         source.shown[vehicle] = len(photos)
 
 
-def _look(path: Path, scanned: VideoScan, subtitles: Path | None, source: "SourceInfo") -> None:
+def _look(path: Path, scanned: VideoScan, poses: Poses, source: "SourceInfo") -> None:
     """Only the metadata: the poses of all pictures, by vehicle."""
-    cues = srt.read_srt(subtitles) if subtitles is not None else None
-    poses = Poses(scanned, cues)
     source.findings += poses.findings
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
     vehicle = path.stem

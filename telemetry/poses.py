@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from telemetry import srt
 from telemetry.findings import Finding, plural
+from telemetry.mavposes import fixed_camera
 from telemetry.sample import Sample
 from telemetry.timeline import Timeline
 from telemetry.video import VideoScan
@@ -114,6 +115,43 @@ class Poses:
             or any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
             or any(sample.has_position for _, sample in self._djmd)
         )
+
+    @property
+    def has_angles(self) -> bool:
+        """Whether any source of this video knows a camera's yaw."""
+        return (
+            any(sample.yaw_deg is not None for _, samples in self._interpolated for sample in samples)
+            or any(note.sample is not None and note.sample.yaw_deg is not None for note in self._scan.pictures)
+            or any(sample.yaw_deg is not None for _, sample in self._djmd)
+        )
+
+    def add_track(self, name: str, timeline: Timeline, offset_s: float, *, has_gimbal: bool) -> int:
+        """Add a vehicle's log as a source, behind all others; returns how many pictures it places.
+
+        Args:
+            name: origin of its fields.
+            timeline: the vehicle's poses over UTC.
+            offset_s: video time minus UTC.
+            has_gimbal: False where the camera is taken as fixed under the airframe.
+        """
+        samples = timeline.at_all(self._times - offset_s)
+        if not has_gimbal:
+            samples = [fixed_camera(sample) for sample in samples]
+        for sample in samples:
+            if sample.time_s != sample.time_s:
+                sample.time_s = None
+        self._interpolated.append((name, samples))
+        return sum(sample.has_position for sample in samples)
+
+    def track(self) -> tuple[Array, Array]:
+        """Video times (N,) and positions (N, 2), latitude and longitude in degrees, of pictures that have one."""
+        rows = [
+            (t, pose.sample.lat_deg, pose.sample.lon_deg)
+            for i, t in enumerate(self._times.tolist())
+            if t == t and (pose := self.of(i)) is not None and pose.sample.has_position
+        ]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return table[:, 0], table[:, 1:]
 
     def _time(self, index: int) -> float:
         """Video time of a packet's picture; NaN where it is not known."""

@@ -18,6 +18,8 @@ ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_de
 LINEAR = ("lat_deg", "height_m", "altitude_m", "fov_deg", "sigma_m")
 _WRAPPED = (*ANGLES, "lon_deg")
 FIELDS = (*LINEAR, *_WRAPPED)
+GROUND = "ground_m"
+"""Name of the series of heights above the ground below."""
 
 
 class Timeline:
@@ -30,10 +32,12 @@ class Timeline:
     def __init__(self, samples: Iterable[Sample], *, max_gap_s: float = 2.0) -> None:
         self.max_gap_s = max_gap_s
         rows = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
-        self._series = {name: _series(rows, name) for name in FIELDS}
+        self._series = {name: _series(rows, name) for name in FIELDS if name != "height_m"}
+        # Heights above takeoff and above the ground are two things, even where both are recorded.
+        self._series["height_m"] = _series([s for s in rows if not s.height_is_ground], "height_m")
+        self._series[GROUND] = _series([s for s in rows if s.height_is_ground], "height_m")
         self._times = np.array([s.time_s for s in rows], dtype=np.float64)
         self._vehicle = next((s.vehicle for s in rows if s.vehicle), None)
-        self._ground = [s.height_is_ground for s in rows if s.height_m is not None]
 
     def __len__(self) -> int:
         return len(self._times)
@@ -68,13 +72,15 @@ class Timeline:
         """The poses at many moments at once."""
         moments = np.asarray(times, dtype=np.float64)
         columns = [(name, self.values(name, moments).tolist()) for name in FIELDS if len(self._series[name][0])]
-        ground = bool(self._ground) and sum(self._ground) * 2 > len(self._ground)
+        ground = self.values(GROUND, moments).tolist()
         result = []
         for i, moment in enumerate(moments.tolist()):
-            sample = Sample(time_s=moment, vehicle=self._vehicle, height_is_ground=ground)
+            sample = Sample(time_s=moment, vehicle=self._vehicle)
             for name, column in columns:
                 if column[i] == column[i]:
                     setattr(sample, name, column[i])
+            if ground[i] == ground[i]:
+                sample.height_m, sample.height_is_ground = ground[i], True
             if sample.lat_deg is None or sample.lon_deg is None:
                 sample.lat_deg = sample.lon_deg = None
             result.append(sample)
