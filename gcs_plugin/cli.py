@@ -10,6 +10,7 @@ from orthoswarm.errors import OrthoSwarmError
 
 # verb -> one line of help; the module is gcs_plugin.commands.<verb>, with configure(parser) and run(args) -> int.
 VERBS = {
+    "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "inspect": "say what photos, videos and logs hold and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",

@@ -248,7 +248,7 @@ def _separation_text(slots: list[list[Slot]], altitude_m: float, apart: Separati
         )
     if any(layers):
         top = altitude_m + max(layers) * apart.height_m
-        text += f"; {sum(map(bool, layers))} sorties fly out or home higher than the lines, up to {top:g} m"
+        text += f"; ways out or home higher than the lines, up to {top:g} m: {sum(map(bool, layers))}"
     if any(delays):
-        text += f"; {sum(map(bool, delays))} vehicles take off later than the first, up to {max(delays):g} s"
+        text += f"; takeoffs later than the first, up to {max(delays):g} s: {sum(map(bool, delays))}"
     return text
