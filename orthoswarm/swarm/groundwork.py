@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.swarm.flight import Flight
-from orthoswarm.swarm.ground import GroundModel, ground_points
+from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.lift import draw_positions, ground_lift
-from orthoswarm.swarm.locus import LARGE, SMALL, dense_ground
+from orthoswarm.swarm.locus import dense_ground
 
 Array = NDArray[np.float64]
 
@@ -16,29 +16,32 @@ CELL_M = 14.0
 USUAL_HEIGHT_M = 150.0
 
 
-def with_lift(flight: Flight, surface: GroundModel) -> GroundModel:
-    """The surface with the level of the ground between its points."""
+def refit(flight: Flight, surface: GroundModel) -> GroundModel:
+    """The ground fitted to the points now and to heights at free positions between them.
+
+    Corners sit on raised things; small patches at free positions tell the ground itself, so that what is left over
+    (the lift) is small.
+    """
     if surface.fit is None:
-        return surface
+        surface = fit_surface(flight.adjustment, surface)
+        if surface.fit is None:
+            return surface
     rig = flight.rig()
-    height = float(np.median(rig.position[:, 2]))
-    positions = draw_positions(rig.position[:, :2], spread_m=45.0 * height / USUAL_HEIGHT_M)
-    bare = replace(surface, lift_m=0.0)
-    lift = ground_lift(rig, flight.pictures.gray, positions, bare.terrain(), flight.leg)
-    return replace(surface, lift_m=lift.lift_m)
+    positions = draw_positions(rig.position[:, :2], spread_m=100.0 * _height(flight, surface) / USUAL_HEIGHT_M)
+    gray = flight.pictures.gray
+    free = ground_lift(rig, gray, positions, surface.terrain(), flight.leg).points
+    surface = replace(surface, lift_m=0.0)
+    return fit_surface(flight.adjustment, surface, extra=(free.points, free.sigma_z))
 
 
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array]:
-    """Ground points (K, 3) and their sigmas in the cells that no track holds."""
+    """Ground points (K, 3) and their sigmas, one in each cell that shows its height."""
     rig = flight.rig()
-    height = float(np.median(rig.position[:, 2] - surface.level_m))
-    cell = CELL_M * height / USUAL_HEIGHT_M
-    known, _ = ground_points(flight.adjustment)
-    cells = _empty_cells(rig.position[:, :2], known[:, :2], cell, _half_width(flight))
+    cell = CELL_M * _height(flight, surface) / USUAL_HEIGHT_M
+    cells = _cells(rig.position[:, :2], cell, _half_width(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0)
-    sweeps = (SMALL.at_height(height), LARGE.at_height(height))
-    found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg, sweeps)
+    found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg)
     return found.points, found.sigma_z
 
 
@@ -48,8 +51,8 @@ def _half_width(flight: Flight) -> float:
     return float(0.5 * flight.pictures.size[0] / rig.lens[0, 0] * np.median(rig.position[:, 2]))
 
 
-def _empty_cells(path: Array, known: Array, cell_m: float, reach_m: float) -> Array:
-    """Centres of the cells within reach of the path that hold no point."""
+def _cells(path: Array, cell_m: float, reach_m: float) -> Array:
+    """Centres of the cells within reach of the path."""
     low = np.floor((path.min(0) - reach_m) / cell_m).astype(int)
     high = np.ceil((path.max(0) + reach_m) / cell_m).astype(int)
     if (high - low).prod() > 400_000:
@@ -59,7 +62,9 @@ def _empty_cells(path: Array, known: Array, cell_m: float, reach_m: float) -> Ar
     at = np.floor(path / cell_m).astype(int) - low
     for i, j in np.unique(at, axis=0):
         near[max(0, i - k) : i + k + 1, max(0, j - k) : j + k + 1] = True
-    own = np.floor(known / cell_m).astype(int) - low
-    inside = ((own >= 0) & (own < near.shape)).all(1)
-    near[own[inside, 0], own[inside, 1]] = False
     return np.asarray((np.argwhere(near) + low + 0.5) * cell_m)
+
+
+def _height(flight: Flight, surface: GroundModel) -> float:
+    """Flying height above the ground, metres."""
+    return max(1.0, float(np.median(flight.rig().position[:, 2])) - surface.level_m)

@@ -29,6 +29,8 @@ from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
+from orthoswarm.swarm.units import merge_units, split_units
+from orthoswarm.swarm.weak import steady_weak
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -151,6 +153,47 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
     watch.lap("sigma")
 
 
+@dataclass(frozen=True, slots=True)
+class SwarmRefiner:
+    """One vehicle as soon as it completes (placement.Refiner): solo, then again with its neighbours held.
+
+    Attributes:
+        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area. options: see Options.
+    """
+
+    epsg: int
+    origin: Array
+    options: Options = Options()
+
+    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place one vehicle's frames; neighbours (earlier results of this refiner) are held as they are.
+
+        Raises:
+            OrthoSwarmError: if nothing can be made of the frames.
+        """
+        parts = split_units({frames[0].vehicle: frames} if frames else {})
+        if not parts:
+            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+        own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
+        others = [state for n in neighbours for state in states_of(n)]
+        everyone = [*own, *others]
+        network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
+        anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
+        lean = pooled_lean(everyone)
+        done = []
+        for state, correction in zip(own, network.correction_m, strict=False):
+            item = (state, neighbours_of(state, everyone), float(correction) - anchor)
+            done.append(second_pass(item, basemap=basemap, origin=self.origin, lean=lean))
+        terrain = _shifted(common_terrain([*done, *others]), self.origin)
+        return merge_units([to_solution(s, self.origin, terrain) for s in done])[0]
+
+
+def states_of(solution: Solution) -> list[VehicleState]:
+    """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
+    state = solution.state
+    return [] if state is None else list(state) if isinstance(state, list) else [state]
+
+
 def refine_all(
     vehicles: Mapping[str, Sequence[Frame]],
     basemap: MapWindow | None,
@@ -173,14 +216,16 @@ def refine_all(
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
     task = partial(solo, epsg=grid.epsg, origin=origin, basemap=basemap, options=options or Options())
     states = []
-    for n, state in enumerate(run(task, list(vehicles.values()))):
+    units = split_units(vehicles)
+    for n, state in enumerate(run(task, units)):
         states.append(state)
         if progress:
-            progress("solo", n + 1, len(vehicles))
+            progress("solo", n + 1, len(units))
     coarse = [to_solution(s, origin, None, coarse=True) for s in states]
     states = _second_passes(states, basemap, origin, run, progress)
-    terrain = common_terrain(states)
-    return Refined(coarse, [to_solution(s, origin, terrain) for s in states], _shifted(terrain, origin))
+    terrain = _shifted(common_terrain(states), origin)
+    fine = [to_solution(s, origin, terrain) for s in states]
+    return Refined(merge_units(coarse), merge_units(fine), terrain)
 
 
 def _second_passes(
@@ -264,6 +309,8 @@ def second_pass(
     sigma, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, 0.05)
     state.sigma_m = sigma[: len(flight.frames)]
     release(flight)
+    if not flight.sparse:
+        steady_weak(flight, state.sigma_m)
     watch.lap("sigma")
     state.dense = dense_points(flight, state.surface)
     watch.lap("denser terrain")

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Adjustment, Ties
 from orthoswarm.swarm.flight import Flight
-from orthoswarm.swarm.ground import GroundModel, fit_surface
-from orthoswarm.swarm.groundwork import with_lift
+from orthoswarm.swarm.ground import GroundModel
+from orthoswarm.swarm.groundwork import refit
 from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.onmap import shift_cameras
 from orthoswarm.swarm.rig import Tracks
@@ -159,7 +159,7 @@ def settle(
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
         if k in (1, 3):
-            surface = with_lift(flight, fit_surface(flight.adjustment, surface))
+            surface = refit(flight, surface)
     roofs = roof_round(flight, surface, ground)
     ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
     voted = vote_lean(roofs[0], roofs[1], ground_shift) if lean is None else lean
@@ -187,7 +187,7 @@ def _second_round(
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
         if k % 2 == 0:
-            surface = with_lift(flight, fit_surface(flight.adjustment, surface))
+            surface = refit(flight, surface)
     return surface, ties, matches
 
 

@@ -13,10 +13,11 @@ from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.ground import GroundModel
 from orthoswarm.swarm.rig import CX, CY, WIDTH, F, Rig
 from orthoswarm.swarm.ties import MapMatches
+from orthoswarm.swarm.weak import ENOUGH, observations_per_camera
 
 Array = NDArray[np.float64]
 
-ENOUGH_OBSERVATIONS = 8
+FEWEST_SPARSE = 12
 LEG_TIES = 3
 
 
@@ -65,12 +66,6 @@ class Stopwatch:
         self._last = now
 
 
-def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
-    """Well fitting observations of each camera: int64 (N,)."""
-    adj = flight.adjustment
-    return np.bincount(adj.tracks.camera[adj.obs_weight > 0.3], minlength=len(adj.rig))
-
-
 def to_solution(state: VehicleState, origin: Array, terrain: Terrain | None, *, coarse: bool = False) -> Solution:
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
@@ -78,7 +73,7 @@ def to_solution(state: VehicleState, origin: Array, terrain: Terrain | None, *, 
     stage: Stage = "coarse" if coarse or not state.on_map else "fine"
     rig = full_resolution(rig, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
-    weak = observations_per_camera(flight) < ENOUGH_OBSERVATIONS
+    weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else ENOUGH)
     placed = [
         PlacedFrame(frame, rig.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
         for i, frame in enumerate(flight.frames)

@@ -1,0 +1,50 @@
+"""Pictures that too few observations hold (water, haze, blur): placed between their neighbours (RECIPE.md step 10)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.swarm.flight import Flight
+
+Array = NDArray[np.float64]
+
+ENOUGH = 8
+FARTHEST = 40
+
+
+def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
+    """Well fitting observations of each of the vehicle's cameras: int64 (N,)."""
+    adj = flight.adjustment
+    n = len(flight.frames)
+    good = (adj.obs_weight > 0.3) & (adj.tracks.camera < n)
+    return np.bincount(adj.tracks.camera[good], minlength=n)
+
+
+def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
+    """Interpolate weakly held cameras from strong ones before and after, in place; returns which they are.
+
+    Positions follow the record's own shape where it agrees with its neighbours, else a straight line in time; the
+    attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance.
+    """
+    adj = flight.adjustment
+    n = len(flight.frames)
+    weak = observations_per_camera(flight) < ENOUGH
+    strong = np.flatnonzero(~weak)
+    if len(strong) < 2:
+        return weak
+    time = flight.records.time_s
+    recorded = adj.priors.position[:n]
+    for i in np.flatnonzero(weak):
+        k = int(np.searchsorted(strong, i))
+        a, b = strong[max(k - 1, 0)], strong[min(k, len(strong) - 1)]
+        t = 0.5 if time[b] == time[a] else float(np.clip((time[i] - time[a]) / (time[b] - time[a]), 0.0, 1.0))
+        straight = adj.rig.position[a] * (1 - t) + adj.rig.position[b] * t
+        offset = (adj.rig.position[a] - recorded[a]) * (1 - t) + (adj.rig.position[b] - recorded[b]) * t
+        follows = recorded[i] + offset
+        gap = float(np.hypot(*(follows - straight)[:2]))
+        step = float(np.hypot(*(adj.rig.position[b] - adj.rig.position[a])[:2]))
+        adj.rig.position[i] = follows if gap < max(4.0, 0.3 * step) else straight
+        near = a if i - a <= b - i else b
+        turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
+        adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
+        sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST))
+    return weak
