@@ -34,12 +34,15 @@ Handler = Callable[[Vehicle, Message, float], None]
 
 _LOST_S: Final = 5.0
 _TICK_S: Final = 0.25
-_BATCH_S: Final = 0.005
+_BATCH_S: Final = 0.02
 _IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 _HEARTBEAT, _ACK, _TEXT = _IDS["HEARTBEAT"], _IDS["COMMAND_ACK"], _IDS["STATUSTEXT"]
 _DETECTED: Final = frozenset(_IDS[name] for name in RELEVANT)
 _REQUESTS: Final = frozenset({_IDS["MISSION_REQUEST"], _IDS["MISSION_REQUEST_INT"]})
-_BOOT_CLOCKS: Final = frozenset({_IDS["GLOBAL_POSITION_INT"], _IDS["ATTITUDE"], _IDS["SYSTEM_TIME"]})
+_BOOT_CLOCKS: Final = frozenset({_IDS["GLOBAL_POSITION_INT"], _IDS["SYSTEM_TIME"]})
+# What a late packet of these says has been said better since.
+_STATES: Final = frozenset({_HEARTBEAT, _IDS["MISSION_CURRENT"], _IDS["EXTENDED_SYS_STATE"]})
+_OVERTAKEN: Final = 64
 _PHOTOS: Final = frozenset({_IDS["CAMERA_FEEDBACK"], _IDS["CAMERA_IMAGE_CAPTURED"]})
 _WORDS: Final = {
     MissionEvent.STARTED: "has started its mission",
@@ -289,24 +292,31 @@ class Fleet:
             vehicle = self._found(packet, now)
             if vehicle is None:
                 return
-        counter = (peer, packet.system, packet.component)
-        last = self._counters.get(counter)
-        if last is not None:
-            gap = (packet.seq - last - 1) & 0xFF
-            vehicle.missed += gap if gap < 128 else 0
-        self._counters[counter] = packet.seq
-        vehicle.received += 1
+        late = self._count(vehicle, peer, packet, now)
         vehicle.heard = now
         kind = packet.kind
         if packet.component == vehicle.address.component:
-            self._autopilot_says(vehicle, side, peer, kind, packet.message, now)
+            self._autopilot_says(vehicle, side, peer, kind, packet.message, now, late and kind in _STATES)
         elif kind in _PHOTOS:
             vehicle.update(packet.message)
         for handler in self._handlers.get(kind, ()):
             handler(vehicle, packet.message, utc)
 
+    def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> bool:
+        """Keep the books of a sender's packet counter; True for a packet that others have overtaken, or a copy."""
+        counter = (peer, packet.system, packet.component)
+        last = self._counters.get(counter)
+        vehicle.received += 1
+        if last is not None:
+            gap = (packet.seq - last - 1) & 0xFF
+            if gap >= 256 - _OVERTAKEN and now - vehicle.heard < 1.0:
+                return True
+            vehicle.missed += gap if gap < 128 else 0
+        self._counters[counter] = packet.seq
+        return False
+
     def _autopilot_says(
-        self, vehicle: Vehicle, side: Side, peer: Peer, kind: int, message: Message, now: float
+        self, vehicle: Vehicle, side: Side, peer: Peer, kind: int, message: Message, now: float, stale: bool
     ) -> None:
         route = vehicle.routes.get((side, peer))
         if route is None:
@@ -319,8 +329,10 @@ class Fleet:
                 vehicle.lost = False
                 self._event("regained", vehicle, "is heard again")
             self._send(vehicle.system, vehicle.streams.start(now))
-        vehicle.update(message)
         vehicle.streams.seen(kind, now)
+        if stale:
+            return
+        vehicle.update(message)
         if kind in _BOOT_CLOCKS:
             self._watch_clock(vehicle, route, message.time_boot_ms / 1e3, now)
         elif kind == _ACK:
@@ -387,9 +399,18 @@ class Fleet:
                 vehicle.lost = True
                 self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
             if len(vehicle.routes) > 1:
-                boots = [r.boot for r in vehicle.routes.values() if r.boot is not None and now - r.boot_at < 1.5]
-                if boots and max(boots) - min(boots) > 3.0:
-                    self._twins(vehicle)
+                self._compare_routes(vehicle, now)
+
+    def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
+        """Is it one vehicle on two links, or two vehicles with one system id? Their clocks tell."""
+        fresh = [route for route in vehicle.routes.values() if now - route.heard < 2.0]
+        boots = [route.boot for route in fresh if route.boot is not None and now - route.boot_at < 1.5]
+        if boots and max(boots) - min(boots) > 3.0:
+            self._twins(vehicle)
+        for route in fresh:
+            if route is not vehicle.route and now - route.boot_at > 1.5 and now - route.asked_at > 3.0:
+                route.asked_at = now
+                self.hub.send(route.side, route.peer, vehicle.streams.ask_clock())
 
     def _reap(self) -> None:
         """Take out the dialogues that have ended, and remember what they have shown."""

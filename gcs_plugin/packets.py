@@ -6,8 +6,9 @@ CRC-16/MCRF4XX, which is CRC-16/CCITT on mirrored bits, and that one is in the s
 """
 
 import binascii
+import operator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gcs_plugin.mavlink import Message, dialect
 
@@ -51,8 +52,34 @@ class Packet:
     def message(self) -> Message:
         """The decoded message."""
         if self._message is None:
-            self._message = _DECODER.decode(bytearray(self.raw))
+            maker = _MAKERS.get(self.kind)
+            self._message = _DECODER.decode(bytearray(self.raw)) if maker is None else _make(self, *maker)
         return self._message
+
+
+def _make(packet: Packet, kind: Any, size: int, order: Any) -> Message:
+    """Decode a message of plain numbers: what pymavlink does in twice the time, because it checks once more."""
+    raw = packet.raw
+    start = 10 if raw[0] == V2_MARKER else 6
+    payload = raw[start : start + min(size, raw[1])]
+    if len(payload) < size:  # trailing zeros are not sent
+        payload += bytes(size - len(payload))
+    message = kind(*order(kind.unpacker.unpack(payload)))
+    header = message.get_header()
+    header.mlen, header.seq, header.srcSystem, header.srcComponent = raw[1], packet.seq, packet.system, packet.component
+    return message
+
+
+def _makers() -> dict[int, tuple[Any, int, Any]]:
+    """Classes, sizes and field orders of the messages without arrays and texts."""
+    plain = {}
+    for number, kind in dialect.mavlink_map.items():
+        if len(kind.orders) > 1 and all(length == 1 for length in kind.lengths) and "char" not in kind.fieldtypes:
+            plain[number] = (kind, kind.unpacker.size, operator.itemgetter(*kind.orders))
+    return plain
+
+
+_MAKERS: Final = _makers()
 
 
 @dataclass(slots=True)

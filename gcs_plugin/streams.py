@@ -123,6 +123,11 @@ class Streams:
         self._look(now)
         return self._next(now)
 
+    def ask_clock(self) -> Message:
+        """A question for the vehicle's clock, once a second, for a link beside the one that is used."""
+        kind, to = float(dialect.MAVLINK_MSG_ID_SYSTEM_TIME), self.vehicle
+        return dialect.MAVLink_command_long_message(to.system, to.component, _COMMAND, 0, kind, 1e6, 0, 0, 0, 0, 0)
+
     def _next(self, now: float) -> list[Message]:
         self._tries = 0
         self._asking = self._queue.pop(0) if self._queue else None

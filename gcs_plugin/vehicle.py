@@ -54,7 +54,7 @@ class Route:
         side: the link; peer: the sender on it.
         heard: when something came last (the fleet's clock).
         boot: the vehicle's start on that clock, from its own counter; None before the first position.
-        boot_at: when that was computed.
+        boot_at: when that was computed; asked_at: when its clock was asked for.
         clock: watches the counter.
     """
 
@@ -63,6 +63,7 @@ class Route:
     heard: float
     boot: float | None = None
     boot_at: float = 0.0
+    asked_at: float = 0.0
     clock: BootClock = field(default_factory=BootClock)
 
 

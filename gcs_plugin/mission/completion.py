@@ -79,6 +79,7 @@ class CompletionDetector:
     _has_state: bool | None = None
     _landed: int | None = None
     _airborne: bool = False
+    _beats: int = 0
     _landing_seen: bool = False
     _reached: int = -1
     _dropped: bool = False
@@ -207,8 +208,9 @@ class CompletionDetector:
         mode = int(message.custom_mode)
         self._mission_mode = mode == (_ARDUCOPTER_AUTO if self.autopilot is Autopilot.ARDUPILOT else _PX4_AUTO_MISSION)
         events: list[MissionEvent] = []
-        if self.armed and was is False:
-            if self._waiting:  # how the last flight ended was never heard
+        self._beats = self._beats + 1 if self.armed else 0
+        if self._beats == 2:  # armed again; a single heartbeat may be a late one of the flight before
+            if self._waiting:  # how that ended was never heard
                 events += self._abort()
             if self.phase in (Phase.COMPLETE, Phase.ABORTED):
                 self._restart(hot=False)
