@@ -6,15 +6,18 @@ Cheap enough for a hundred vehicles: a message costs a few microseconds, memory 
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from telemetry.mavposes import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.sample import Sample
 
-_POSITION = ("lat_deg", "lon_deg", "altitude_m", "height_m")
+_POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
 _FLIGHT = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 _CAMERA = ("yaw_deg", "pitch_deg", "roll_deg")
 _HELD_S = 0.3
+_ACCURATE_M = 0.5
+_ACCURATE_FOR_S = 2.0
 _TURNS = frozenset({"lon_deg", *_FLIGHT, *_CAMERA})
 
 
@@ -96,7 +99,9 @@ class LivePoses:
         self._position = _Series(_POSITION, keep_s)
         self._flight = _Series(_FLIGHT, keep_s)
         self._camera = _Series(_CAMERA, keep_s)
+        self._height = _Series(("height_m",), keep_s)
         self._ground = _Series(("height_m",), keep_s)
+        self._accurate_s = float("-inf")
 
     def feed(self, message: Any, arrival_s: float | None = None) -> CameraEvent | None:
         """Take a MAVLink message of this vehicle; returns the camera event if it is one, with its pose complete.
@@ -120,20 +125,29 @@ class LivePoses:
 
     def add(self, sample: Sample) -> None:
         """Take a sample from any source (its time UTC)."""
-        if sample.time_s is None:
+        time_s = sample.time_s
+        if time_s is None:
             return
-        if sample.has_position:
-            values = (sample.lat_deg, sample.lon_deg, sample.altitude_m)
-            height = None if sample.height_is_ground else sample.height_m
-            self._position.add(sample.time_s, (*values, height))
-        if sample.height_is_ground and sample.height_m is not None:
-            self._ground.add(sample.time_s, (sample.height_m,))
+        if sample.has_position and not self._is_outdone(sample):
+            self._position.add(time_s, (sample.lat_deg, sample.lon_deg, sample.altitude_m, sample.sigma_m))
+        elif sample.has_position:
+            sample = replace(sample, lat_deg=None, lon_deg=None, altitude_m=None, sigma_m=None)
+        if sample.height_m is not None:
+            (self._ground if sample.height_is_ground else self._height).add(time_s, (sample.height_m,))
         if sample.flight_yaw_deg is not None:
-            self._flight.add(sample.time_s, (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg))
+            self._flight.add(time_s, (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg))
         if sample.yaw_deg is not None:
-            self._camera.add(sample.time_s, (sample.yaw_deg, sample.pitch_deg, sample.roll_deg))
+            self._camera.add(time_s, (sample.yaw_deg, sample.pitch_deg, sample.roll_deg))
         self.latest = sample.merge(self.latest)
         self.latest.vehicle = self.vehicle
+
+    def _is_outdone(self, sample: Sample) -> bool:
+        """Whether a better receiver (RTK on the bus) tells the position at this time already."""
+        time_s = sample.time_s or 0.0
+        if sample.sigma_m is not None and sample.sigma_m <= _ACCURATE_M:
+            self._accurate_s = time_s
+            return False
+        return abs(time_s - self._accurate_s) < _ACCURATE_FOR_S
 
     def at(self, time_s: float) -> Sample:
         """The pose at a moment (UTC), interpolated; fields are None where they are not known then.
@@ -141,7 +155,7 @@ class LivePoses:
         A camera whose own attitude is not reported is taken as fixed under the airframe.
         """
         sample = Sample(time_s=time_s, vehicle=self.vehicle)
-        for series in (self._position, self._flight, self._camera):
+        for series in (self._position, self._height, self._flight, self._camera):
             series.read(time_s, self._max_gap_s, sample)
         above = Sample()
         self._ground.read(time_s, self._max_gap_s, above)

@@ -48,6 +48,12 @@ def camera_angles_deg(forward_ned: Array) -> tuple[float, float, float]:
     return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
 
 
+def camera_frame_angles_deg(camera_ned: Array) -> tuple[float, float, float]:
+    """Our yaw, pitch, roll in degrees of a camera-to-NED rotation whose z is the optical axis, x right, y down."""
+    yaw, pitch, roll = angles_from_rotation(_NED_TO_ENU @ camera_ned)
+    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+
+
 def mounted_down_deg(body_ned: Array) -> tuple[float, float, float]:
     """Our yaw, pitch, roll in degrees of a camera fixed under an airframe, its picture's up towards the nose."""
     down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # optical axis = body z, picture up = body x
