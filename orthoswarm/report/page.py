@@ -17,7 +17,6 @@ from orthoswarm.products import write_text
 from orthoswarm.report import charts
 from orthoswarm.report.displacement import Displacements, displacements
 from orthoswarm.report.pictures import (
-    Bounds,
     MapView,
     Picture,
     data_uri,
@@ -73,6 +72,7 @@ def write_page(
     Raises:
         OrthoSwarmError: if the disk is full.
     """
+    import cv2
     import jinja2
 
     best = next((out / name for name, _, _ in reversed(_STAGES) if (out / name).exists()), None)
@@ -87,14 +87,14 @@ def write_page(
     }
     moved = None
     if best is not None:
-        bounds = product_bounds(best)
-        there = None
-        if basemap is not None:
-            least = max(float(report["gsd_m"]), basemap.native_gsd_m, 0.25)
-            there = MapView.read(basemap, view_grid(report["epsg"], bounds, 2600, least))
-            moved = _against_map(best, there)
-        values |= _pictures(out, best, bounds, report, placed, there, moved)
-        values["edges"] = _edge_crops(best, there, basemap) if basemap is not None and there is not None else []
+        least = max(float(report["gsd_m"]), basemap.native_gsd_m if basemap else 0.0)
+        ortho = product_picture(best, view_grid(report["epsg"], product_bounds(best), 2000, least))
+        there = None if basemap is None else MapView.read(basemap, ortho.grid)
+        if basemap is not None and there is not None:
+            gray = cv2.cvtColor(ortho.rgb, cv2.COLOR_RGB2GRAY)
+            moved = displacements(gray, ortho.seen, there.gray, there.valid, there.grid)
+            values["edges"] = _edge_crops(best, ortho, there, basemap)
+        values |= _pictures(out, ortho, report, placed, there, moved)
     values["verdict"] = _verdict(report, placed, moved)
     values["facts"] = _facts(report, placed, moved)
     values["fov"] = charts.fields_of_view(report["vehicles"])
@@ -105,20 +105,17 @@ def write_page(
 
 def _pictures(
     out: Path,
-    best: Path,
-    bounds: Bounds,
+    ortho: Picture,
     report: Mapping[str, Any],
     placed: Sequence[PlacedFrame],
     there: MapView | None,
     moved: Displacements | None,
 ) -> dict[str, Any]:
     """All figures, largest first."""
-    gsd = float(report["gsd_m"])
-    grid = view_grid(report["epsg"], bounds, 1400, gsd)
-    ortho = product_picture(best, grid)
-    small = view_grid(report["epsg"], bounds, 760, gsd)
-    reduced = product_picture(best, small)
-    main = ortho.copy()
+    epsg, step = ortho.grid.epsg, ortho.grid.gsd_m
+    main = ortho.on(view_grid(epsg, ortho.grid.bounds, 1400, step))
+    small = view_grid(epsg, ortho.grid.bounds, 760, step)
+    reduced = ortho.on(small)
     scale_bar(main)
     stages = []
     for name, title, text in _STAGES:
@@ -140,23 +137,14 @@ def _same_as_coarse(report: Mapping[str, Any]) -> bool:
 # -- figures ------------------------------------------------------------------------------------------------------
 
 
-def _against_map(best: Path, there: MapView) -> Displacements:
-    """Blocks of the orthoimage on the map."""
-    import cv2
-
-    picture = product_picture(best, there.grid)
-    gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY)
-    return displacements(gray, picture.seen, there.gray, there.valid, there.grid)
-
-
-def _edge_crops(best: Path, there: MapView, basemap: Basemap) -> list[Figure]:
+def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) -> list[Figure]:
     """Parts of the orthoimage with the map's edges over them, where the map has most of them."""
     import cv2
 
     epsg, side = there.grid.epsg, 360
     gsd = max(0.5 * there.grid.gsd_m, 0.5 * basemap.native_gsd_m, 0.1)
     overview = view_grid(epsg, there.grid.bounds, 400)
-    seen = product_picture(best, overview).seen.astype(np.float32)
+    seen = ortho.on(overview).seen.astype(np.float32)
     size = max(3, int(side * gsd / overview.gsd_m))
     edges = map_edges(there.on(overview)).astype(np.float32) * seen
     full = cv2.boxFilter(seen, -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9

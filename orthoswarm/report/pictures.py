@@ -40,6 +40,19 @@ class Picture:
         """One to draw on."""
         return Picture(self.rgb.copy(), self.seen, self.grid)
 
+    def on(self, grid: GroundGrid) -> "Picture":
+        """The same on another grid, as far as it reaches."""
+        bands, seen = _regrid(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)), self.seen, self.grid, grid)
+        return on_paper(np.ascontiguousarray(bands.transpose(1, 2, 0)), seen, grid)
+
+
+def _regrid(
+    bands: Bytes, valid: NDArray[np.bool_], old: GroundGrid, new: GroundGrid
+) -> tuple[Bytes, NDArray[np.bool_]]:
+    first = ((new.west - old.west) / old.gsd_m, (old.north - new.north) / old.gsd_m)
+    scale = new.gsd_m / old.gsd_m
+    return resample(bands, valid, first, (scale, scale), (new.width, new.height))
+
 
 def view_grid(epsg: int, bounds: Bounds, most_px: int, least_gsd_m: float = 0.0) -> GroundGrid:
     """A grid of at most so many pixels a side over bounds, no finer than a ground pixel."""
@@ -108,10 +121,7 @@ class MapView:
 
     def on(self, grid: GroundGrid) -> "MapView":
         """The same on another grid, as far as it reaches."""
-        step = self.grid.gsd_m
-        first = ((grid.west - self.grid.west) / step, (self.grid.north - grid.north) / step)
-        scale = grid.gsd_m / step
-        gray, valid = resample(self.gray[None], self.valid, first, (scale, scale), (grid.width, grid.height))
+        gray, valid = _regrid(self.gray[None], self.valid, self.grid, grid)
         return MapView(gray[0], valid, grid)
 
     def picture(self) -> Picture:
