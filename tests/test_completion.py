@@ -180,6 +180,20 @@ def test_the_end_of_a_landing_may_arrive_in_any_order(order):
     assert events == [MissionEvent.COMPLETE]
 
 
+def test_a_lost_disarming_after_a_landing_starts_nothing():
+    detector = CompletionDetector(AP)
+    detector.uploaded(mission(AP, *BODIES["land"]))
+    run(detector, [heartbeat(True), landed(2), current(3, ACTIVE), current(4, ACTIVE), landed(4)])
+    assert run(detector, [landed(1), *[current(1, ACTIVE)] * 5, heartbeat(False)]) == [MissionEvent.COMPLETE]
+
+
+@pytest.mark.parametrize("ending", ["rtl", "land"])
+def test_a_late_heartbeat_of_the_flight_starts_nothing(ending):
+    detector, _ = fly(AP, ending)
+    late = [heartbeat(True), current(4, ACTIVE), current(4, ACTIVE), heartbeat(False)]
+    assert run(detector, [*late, current(0 if ending == "rtl" else 1, COMPLETE if ending == "rtl" else ACTIVE)]) == []
+
+
 def test_a_mission_set_back_during_the_landing_has_not_completed():
     detector = CompletionDetector(AP)
     detector.uploaded(mission(AP, *BODIES["land"]))

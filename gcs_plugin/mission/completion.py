@@ -272,8 +272,9 @@ class CompletionDetector:
             self.phase = Phase.ACTIVE
             return [MissionEvent.RESUMED]
         # After an end in the air a mission counts as flown again only once it is back before its last item.
-        needed = self._proofs_needed if self.phase is Phase.IDLE else 2
-        self._proofs = 0 if self.phase is not Phase.IDLE and self._at_final else self._proofs + 1
+        ended = self.phase is not Phase.IDLE
+        needed = 2 if ended else self._proofs_needed
+        self._proofs = 0 if ended and (self._at_final or self._landed == _ON_GROUND) else self._proofs + 1
         if self._proofs < needed:
             return []
         self._restart(hot=False)
