@@ -4,13 +4,14 @@ Each record: A3 95, type, then the columns that the type's FMT record (type 128)
 RFND, TERR, GPS and AHR2 are read. Source: ArduPilot's AP_Logger documentation.
 """
 
+import mmap
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from telemetry.logs import FlightLog, NotALog, Row, each
+from telemetry.logs import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
 from telemetry.mavposes import CameraEvent
 from telemetry.sample import Sample, checked
 
@@ -22,6 +23,7 @@ _CODES = {
     "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "M": "B", "q": "q", "Q": "Q", "g": "e",
 }  # fmt: skip
 _SCALES = {"c": 1e-2, "C": 1e-2, "e": 1e-2, "E": 1e-2, "L": 1e-7}
+_EVENTS = frozenset({"CAM", "TRIG"})
 _WANTED = frozenset({"CAM", "TRIG", "POS", "ATT", "AHR2", "MNT", "RFND", "TERR", "GPS"})
 
 
@@ -36,7 +38,7 @@ class _Format:
         if self._struct.size != length - 3 or len(self._names) != len(codes):
             raise ValueError("the columns do not fill the record")
 
-    def read(self, data: bytes, at: int) -> Row:
+    def read(self, data: mmap.mmap, at: int) -> Row:
         values = self._struct.unpack_from(data, at + 3)
         return {
             name: value if scale is None else value * scale
@@ -50,8 +52,8 @@ def read_dataflash(path: Path) -> FlightLog:
     Raises:
         OSError: it cannot be read. NotALog: it is none.
     """
-    data = path.read_bytes()
-    rows = _rows(data)
+    with mapped(path) as data:
+        rows = _rows(data)
     if not rows:
         raise NotALog("the file holds no DataFlash record; it is no ArduPilot log")
     log = FlightLog(path, "DataFlash", path.stem)
@@ -66,7 +68,7 @@ def read_dataflash(path: Path) -> FlightLog:
     return log
 
 
-def _rows(data: bytes) -> dict[str, list[Row]]:
+def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
     """Records of the wanted types, in order of the file."""
     formats: dict[int, _Format | None] = {}
     lengths: dict[int, int] = {_FMT: _FMT_SIZE}
@@ -84,12 +86,14 @@ def _rows(data: bytes) -> dict[str, list[Row]]:
         else:
             form = formats.get(kind)
             if form is not None:
-                found.setdefault(form.name, []).append(form.read(data, at))
+                row, rows = form.read(data, at), found.setdefault(form.name, [])
+                if form.name in _EVENTS or not rows or not 0.0 <= _boot_s(row) - _boot_s(rows[-1]) < LEAST_STEP_S:
+                    rows.append(row)
         at += length
     return found
 
 
-def _learn(data: bytes, at: int, formats: dict[int, _Format | None], lengths: dict[int, int]) -> None:
+def _learn(data: mmap.mmap, at: int, formats: dict[int, _Format | None], lengths: dict[int, int]) -> None:
     kind, length, name, codes, columns = struct.unpack_from("<BB4s16s64s", data, at + 3)
     if length < 3 or kind == _FMT:
         return

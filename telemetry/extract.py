@@ -59,6 +59,7 @@ def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tupl
     from av.codec.context import Flags
 
     by_time = {round(note.video_s, 6): i for i, note in enumerate(found.pictures) if note.video_s is not None}
+    rank = _presentation_rank(found)
     with open_video(found.path) as container:
         stream = container.streams.video[0]
         start = stream.start_time or 0
@@ -80,8 +81,20 @@ def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tupl
                 own = frame.opaque if isinstance(frame.opaque, int) else None
                 if own is None and frame.pts is not None:
                     own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
+                if own is not None and rank is not None and own < len(rank):
+                    number = max(number, rank[own])  # pictures that were lost keep their numbers
                 yield number, own, frame
                 number += 1
+
+
+def _presentation_rank(found: VideoScan) -> list[int] | None:
+    """Number in order of presentation of each packet's picture; None where times are missing or repeated."""
+    times = [note.video_s for note in found.pictures]
+    known = [t for t in times if t is not None]
+    if len(set(known)) != len(times):
+        return None
+    place = {t: i for i, t in enumerate(sorted(known))}
+    return [place[t] for t in times if t is not None]
 
 
 def pictures(

@@ -23,6 +23,7 @@ from telemetry.container import NotAPicture
 from telemetry.course import courses_deg, local_metres, straight_legs
 from telemetry.discover import Discovery, Folder, discover, natural_key
 from telemetry.findings import Finding, plural
+from telemetry.order import in_order
 from telemetry.photos import Angles, PhotoTags, read_photos
 from telemetry.sample import Sample
 
@@ -33,6 +34,8 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
 
 _LEAST_HEIGHT_M = 1.0
+_BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
+"""Spectral bands by how well they show the ground; "" is a colour picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,13 +197,28 @@ def _photo_folder(
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
         add_logs(photos, folder.path, vehicle, logs, source.findings)
-        photos = sorted(_with_position(photos, vehicle, found, result), key=_photo_key)
+        photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
+        photos = in_order(photos, vehicle, source.findings)
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
         source.findings += flight_findings(photos, frames, vehicle)
     source.counts["frames"] = len(source.frames)
     if seen:
         result.sources.append(source)
+
+
+def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+    """Of a multispectral camera's pictures the colour ones, else those of one band; the others are rejected."""
+    bands = {photo.band for photo in photos}
+    if len(bands) < 2:
+        return list(photos)
+    kept = next((band for band in _BANDS if band in {b.lower() for b in bands}), min(bands).lower())
+    for photo in photos:
+        if photo.band.lower() != kept:
+            what = "the colour pictures" if not kept else f"band {kept}"
+            reason = f"a picture of one spectral band ({photo.band or 'colour'}); of each exposure {what} is mapped"
+            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
+    return [photo for photo in photos if photo.band.lower() == kept]
 
 
 def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:

@@ -5,8 +5,9 @@ truncation and damage: a bad record is skipped, the next good one found.
 """
 
 import contextlib
+import mmap
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,10 @@ from telemetry.timeline import Timeline
 
 Row = dict[str, Any]
 """One record of a binary log."""
+
+
+LEAST_STEP_S = 0.04
+"""Attitude and position are kept at 25 Hz at most: more adds nothing, and a long log would fill the memory."""
 
 
 class NotALog(Exception):
@@ -124,6 +129,17 @@ def _note_missing_numbers(log: FlightLog) -> None:
         log.findings.append(Finding("event-gaps", text))
 
 
+@contextlib.contextmanager
+def mapped(path: Path) -> Iterator[mmap.mmap]:
+    """A log's bytes without reading them all into memory.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        yield data
+
+
 def each(rows: Iterable[Row], take: Callable[[Row], None]) -> None:
     """Take every record; one whose fields are missing or of the wrong type (a damaged format) is skipped."""
     for row in rows:
@@ -148,7 +164,17 @@ def read_tlog(path: Path) -> list[FlightLog]:
     decoder = mavlink.MAVLink(None)
     decoder.robust_parsing = True
     vehicles: dict[int, _TlogVehicle] = {}
-    data = path.read_bytes()
+    with mapped(path) as data:
+        packets = _read_packets(data, decoder, mavlink.MAVError, wanted, vehicles)
+    if not packets:
+        raise NotALog("the file holds no MAVLink packet; it is no tlog")
+    return [vehicle.log(path, system) for system, vehicle in sorted(vehicles.items())]
+
+
+def _read_packets(
+    data: mmap.mmap, decoder: Any, failure: type[Exception], wanted: Container[int], vehicles: dict[int, "_TlogVehicle"]
+) -> int:
+    """Feed every wanted packet to its vehicle; returns the number of packets."""
     at, size, packets = 0, len(data), 0
     while at + _HEADER + 8 <= size:
         length, number, system = _packet_at(data, at + _HEADER)
@@ -159,7 +185,7 @@ def read_tlog(path: Path) -> list[FlightLog]:
         if number in wanted:
             try:
                 message = decoder.decode(bytearray(data[at + _HEADER : at + _HEADER + length]))
-            except mavlink.MAVError:
+            except failure:
                 at = _resync(data, at + 1)
                 continue
             arrival_s = int.from_bytes(data[at : at + _HEADER], "big") * 1e-6
@@ -167,12 +193,10 @@ def read_tlog(path: Path) -> list[FlightLog]:
                 vehicles[system] = _TlogVehicle()
             vehicles[system].feed(message, arrival_s)
         at += _HEADER + length
-    if not packets:
-        raise NotALog("the file holds no MAVLink packet; it is no tlog")
-    return [vehicle.log(path, system) for system, vehicle in sorted(vehicles.items())]
+    return packets
 
 
-def _packet_at(data: bytes, at: int) -> tuple[int, int, int]:
+def _packet_at(data: mmap.mmap, at: int) -> tuple[int, int, int]:
     """Length, message number and system of the MAVLink packet at a place; length 0 where there is none."""
     if data[at] == 0xFD and at + 10 <= len(data):
         length = 12 + data[at + 1] + (13 if data[at + 2] & 1 else 0)
@@ -182,7 +206,7 @@ def _packet_at(data: bytes, at: int) -> tuple[int, int, int]:
     return 0, 0, 0
 
 
-def _resync(data: bytes, at: int) -> int:
+def _resync(data: mmap.mmap, at: int) -> int:
     """The next place where a record may begin: a plausible time (years 2000 to 2100), then a packet's mark."""
     for start in range(at, min(len(data) - _HEADER, at + 70_000)):
         if data[start + _HEADER] in (0xFD, 0xFE) and data[start] == 0 and 0x03 <= data[start + 1] <= 0x0E:
@@ -201,17 +225,23 @@ class _TlogVehicle:
         self._clocks: list[float] = []
         self._arrivals: list[tuple[float, float]] = []
         self._paces: list[float] = []
+        self._latest: dict[tuple[bool, bool, bool], float] = {}
 
     def feed(self, message: object, arrival_s: float) -> None:
         reboots = self._poses.reboots
         found = self._poses.feed(message)
         if self._poses.reboots != reboots:
             self._close()
-        if self._poses.utc_minus_boot_s is not None:
-            self._clocks.append(self._poses.utc_minus_boot_s)
+        clock = self._poses.utc_minus_boot_s
+        if clock is not None and (not self._clocks or clock != self._clocks[-1]):
+            self._clocks.append(clock)
         if isinstance(found, Sample):
-            self._arrivals.append((found.time_s or 0.0, arrival_s))
-            self._samples.append(found)
+            kind = (found.has_position, found.yaw_deg is None, found.height_is_ground)
+            boot_s = found.time_s or 0.0
+            if not 0.0 <= boot_s - self._latest.get(kind, -1.0) < LEAST_STEP_S:
+                self._latest[kind] = boot_s
+                self._arrivals.append((boot_s, arrival_s))
+                self._samples.append(found)
         elif found is not None:
             self._events.append(found)
 

@@ -4,13 +4,14 @@ Source: the ULog file format specification of PX4 (header, definitions, data; me
 """
 
 import math
+import mmap
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from telemetry.logs import FlightLog, NotALog, Row, each
+from telemetry.logs import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
 from telemetry.mavposes import CameraEvent, euler_deg
 from telemetry.rotations import camera_angles_deg, euler_ned, quaternion_ned
 from telemetry.sample import Sample, checked
@@ -26,6 +27,7 @@ _WANTED = frozenset(
         "distance_sensor", "gimbal_device_attitude_status", "sensor_gps", "vehicle_gps_position",
     }
 )  # fmt: skip
+_EVENTS = frozenset({"camera_capture", "camera_trigger"})
 _YAW_IN_VEHICLE, _YAW_IN_EARTH, _YAW_LOCK = 32, 64, 16
 
 
@@ -35,10 +37,10 @@ def read_ulog(path: Path) -> FlightLog:
     Raises:
         OSError: it cannot be read. NotALog: it is none.
     """
-    data = path.read_bytes()
-    if data[:7] != _MAGIC:
-        raise NotALog("the file is no ULog; check its name")
-    rows = _rows(data)
+    with mapped(path) as data:
+        if data[:7] != _MAGIC:
+            raise NotALog("the file is no ULog; check its name")
+        rows = _rows(data)
     log = FlightLog(path, "ULog", path.stem)
     fixes = rows.get("sensor_gps") or rows.get("vehicle_gps_position", [])
     clock = _utc_minus_boot(fixes)
@@ -74,7 +76,7 @@ def read_ulog(path: Path) -> FlightLog:
     return log
 
 
-def _rows(data: bytes) -> dict[str, list[Row]]:
+def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
     """Data of the wanted topics, first instance of each."""
     formats: dict[str, list[tuple[str, str, int]]] = {}
     topics: dict[int, tuple[str, list[tuple[str, struct.Struct]]]] = {}
@@ -98,9 +100,16 @@ def _rows(data: bytes) -> dict[str, list[Row]]:
             topic = topics.get(int.from_bytes(body[:2], "little"))
             if topic is not None:
                 row = _row(body[2:], topic[1])
-                if row is not None:
-                    found.setdefault(topic[0], []).append(row)
+                rows = found.setdefault(topic[0], [])
+                if row is not None and (topic[0] in _EVENTS or not rows or _is_later(row, rows[-1])):
+                    rows.append(row)
     return found
+
+
+def _is_later(row: Row, last: Row) -> bool:
+    """Whether a record is worth keeping after the last one kept."""
+    step = (row["timestamp"] - last["timestamp"]) * 1e-6
+    return not 0.0 <= step < LEAST_STEP_S
 
 
 def _fields(text: str) -> list[tuple[str, str, int]]:

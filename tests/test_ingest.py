@@ -225,3 +225,36 @@ def test_progress_reaches_the_total(tmp_path):
     seen = []
     load([tmp_path], progress=lambda what, done, total: seen.append((what, done, total)))
     assert seen[-1] == ("reading photos", 3, 3)
+
+
+def test_a_clock_that_jumps_back_in_flight_is_bridged(tmp_path):
+    for i in range(12):
+        second = 3 * i if i < 6 else 3 * i - 900 + 1000
+        photo(tmp_path / f"P_{i:02d}.JPG", 47.5 + 1e-4 * i, 8.25, second if i >= 6 else second + 1000, yaw=0.0)
+    for i in range(6, 12):  # the clock was set back by a quarter of an hour
+        photo(tmp_path / f"P_{i:02d}.JPG", 47.5 + 1e-4 * i, 8.25, 3 * i + 100, yaw=0.0)
+    frames = load([tmp_path]).frames
+    assert [f.image for f in frames] == [f"P_{i:02d}.JPG" for i in range(12)]
+    assert np.allclose(np.diff([f.time_s for f in frames]), 3.0)
+    assert "clock-jump" in codes(tmp_path)
+
+
+def test_numbers_that_begin_anew_do_not_overrule_the_times(tmp_path):
+    for i in range(12):
+        number = 995 + i if i < 5 else i - 4
+        photo(tmp_path / f"DJI_{number:04d}.JPG", 47.5 + 1e-4 * i, 8.25, 3 * i, yaw=0.0)
+    frames = load([tmp_path]).frames
+    assert np.all(np.diff([f.fix.lat_deg for f in frames]) > 0)
+    assert "clock-jump" not in codes(tmp_path)
+
+
+def test_of_a_multispectral_camera_one_band_is_mapped(tmp_path):
+    for i in range(3):
+        for n, band in enumerate(("Blue", "Green", "NIR")):
+            packet = f"<x:xmpmeta><Camera:BandName>{band}</Camera:BandName></x:xmpmeta>".encode()
+            exif = gps_exif(47.5 + 1e-4 * i, 8.25, local=f"2024:05:06 12:00:{i:02d}")
+            jpeg(tmp_path / f"IMG_{i:04d}_{n}.jpg", xmp_packet=packet, exif_bytes=exif)
+    result = load([tmp_path])
+    assert [f.image for f in result.frames] == [f"IMG_{i:04d}_1.jpg" for i in range(3)]
+    assert len(result.rejected) == 6
+    assert "spectral band" in result.rejected[0].reason
