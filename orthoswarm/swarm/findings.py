@@ -102,11 +102,13 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
         one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY
         if off < max(_SLOPE_DEG if one_way else _TILT_DEG, 3.0 * sigma):
             continue
-        if np.isfinite(records.pitch[rows]).any():
-            tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))
+        tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))
+        if not np.isfinite(records.pitch[rows]).any():
+            found.append(f"{who}: the camera looks {seen:.0f} degrees off nadir; no tag says so")
+        elif abs(seen - tag) > 0.5 * off:
             found.append(f"{who}: the camera looks {seen:.0f} degrees off nadir where tags say {tag:.0f}")
         else:
-            found.append(f"{who}: the camera looks {seen:.0f} degrees off nadir; no tag says so")
+            found.append(f"{who}: recorded pitch and roll are {off:.0f} degrees off")
     return found
 
 

@@ -16,6 +16,7 @@ from orthoswarm.swarm.plane import Array, Complex, Flags, Ints, PairGraph, Recor
 
 _COURSE_SIGMA = float(np.radians(2.0))
 _C_SCHEDULE = (400.0, 100.0, 36.0, 9.0, 9.0)
+_CANDIDATES = 360
 _AGREE = float(np.radians(20.0))
 
 
@@ -152,8 +153,9 @@ def _identity(count: int) -> csr_matrix:
 
 def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
     """The angle that the most weight supports: the densest window, then the mean of what lies near it."""
-    support = (weight[None, :] * (np.abs(wrap(angle[None, :] - angle[:, None])) < width)).sum(1)
-    mode = float(angle[int(support.argmax())])
+    tried = angle[:: max(1, len(angle) // _CANDIDATES)]
+    support = (weight[None, :] * (np.abs(wrap(angle[None, :] - tried[:, None])) < width)).sum(1)
+    mode = float(tried[int(support.argmax())])
     for _ in range(5):
         r = wrap(angle - mode)
         w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2

@@ -19,6 +19,9 @@ from orthoswarm.swarm.sparse import SparseStart
 
 _DATUM_SIGMA_M = 3.0
 _PLANE_SIGMA_M = 3.0
+_DRIFT_SIGMA_M = 4.0
+_DRIFT_BEND_M = 2.5
+_PHOTOS_PER_KNOT = 12
 _HELD = 0.02
 _LENS_SIGMA = (0.1, 0.05)
 _FULL_LENS_SIGMA = (0.3, 0.012)
@@ -117,7 +120,9 @@ def _models(start: SparseStart) -> tuple[GroupModel, ...]:
                 bias_sigma=_BIAS_SIGMA,
                 height_sigma=(0.1 if stated else 1.0) if start.height_known[rows].mean() > 0.5 else 30.0,
                 lag_sigma=0.2 if stated else 0.5,
-                drift_sigma=0.0,
+                drift_sigma=0.0 if stated else _DRIFT_SIGMA_M,
+                drift_bend=_DRIFT_BEND_M,
+                knot_every=_PHOTOS_PER_KNOT,
             )
         )
     return tuple(models)
