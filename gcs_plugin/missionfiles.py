@@ -20,6 +20,7 @@ LatLon = tuple[float, float]
 FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE = 0, 2, 3
 NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 17, 20, 21, 22, 82
 DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
+_FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
 _GROUND_SPEED = 1.0
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
@@ -73,11 +74,27 @@ class Mission:
     no_fly: tuple[tuple[LatLon, ...], ...] = field(default=())
     speed_m_s: float | None = None
 
-    def path(self) -> tuple[LatLon, ...]:
-        """Latitudes and longitudes of the waypoints flown to, takeoff and landing left out."""
-        return tuple(
-            (i.lat_deg, i.lon_deg) for i in self.items if i.command in (NAV_WAYPOINT, NAV_SPLINE) and i.has_position
-        )
+    def lines(self) -> tuple[tuple[LatLon, ...], ...]:
+        """What is to be photographed: the stretches flown with the camera triggering by distance, if any, else all.
+
+        Each is a row of latitudes and longitudes in degrees of two or more waypoints; takeoff and landing are left out.
+        """
+        if not any(i.command == DO_SET_CAM_TRIGG_DIST and i.params[0] > 0.0 for i in self.items):
+            path = [(i.lat_deg, i.lon_deg) for i in self.items if i.command in _FLOWN and i.has_position]
+            return (tuple(path),) if len(path) > 1 else ()
+        found: list[list[LatLon]] = []
+        here: LatLon | None = None
+        triggering = False
+        for item in self.items:
+            if item.command == DO_SET_CAM_TRIGG_DIST:
+                triggering = item.params[0] > 0.0
+                if triggering:
+                    found.append([here] if here else [])
+            elif item.command in _FLOWN and item.has_position:
+                here = (item.lat_deg, item.lon_deg)
+                if triggering:
+                    found[-1].append(here)
+        return tuple(tuple(line) for line in found if len(line) > 1)
 
 
 def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[MissionItem, ...]:

@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--altitude", type=float, required=True, metavar="M", help="height of the lines above takeoff, metres")
     add("--fov-min", type=float, required=True, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
-    add("--method", choices=["columns", "bcd", "tmstc"], default="tmstc", help="how to lay lines (default tmstc)")
+    add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
     add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
     add("--json", action="store_true", help="one JSON document on stdout")
     flight = parser.add_argument_group("flight")
@@ -168,8 +168,7 @@ def read_shapes(path: Path) -> "tuple[Shapes, list[Ring]]":
         return parse_kml(text, str(path)), []
     mission = parse_mission(text, str(path))
     polygons = tuple(Polygon(ring(survey, str(path))) for survey in mission.surveys)
-    paths = [*mission.polylines, *([mission.path()] if len(mission.path()) > 1 else [])]
-    lines = tuple(ring(line, str(path), 2) for line in paths)
+    lines = tuple(ring(line, str(path), 2) for line in (mission.polylines or mission.lines()))
     return Shapes(polygons, lines), [ring(zone, str(path)) for zone in mission.no_fly]
 
 

@@ -14,6 +14,7 @@ from orthoswarm.planning.shapes import Polygon, Ring
 Geometry = Any  # shapely has no type information here
 
 _SMALLEST_M2 = 1.0
+_NARROWEST_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,12 @@ def _to_grid(grid: LocalGrid, points: Ring) -> Ring:
 def _check(polygon: Geometry, grid: LocalGrid, name: str) -> None:
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         raise InputError(f"{name} reaches too far for one UTM grid; plan a smaller area")
-    if shapely.Polygon(polygon.exterior).area < _SMALLEST_M2:
+    outline = shapely.Polygon(polygon.exterior)
+    hull = outline.convex_hull  # a crossing outline may have no net area, but its hull has
+    if min(hull.area, hull.area if not outline.is_valid else outline.area) < _SMALLEST_M2:
         raise InputError(f"{name} has no area (less than {_SMALLEST_M2:g} square metre); draw a larger one")
+    if 2.0 * hull.area < _NARROWEST_M * hull.length or _is_line(grid, polygon):
+        raise InputError(f"{name} has no area (its points lie on a line); draw it with some width")
     if polygon.is_valid:
         return
     reason, _, place = shapely.is_valid_reason(polygon).partition("[")
@@ -90,6 +95,13 @@ def _check(polygon: Geometry, grid: LocalGrid, name: str) -> None:
     if "hole" in reason.lower():
         raise InputError(f"{name} has a hole that is not inside it ({reason.lower()}{where}); move the hole inside")
     raise InputError(f"{name} crosses or touches itself{where} ({reason.lower()}); redraw its outline without crossing")
+
+
+def _is_line(grid: LocalGrid, polygon: Geometry) -> bool:
+    """True for points on one parallel: in metres it bends, so that nothing would seem to have an area."""
+    lat_lon = grid.to_geographic(shapely.get_coordinates(polygon.exterior))
+    hull = shapely.MultiPoint(lat_lon).convex_hull
+    return bool(hull.area < 1e-7 * hull.length**2)
 
 
 def _polygons_only(geometry: Geometry) -> Geometry:

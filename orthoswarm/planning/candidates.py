@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Method = Literal["columns", "bcd", "tmstc"]
 
 METHODS: tuple[str, ...] = get_args(Method)
-_TRIES: dict[str, int] = {"columns": 5, "bcd": 5, "tmstc": 4}
+_TRIES: dict[str, int] = {"columns": 6, "bcd": 6, "tmstc": 8}
 _TRIES_IF_FEW = 12  # few lines are cheap to lay and hard to share
 _MANY_LEGS = 400
 _DENSER = 1.25
@@ -66,13 +66,13 @@ def candidates(
             continue
         count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
         few = few or count < 4 * vehicles
-        yield _finished(field, legs, count, angle, foot, method, router, reach_m)
+        yield from _finished(field, legs, count, angle, foot, method, router, reach_m)
         if len(legs) > _MANY_LEGS:  # directions hardly differ then, and each takes its time
             return
         if method != "tmstc" and vehicles <= len(legs) < 4 * vehicles:
             denser = _lay(field, angle, foot, method, router, vehicles)
             if len(legs) < len(denser) <= _DENSER * len(legs):
-                yield _finished(field, denser, count, angle, foot, method, router, reach_m)
+                yield from _finished(field, denser, count, angle, foot, method, router, reach_m)
 
 
 def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Router, multiple: int) -> Array:
@@ -85,9 +85,12 @@ def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Ro
 
 def _finished(
     field: Field, legs: Array, count: int, angle: float, foot: Footprint, method: Method, router: Router, reach_m: float
-) -> Candidate:
+) -> Iterator[Candidate]:
+    """The legs without gaps, in the method's own order, and in the order of a local search."""
     mended = coverage.mend(field, legs, foot, router, reach_m, angle)
-    return Candidate(mended if method == "columns" else shorten(mended, router), count)
+    yield Candidate(mended, count)
+    if method != "columns":
+        yield Candidate(shorten(mended, router), count)
 
 
 def chained(loops: list[Array]) -> Array:

@@ -1,5 +1,6 @@
 """Who flies what: legs shared among the vehicles of a crew, and cut into sorties."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,7 +16,7 @@ from orthoswarm.planning.motion import Motion
 from orthoswarm.planning.order import shorten
 from orthoswarm.planning.routes import Router
 from orthoswarm.planning.schedule import Maker, Separation, Slot, separate
-from orthoswarm.planning.split import Limits, cut, share, sorties
+from orthoswarm.planning.split import Limits, Row, cut, share, sorties
 from orthoswarm.planning.types import End
 
 Array = NDArray[np.float64]
@@ -142,7 +143,7 @@ class Crew:
         row = cut(legs, router, options.motion, self.vehicles, self._least_leg_m)
         pieces = share(row, self.vehicles, self.starts, self._returns, router, options.motion, self._limits)
         if pieces is None:
-            raise self._too_short()
+            raise self._too_short(row, self.starts)
         homes, work, lengths, times = [], [], [], []
         for vehicle, (begin, end) in enumerate(pieces):
             mine = row.legs(begin, end)
@@ -184,7 +185,7 @@ class Crew:
             row = cut(legs, self._router, options.motion, 1, step, max(step, total / 2000.0))
             found = sorties(row, home, self._returns, self._router, options.motion, limits)
             if found is None:
-                raise self._too_short()
+                raise self._too_short(row, home[None])
             result = [row.legs(a, b) for a, b in found]
             flights = [self._flight(f, home, top, top) for f in result]
             longest, most = max(f.time_s(options.motion) for f in flights), max(f.items for f in flights)
@@ -194,10 +195,17 @@ class Crew:
             fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
             shorter = 0.995 * limits.endurance_s * min(1.0, options.endurance_s / longest)
             limits = replace(limits, endurance_s=shorter, most_legs=max(1, fewer))
-        raise self._too_short()
+        raise self._too_short(row, home[None])
 
-    def _too_short(self) -> InputError:
+    def _too_short(self, row: Row, starts: Array | None) -> InputError:
+        """What to say when a part of the row is out of reach: how long the flight to the farthest would be."""
+        top = self._options.separation.layers * self._options.separation.height_m
+        places = row.parts[:1, 0] if starts is None else starts
+        far = self._router.distances(places, row.parts[:, 0]) + self._router.distances(places, row.parts[:, 1])
+        start, part = np.unravel_index(np.argmax(far), far.shape)
+        home = row.parts[part, 0] if starts is None else places[start]
+        needed = self._flight(row.parts[part][None], home, top, top).time_s(self._options.motion)
         return InputError(
-            f"the endurance of {self._options.endurance_s / 60:.1f} min is too short to reach the far end and come "
-            "back; start nearer, fly faster or lower, or use larger batteries"
+            f"the endurance of {self._options.endurance_s / 60:.1f} min is too short: the farthest line needs about "
+            f"{math.ceil(1.05 * needed / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"
         )

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _FAIR_ENOUGH = 1.25
+_WORTH = 0.99  # a later candidate must be better by this: the first ones are in the method's own, tidier order
 
 
 def plan_area(
@@ -34,7 +35,7 @@ def plan_area(
     vehicles: int,
     altitude_m: float,
     foot: Footprint,
-    method: Method = "tmstc",
+    method: Method = "bcd",
     options: Options | None = None,
     progress: Progress = lambda _: None,
 ) -> Plan:
@@ -86,14 +87,14 @@ def _best_work(
         most = max(most, candidate.stretches)
         if candidate.stretches >= crew.vehicles:
             work = crew.share(candidate.legs, method != "columns")
-            best = work if best is None or work.score < best.score else best
+            best = work if best is None or work.score < _WORTH * best.score else best
     if best is not None:
         return best
     if not most:
         raise InputError("all of the area lies within the clearance of no-fly zones; reduce the clearance")
     raise InputError(
-        f"{crew.vehicles} vehicles are more than the {most} lines that this area has for them; "
-        f"use at most {most} vehicles, or fly lower so that lines lie closer"
+        f"{crew.vehicles} vehicles are more than this area has lines for; "
+        f"use {most} or fewer, or fly lower so that lines lie closer"
     )
 
 
