@@ -10,7 +10,7 @@ from collections.abc import Mapping
 Properties = Mapping[str, str]
 
 _ATTRIBUTE = re.compile(rb"""([A-Za-z][\w.-]{0,63}:[A-Za-z]\w{0,63})\s*=\s*(?:"([^"<]{0,1024})"|'([^'<]{0,1024})')""")
-_ELEMENT = re.compile(rb"<([A-Za-z][\w.-]{0,63}:[A-Za-z]\w{0,63})>\s*([^<]{1,1024}?)\s*</")
+_ELEMENT = re.compile(rb"<([A-Za-z][\w.-]{0,63}:[A-Za-z]\w{0,63})>([^<]{1,1024})</")
 _LIST = re.compile(
     rb"<([A-Za-z][\w.-]{0,63}:[A-Za-z]\w{0,63})>\s*<rdf:(?:Seq|Bag|Alt)>\s*<rdf:li[^>]{0,64}>([^<]{1,1024})</"
 )
@@ -28,7 +28,7 @@ def properties(packet: bytes) -> dict[str, str]:
             found[name.decode("ascii", "replace")] = (first or second).decode("utf-8", "replace").strip()
     for name, value in _ELEMENT.findall(packet):
         if not name.startswith(b"rdf:"):
-            found[name.decode("ascii", "replace")] = value.decode("utf-8", "replace")
+            found[name.decode("ascii", "replace")] = value.decode("utf-8", "replace").strip()
     if b"rdf:li" in packet:
         for name, value in _LIST.findall(packet):
             found.setdefault(name.decode("ascii", "replace"), value.decode("utf-8", "replace").strip())
