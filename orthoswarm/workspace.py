@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any, Generic, TypeVar
 
 from orthoswarm import __version__
-from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.errors import InputError
 from orthoswarm.export.partial import disk_error, written_whole
 from orthoswarm.frame import Frame
 
@@ -178,17 +178,3 @@ def _remove(path: Path) -> None:
     else:
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def require_space(folder: Path, needed_mb: float) -> None:
-    """Raise OrthoSwarmError at once where a run would fill the disk later.
-
-    Args:
-        folder: existing folder on the disk in question.
-        needed_mb: what the run will write at least, megabytes.
-    """
-    free = shutil.disk_usage(folder).free / 1e6
-    if free < needed_mb:
-        raise OrthoSwarmError(
-            f"the disk with {folder} has {free:,.0f} MB left, the map needs about {needed_mb:,.0f} MB; free some space"
-        )
