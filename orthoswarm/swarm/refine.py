@@ -23,7 +23,7 @@ from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.levels import level_network
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
-from orthoswarm.swarm.settle import resettle, settle, working_gsd
+from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
@@ -34,6 +34,10 @@ from orthoswarm.swarm.weak import steady_weak
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+
+
+MAP_FLOOR_PX = 0.13
+"""What no residual tells (map content that stands above the ground everywhere), in pixels of the compared map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +162,8 @@ class SwarmRefiner:
     """One vehicle as soon as it completes (placement.Refiner): solo, then again with its neighbours held.
 
     Attributes:
-        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area. options: see Options.
+        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
+        options: see Options.
     """
 
     epsg: int
@@ -306,7 +311,8 @@ def second_pass(
     watch.lap("second adjustment")
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
-    sigma, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, 0.05)
+    floor = MAP_FLOOR_PX * map_gsd(flight, basemap) if basemap is not None and state.on_map else 0.05
+    sigma, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.sigma_m = sigma[: len(flight.frames)]
     release(flight)
     if not flight.sparse:

@@ -19,6 +19,8 @@ from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, vote_lean
 Array = NDArray[np.float64]
 
 TIE_SIGMA_M = 0.35
+TIE_SIGMA_LIMITS_M = (0.1, 1.0)
+FEWEST_TO_WEIGH = 20
 LINK_SIGMA_PX = 0.7
 
 
@@ -92,6 +94,14 @@ def as_ties(matches: MapMatches, points: Array, surface: GroundModel) -> Ties:
     height = own[:, 2] - surface.height(own[:, :2])
     xy = own[:, :2] + matches.shift + height[:, None] * np.asarray(surface.lean)
     return Ties(matches.point, xy, np.full(len(matches.point), TIE_SIGMA_M))
+
+
+def weighed(ties: Ties, residual: Array) -> Ties:
+    """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
+    if len(residual) < FEWEST_TO_WEIGH:
+        return ties
+    sigma = float(np.clip(1.4826 * np.median(np.abs(residual)), *TIE_SIGMA_LIMITS_M))
+    return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 
 def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
@@ -186,6 +196,8 @@ def _second_round(
     ties = as_ties(matches, flight.adjustment.points, surface)
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
+        if k in (0, 1):
+            ties = weighed(ties, flight.adjustment.tie_residual)
         if k % 2 == 0:
             surface = refit(flight, surface)
     return surface, ties, matches
