@@ -163,9 +163,9 @@ def test_gimbal_yaw_is_the_pictures_where_it_is_absolute(tmp_path):
     assert "yaw-relative" not in codes(folder)
 
 
-def test_gimbal_yaw_relative_to_the_airframe_is_replaced_by_flight_yaw(tmp_path):
+def test_gimbal_yaw_relative_to_the_airframe_is_added_to_the_flight_yaw(tmp_path):
     folder = flight(tmp_path / "f", [80, 260, 80], yaw=lambda c: -1.5, flight=lambda c: c)
-    assert np.allclose(np.mod(yaws_deg(load([folder]).frames), 360), [80] * 5 + [260] * 5 + [80] * 5)
+    assert np.allclose(np.mod(yaws_deg(load([folder]).frames), 360), [78.5] * 5 + [258.5] * 5 + [78.5] * 5)
     assert "yaw-relative" in codes(folder)
 
 
@@ -211,11 +211,11 @@ def test_sheffield_is_read_with_its_traps_named(real_data):
     assert "yaw-inconsistent" not in codes(folder)
 
 
-def test_jwcate_takes_the_flight_yaw(real_data):
+def test_jwcate_takes_flight_and_gimbal_yaw_together(real_data):
     folder = real_data("jwcate_1200")
     frames = load([folder]).frames
     assert len(frames) == 36
-    assert math.degrees(frames[0].fix.yaw_rad) == pytest.approx(170.6)
+    assert math.degrees(frames[0].fix.yaw_rad) == pytest.approx(170.6 - 1.3)
     assert "yaw-relative" in codes(folder)
 
 
