@@ -14,6 +14,8 @@ VERBS = {
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "inspect": "say what photos, videos and logs hold and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
+    "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
+    "sim": "run simulated vehicles that speak MAVLink",
     "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
     "twin": "make a set of photos, map and truth of a digital twin city",
     "evaluate": "measure an orthoimage against a reference, and poses against truth",

@@ -71,6 +71,11 @@ class FleetEvent:
     text: str
 
 
+def mission_event(event: MissionEvent) -> tuple[str, str]:
+    """Kind and words of what has happened to a mission."""
+    return event.value, _WORDS[event]
+
+
 class Fleet:
     """All vehicles on all links.
 
@@ -381,7 +386,8 @@ class Fleet:
 
     def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
         for event in events:
-            self._event(event.value, vehicle, _WORDS[event])
+            kind, text = mission_event(event)
+            self._event(kind, vehicle, text)
 
     def _event(self, kind: str, vehicle: Vehicle, text: str) -> None:
         event = FleetEvent(kind, vehicle.system, self._wall(), f"vehicle {vehicle.system} {text}")
@@ -426,11 +432,15 @@ class Fleet:
         if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
             vehicle.mission = job.mission
             vehicle.detector.uploaded(job.mission)
+            return
+        mission = None
+        if isinstance(job, MissionDownload) and job.items is not None:
+            mission = Mission(vehicle.autopilot, tuple(job.items))
         elif isinstance(job, InOrder) and isinstance(job.steps[0], CheckMission):
             mission = job.steps[0].mission
-            if mission is not None and vehicle.mission is not mission:
-                vehicle.mission = mission
-                vehicle.detector.knows_mission(mission)
+        if mission is not None and (vehicle.mission != mission or not vehicle.detector.knows):
+            vehicle.mission = mission
+            vehicle.detector.knows_mission(mission)
 
     def _send(self, system: int, messages: Sequence[Message]) -> None:
         if not messages:

@@ -119,7 +119,8 @@ class Flight:
         cls, autopilot: Autopilot, modes: Modes, store: MissionStore, chart: Chart, frame: Airframe, seed: int
     ) -> "Flight":
         """A vehicle standing at home."""
-        return cls(autopilot, modes, store, Motion(chart, frame, Random(seed), speed=frame.speed_m_s))
+        mode = modes.hold if autopilot is Autopilot.PX4 else 0
+        return cls(autopilot, modes, store, Motion(chart, frame, Random(seed), speed=frame.speed_m_s), mode)
 
     # --- commands ---
 

@@ -103,7 +103,8 @@ class SimVehicle:
         self.store.rebooted()
         flight = self.flight
         flight.disarm()
-        flight.mode, flight.seq, flight.paused = 0, 0, False
+        flight.mode = flight.modes.hold if self.autopilot is Autopilot.PX4 else 0
+        flight.seq, flight.paused = 0, False
         flight.state = State.NOT_STARTED if len(self.store.items) > 1 else State.NONE
         self._boot(now + silence_s)
 

@@ -1,0 +1,48 @@
+"""Two ways to talk to vehicles behind one interface: our own (the default) and MAVSDK."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gcs_plugin.backends.base import Backend
+from gcs_plugin.mission.exchange import GROUND_STATION, Address
+from orthoswarm.errors import InputError
+
+NAMES = ("pymavlink", "mavsdk")
+
+
+def open_backend(
+    name: str,
+    links: Sequence[str],
+    *,
+    own: Address = GROUND_STATION,
+    key: bytes | None = None,
+    tlog: Path | None = None,
+    pose_hz: float = 10.0,
+) -> Backend:
+    """Open links with a backend.
+
+    Args:
+        name: `pymavlink` or `mavsdk`.
+        links: addresses (`links.parse_link`).
+        own: our address.
+        key: signing key (pymavlink only).
+        tlog: telemetry log (pymavlink only).
+        pose_hz: rate of position and attitude that vehicles are asked for.
+
+    Raises:
+        InputError: an address is wrong, or the backend cannot do what is asked.
+    """
+    if name == "pymavlink":
+        from gcs_plugin.backends.direct import DirectBackend
+
+        return DirectBackend(links, own=own, key=key, tlog=tlog, pose_hz=pose_hz)
+    if name == "mavsdk":
+        from gcs_plugin.backends.mavsdk import MavsdkBackend
+
+        if key is not None or tlog is not None:
+            raise InputError("the mavsdk backend neither signs nor writes a tlog; use --backend pymavlink for that")
+        return MavsdkBackend(links, own=own)
+    raise InputError(f"there is no backend '{name}'; choose one of: {', '.join(NAMES)}")
+
+
+__all__ = ["NAMES", "Backend", "open_backend"]

@@ -1,0 +1,143 @@
+"""The default backend: our own links and protocol machines, with pymavlink for messages; for many vehicles."""
+
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
+from gcs_plugin.fleet import Fleet, FleetEvent
+from gcs_plugin.links import Link
+from gcs_plugin.mavlink import Autopilot
+from gcs_plugin.mission.completion import Phase
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.items import Mission
+from gcs_plugin.streams import default_rates
+from orthoswarm.errors import OrthoSwarmError
+
+_QUIET_S = 2.2  # two heartbeats: whoever has not been heard by then is not there
+
+
+class DirectBackend(Backend):
+    """A fleet that is polled while something is asked of it."""
+
+    name = "pymavlink"
+
+    def __init__(
+        self,
+        links: Iterable[Link | str],
+        *,
+        own: Address,
+        key: bytes | None = None,
+        tlog: Path | None = None,
+        pose_hz: float = 10.0,
+    ) -> None:
+        self.fleet = Fleet(links, own=own, key=key, tlog=tlog, rates=default_rates(pose_hz))
+        self.events: list[FleetEvent] = []
+        self.fleet.on_event(self.events.append)
+
+    def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
+        """Poll until everybody has been heard."""
+        fleet, end = self.fleet, time.monotonic() + wait_s
+        found, since = -1, 0.0
+        while time.monotonic() < end:
+            fleet.poll(0.1)
+            if len(fleet.vehicles) != found:
+                found, since = len(fleet.vehicles), time.monotonic()
+            known = all(v.lat_deg is not None and v.landed for v in fleet.vehicles.values())
+            if wanted and all(system in fleet.vehicles for system in wanted) and known:
+                break
+            if not wanted and found and known and time.monotonic() - since > _QUIET_S:
+                break
+        return sorted(fleet.vehicles)
+
+    def autopilot(self, system: int) -> Autopilot:
+        """A vehicle's dialect."""
+        return self.fleet.vehicle(system).autopilot
+
+    def summaries(self) -> list[dict[str, Any]]:
+        """The state of all vehicles."""
+        now = time.monotonic()
+        return [vehicle.summary(now) for _, vehicle in sorted(self.fleet.vehicles.items())]
+
+    def problems(self) -> list[str]:
+        """Links that do not work, and packets that were not believed."""
+        hub = self.fleet.hub
+        problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
+        if hub.rejected:
+            problems.append(f"{hub.rejected} packets had no good signature; check the signing key")
+        return problems
+
+    def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
+        """All uploads at once."""
+        begin = {s: (lambda s=s, m=m: self.fleet.upload(s, m)) for s, m in missions.items()}
+        return self._run(begin, dict.fromkeys(missions, 0.0), "upload", report)
+
+    def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
+        """All commands at their times."""
+        act = {"start": self.fleet.start, "pause": self.fleet.pause, "resume": self.fleet.resume, "rtl": self.fleet.rtl}
+        begin = {system: (lambda system=system: act[verb](system)) for system in delays}
+        return self._run(begin, delays, verb, report)
+
+    def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
+        """Poll and tell until all missions have ended."""
+        self._learn(systems)
+        end, told = time.monotonic() + seconds, 0
+        while True:
+            for event in self.events[told:]:
+                if event.system in systems or not systems:
+                    report(event)
+            told = len(self.events)
+            ended = {event.system for event in self.events if event.kind in ENDED}
+            followed = set(systems) or set(self.fleet.vehicles)
+            if followed and followed <= ended:
+                return True
+            if time.monotonic() >= end:
+                return False
+            self.fleet.poll(0.2)
+
+    def close(self) -> None:
+        """Close the fleet."""
+        self.fleet.close()
+
+    def _learn(self, systems: Collection[int]) -> None:
+        """Read the missions of vehicles whose missions are not known: how they end decides how that looks."""
+        fleet = self.fleet
+        jobs: list[Exchange] = []
+        for system in systems or list(fleet.vehicles):
+            vehicle = fleet.vehicles.get(system)
+            idle = vehicle is not None and not vehicle.lost and not fleet.busy(system) and not vehicle.twins
+            if vehicle is not None and idle and vehicle.mission_total and not vehicle.detector.knows:
+                jobs.append(fleet.download(system))
+        fleet.run_until(lambda: all(job.outcome is not None for job in jobs), 20.0)
+
+    def _run(
+        self,
+        begin: Mapping[int, Callable[[], Exchange]],
+        delays: Mapping[int, float],
+        what: str,
+        report: Report,
+    ) -> dict[int, Outcome]:
+        """Begin each at its time and poll until all have ended."""
+        outcomes: dict[int, Outcome] = {}
+        jobs: dict[int, Exchange] = {}
+        started = time.monotonic()
+        waiting = sorted(begin, key=lambda system: delays[system])
+        while len(outcomes) < len(begin):
+            while waiting and time.monotonic() - started >= delays[waiting[0]]:
+                system = waiting.pop(0)
+                try:
+                    jobs[system] = begin[system]()
+                except OrthoSwarmError as error:
+                    outcomes[system] = Outcome(False, str(error))
+            self.fleet.poll(0.05 if waiting else 0.2)
+            for system, job in jobs.items():
+                if job.outcome is not None:
+                    outcomes.setdefault(system, job.outcome)
+            report(what, len(outcomes), len(begin))
+        return outcomes
+
+    @property
+    def flying(self) -> list[int]:
+        """Vehicles that fly a mission."""
+        return [s for s, v in self.fleet.vehicles.items() if v.detector.phase is Phase.ACTIVE]

@@ -1,0 +1,372 @@
+"""The MAVSDK backend: MAVSDK holds the links and moves missions (`mission_raw`), our machines do the rest.
+
+MAVSDK's high-level `mission` plugin does not suit ArduPilot (no home item, RTL refused), and `is_mission_finished` is
+never true for a mission that ends with LAND; so missions go through `mission_raw`, are read back and compared, and the
+end of a mission is told by the same detector as in the default backend, fed through `mavlink_direct`. MAVSDK decodes
+every message to JSON: for a few vehicles, not for a hundred.
+"""
+
+import json
+import queue
+import re
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
+from gcs_plugin.fleet import FleetEvent, mission_event
+from gcs_plugin.mavlink import Autopilot, Message
+from gcs_plugin.mission.compare import difference
+from gcs_plugin.mission.completion import CompletionDetector, Phase
+from gcs_plugin.mission.control import unflyable
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.items import Mission, MissionItem
+from gcs_plugin.mission.modes import modes_of
+from gcs_plugin.streams import Rates, Streams
+from gcs_plugin.vehicle import Vehicle
+from orthoswarm.errors import InputError, OrthoSwarmError
+
+_HEARD: Final = (
+    "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
+    "GLOBAL_POSITION_INT", "SYS_STATUS", "GPS_RAW_INT", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED",
+)  # fmt: skip
+_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0})
+_ATTEMPTS: Final = 4
+_LOST_S: Final = 5.0
+_QUIET_S: Final = 2.2
+
+
+class JsonMessage:
+    """A message of `mavlink_direct` that looks like one of pymavlink's."""
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self.__dict__.update(fields)
+        self._name, self._number = str(fields["message_name"]), int(fields["message_id"])
+
+    def get_type(self) -> str:
+        """Its name."""
+        return self._name
+
+    def get_msgId(self) -> int:
+        """Its number."""
+        return self._number
+
+
+@dataclass(slots=True, eq=False)
+class _Craft:
+    """A vehicle, and MAVSDK's handles for it."""
+
+    vehicle: Vehicle
+    system: Any
+    direct: Any
+    raw: Any
+    jobs: list[Exchange] = field(default_factory=list)
+
+
+class MavsdkBackend(Backend):
+    """Vehicles through MAVSDK."""
+
+    name = "mavsdk"
+
+    def __init__(self, links: Sequence[str], *, own: Address) -> None:
+        """Open the links.
+
+        Raises:
+            InputError: MAVSDK is missing, or an address is wrong.
+        """
+        try:
+            from mavsdk import Configuration, ConnectionResult, Mavsdk, log_subscribe
+        except ImportError as error:
+            raise InputError(f"MAVSDK cannot be loaded ({error}); pip install mavsdk, or --backend pymavlink") from None
+        log_subscribe(lambda *_: True)  # it would write to stdout, which is for results
+        self.events: list[FleetEvent] = []
+        self._own = own
+        self._queue: queue.SimpleQueue[tuple[int, JsonMessage]] = queue.SimpleQueue()
+        self._crafts: dict[int, _Craft] = {}
+        self._mavsdk = Mavsdk(Configuration.create_manual(own.system, own.component, True))
+        for link in links:
+            result = self._mavsdk.add_any_connection(mavsdk_url(link))
+            if result != ConnectionResult.SUCCESS:
+                self.close()
+                raise InputError(f"MAVSDK cannot open link {link} ({result.name.lower()}); is the port in use?")
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._crafts.clear()
+        self._mavsdk.destroy()
+
+    def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
+        """Look until everybody has been heard."""
+        end, found, since = time.monotonic() + wait_s, -1, 0.0
+        while time.monotonic() < end:
+            self._meet()
+            self._pump(0.1)
+            if len(self._crafts) != found:
+                found, since = len(self._crafts), time.monotonic()
+            known = all(c.vehicle.lat_deg is not None and c.vehicle.landed for c in self._crafts.values())
+            if wanted and all(system in self._crafts for system in wanted) and known:
+                break
+            if not wanted and found and known and time.monotonic() - since > _QUIET_S:
+                break
+        return sorted(self._crafts)
+
+    def autopilot(self, system: int) -> Autopilot:
+        """A vehicle's dialect."""
+        return self._craft(system).vehicle.autopilot
+
+    def summaries(self) -> list[dict[str, Any]]:
+        """The state of all vehicles."""
+        now = time.monotonic()
+        return [craft.vehicle.summary(now) for _, craft in sorted(self._crafts.items())]
+
+    def problems(self) -> list[str]:
+        """MAVSDK does not tell."""
+        return []
+
+    def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
+        """Uploads in threads, for MAVSDK's calls wait."""
+        with ThreadPoolExecutor(max_workers=min(16, max(1, len(missions)))) as pool:
+            futures = {s: pool.submit(self._upload, s, mission) for s, mission in missions.items()}
+            while not all(future.done() for future in futures.values()):
+                self._pump(0.1)
+                report("upload", sum(future.done() for future in futures.values()), len(futures))
+        outcomes = {s: future.result() for s, future in futures.items()}
+        for s, outcome in outcomes.items():
+            if outcome.ok:
+                self._crafts[s].vehicle.detector.uploaded(missions[s])
+        return outcomes
+
+    def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
+        """All commands at their times."""
+        outcomes: dict[int, Outcome] = {}
+        jobs: dict[int, Exchange] = {}
+        began, waiting = time.monotonic(), sorted(delays, key=lambda system: delays[system])
+        while len(outcomes) < len(delays):
+            while waiting and time.monotonic() - began >= delays[waiting[0]]:
+                system = waiting.pop(0)
+                try:
+                    jobs[system] = self._begin(system, verb)
+                except OrthoSwarmError as error:
+                    outcomes[system] = Outcome(False, str(error))
+            self._pump(0.05)
+            for system, job in jobs.items():
+                if job.outcome is not None:
+                    outcomes.setdefault(system, job.outcome)
+            report(verb, len(outcomes), len(delays))
+        return outcomes
+
+    def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
+        """Follow until all missions have ended."""
+        for system in systems or list(self._crafts):
+            detector = self._craft(system).vehicle.detector
+            if not detector.knows and (mission := self._read(system)) is not None:
+                detector.knows_mission(mission)
+        end, told = time.monotonic() + seconds, 0
+        while True:
+            for event in self.events[told:]:
+                if event.system in systems or not systems:
+                    report(event)
+            told = len(self.events)
+            followed = set(systems) or set(self._crafts)
+            if followed and followed <= {event.system for event in self.events if event.kind in ENDED}:
+                return True
+            if time.monotonic() >= end:
+                return False
+            self._meet()
+            self._pump(0.2)
+
+    # --- vehicles ---
+
+    def _craft(self, system: int) -> _Craft:
+        craft = self._crafts.get(system)
+        if craft is None:
+            known = ", ".join(str(number) for number in sorted(self._crafts)) or "none"
+            raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
+        return craft
+
+    def _meet(self) -> None:
+        """Take in systems that MAVSDK has discovered."""
+        from mavsdk import Autopilot as Kind
+        from mavsdk.plugins.mavlink_direct import MavlinkDirect
+        from mavsdk.plugins.mission_raw import MissionRaw
+
+        if self._mavsdk.system_count() == len(self._crafts):
+            return
+        for system in self._mavsdk.get_systems():
+            number = int(system.get_system_id())
+            kind = system.autopilot_type()
+            if number in self._crafts or not system.has_autopilot() or kind == Kind.UNKNOWN:
+                continue
+            autopilot = Autopilot.ARDUPILOT if kind == Kind.ARDUPILOT else Autopilot.PX4
+            address = Address(number)
+            vehicle = Vehicle(
+                address, autopilot, modes_of(autopilot, int(system.vehicle_type())), CompletionDetector(autopilot),
+                Streams(address, self._own, _RATES), heard=time.monotonic(),
+            )  # fmt: skip
+            craft = _Craft(vehicle, system, MavlinkDirect(system), MissionRaw(system))
+            self._crafts[number] = craft
+            for name in _HEARD:
+                craft.direct.subscribe_message(name, self._listener(number))
+            self._event("found", number, f"was found ({autopilot.value})")
+            self._send(craft, vehicle.streams.start(time.monotonic()))
+
+    def _listener(self, number: int) -> Callable[[Any, Any], None]:
+        def take(message: Any, _data: Any) -> None:  # in MAVSDK's thread
+            if message.component_id == number_of_autopilot and message.system_id == number:
+                self._queue.put((number, JsonMessage(json.loads(message.fields_json))))
+
+        number_of_autopilot = Address(number).component
+        return take
+
+    def _pump(self, wait_s: float) -> None:
+        """Take what has come, and let time pass for what is under way."""
+        end = time.monotonic() + wait_s
+        while (left := end - time.monotonic()) > 0.0:
+            try:
+                number, message = self._queue.get(timeout=left)
+            except queue.Empty:
+                break
+            self._take(self._crafts[number], message, time.monotonic())
+        now = time.monotonic()
+        for craft in self._crafts.values():
+            self._send(craft, craft.vehicle.streams.tick(now))
+            for job in list(craft.jobs):
+                if now >= job.deadline:
+                    self._send(craft, job.tick(now))
+            craft.jobs = [job for job in craft.jobs if job.outcome is None]
+            vehicle = craft.vehicle
+            if not vehicle.lost and now - vehicle.heard > _LOST_S:
+                vehicle.lost = True
+                self._event("lost", vehicle.system, f"has been silent for {_LOST_S:.0f} s")
+
+    def _take(self, craft: _Craft, message: Message, now: float) -> None:
+        vehicle = craft.vehicle
+        vehicle.heard, vehicle.received = now, vehicle.received + 1
+        if vehicle.lost:
+            vehicle.lost = False
+            self._event("regained", vehicle.system, "is heard again")
+        vehicle.update(message)
+        vehicle.streams.seen(message.get_msgId(), now)
+        if message.get_type() == "COMMAND_ACK":
+            self._send(craft, vehicle.streams.acknowledged(message, now))
+        for event in vehicle.detector.feed(message):
+            kind, text = mission_event(event)
+            self._event(kind, vehicle.system, text)
+        for job in list(craft.jobs):
+            if job.outcome is None:
+                self._send(craft, job.feed(message, now))
+
+    def _send(self, craft: _Craft, messages: Sequence[Message]) -> None:
+        from mavsdk.plugins.mavlink_direct import MavlinkMessage
+
+        for message in messages:
+            fields = message.to_dict()
+            name = fields.pop("mavpackettype")
+            to = craft.vehicle.address
+            craft.direct.send_message(
+                MavlinkMessage(name, self._own.system, self._own.component, to.system, to.component, json.dumps(fields))
+            )
+
+    def _event(self, kind: str, system: int, text: str) -> None:
+        self.events.append(FleetEvent(kind, system, time.time(), f"vehicle {system} {text}"))
+
+    # --- missions and commands ---
+
+    def _upload(self, system: int, mission: Mission) -> Outcome:
+        """Upload and read back; in a thread of its own."""
+        craft = self._crafts.get(system)
+        if craft is None:
+            return Outcome(False, f"vehicle {system} is not on the links; check links and system ids")
+        if craft.vehicle.detector.phase is Phase.ACTIVE and craft.vehicle.armed:
+            return Outcome(False, f"vehicle {system} is flying its mission; pause it or let it return first")
+        wrong = ""
+        for _ in range(_ATTEMPTS):
+            refused = self._write(craft, mission)
+            stored = self._read(system)
+            if stored is None:
+                wrong = f"vehicle {system} could not be read back {refused}; upload again before flying"
+                continue
+            found = difference(mission, stored.items)
+            if found is None:
+                return Outcome(True, f"vehicle {system} holds the mission: {len(mission)} items, read back")
+            if refused:
+                return Outcome(False, f"vehicle {system} refused the mission {refused}; {found.text}")
+            wrong = f"vehicle {system} holds another mission than was sent: {found.text}; upload again before flying"
+        return Outcome(False, wrong)
+
+    def _write(self, craft: _Craft, mission: Mission) -> str:
+        """Upload; returns why it failed."""
+        from mavsdk.plugins.mission_raw import MissionItem as RawItem
+        from mavsdk.plugins.mission_raw import MissionRawError
+
+        items = [
+            RawItem(
+                seq=seq, frame=item.frame, command=item.command, current=int(seq == 0),
+                autocontinue=int(item.autocontinue), param1=item.params[0], param2=item.params[1],
+                param3=item.params[2], param4=item.params[3], x=item.x, y=item.y, z=item.z, mission_type=0,
+            )
+            for seq, item in enumerate(mission.items)
+        ]  # fmt: skip
+        try:
+            craft.raw.upload_mission(items)
+        except MissionRawError as error:
+            return f"({error.result.name.lower().replace('_', ' ')})"
+        return ""
+
+    def _read(self, system: int) -> Mission | None:
+        """The mission in a vehicle, None if it does not say."""
+        from mavsdk.plugins.mission_raw import MissionRawError
+
+        craft = self._crafts[system]
+        try:
+            raw = craft.raw.download_mission()
+        except MissionRawError:
+            return None
+        items = [MissionItem(i.command, i.frame, (i.param1, i.param2, i.param3, i.param4), i.x, i.y, i.z) for i in raw]
+        return Mission(craft.vehicle.autopilot, tuple(items))
+
+    def _begin(self, system: int, verb: Verb) -> Exchange:
+        craft = self._craft(system)
+        vehicle = craft.vehicle
+        if vehicle.lost:
+            raise OrthoSwarmError(f"vehicle {system} is lost; wait until it is heard again")
+        for job in craft.jobs:
+            job.cancel("another command came in between")
+        job = self._dialogue(craft, verb)
+        craft.jobs.append(job)
+        self._send(craft, job.start(time.monotonic()))
+        return job
+
+    def _dialogue(self, craft: _Craft, verb: Verb) -> Exchange:
+        vehicle = craft.vehicle
+        if verb == "pause":
+            return vehicle.pilot.pause()
+        if verb == "resume":
+            return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
+        if verb == "rtl":
+            return vehicle.pilot.rtl()
+        if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
+            raise OrthoSwarmError(f"vehicle {vehicle.system} is flying its mission already")
+        mission = self._read(vehicle.system)
+        in_air = vehicle.in_air and vehicle.armed
+        wrong = unflyable(mission.items if mission else (), vehicle.autopilot, in_air=in_air)
+        if mission is None or wrong:
+            raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not hand out its mission'}")
+        vehicle.detector.knows_mission(mission)
+        return vehicle.pilot.start(in_air=in_air, check=False)
+
+
+def mavsdk_url(link: str) -> str:
+    """A link's address as MAVSDK writes it."""
+    text = link.strip()
+    line = re.fullmatch(r"(?:serial:(?://)?)?(/dev/[^:,]+|COM\d+)(?:[:,](\d+))?", text)
+    if line:
+        return f"serial://{line[1]}:{line[2] or 57600}"
+    match = re.fullmatch(r"(udp|udpin|udpout|tcp|tcpout|tcpin):(?://)?([^:/]*):(\d+)", text)
+    if not match:
+        raise InputError(f"'{link}' is no link; write for example udpin:0.0.0.0:14550 or tcp:127.0.0.1:5760")
+    kind = {"udp": "udpin", "tcp": "tcpout"}.get(match[1], match[1])
+    host = match[2] or ("0.0.0.0" if kind.endswith("in") else "127.0.0.1")
+    return f"{kind}://{host}:{match[3]}"
