@@ -161,14 +161,17 @@ _COLUMNS = {
 
 def read_pose_csv(path: Path) -> PoseTable | None:
     """Read a CSV of poses; None where its header is not one (some other CSV)."""
-    text = _read(path)
-    first = text.split("\n", 1)[0]
+    try:
+        with path.open("rb") as handle:  # most tables beside pictures are none of poses, and may be large
+            first = handle.readline(1 << 14).decode("utf-8-sig", "replace")
+    except OSError:
+        return None
     separator = max(",;\t", key=first.count)
-    reader = csv.reader(io.StringIO(text), delimiter=separator)
+    if not {"image", "lat_deg", "lon_deg"} <= {_COLUMNS.get(c.strip().lower(), "") for c in first.split(separator)}:
+        return None
+    reader = csv.reader(io.StringIO(_read(path)), delimiter=separator)
     try:
         header = [_COLUMNS.get(column.strip().lower(), "") for column in next(reader)]
-        if not {"image", "lat_deg", "lon_deg"} <= set(header):
-            return None
         return dict(filter(None, (_csv_row(header, cells) for cells in reader)))
     except (csv.Error, StopIteration):
         return None

@@ -219,6 +219,16 @@ def test_jwcate_takes_flight_and_gimbal_yaw_together(real_data):
     assert "yaw-relative" in codes(folder)
 
 
+def test_a_frame_is_made_of_a_sample():
+    from telemetry.frames import frame_of
+    from telemetry.sample import Sample
+
+    place = {"image": "a.jpg", "path": Path("a.jpg"), "vehicle": "v", "width": 64, "height": 48}
+    assert frame_of(Sample(yaw_deg=3.0), **place) is None
+    frame = frame_of(Sample(lat_deg=47.0, lon_deg=8.0, yaw_deg=90.0, height_m=50.0, time_s=5.0), **place)
+    assert (frame.fix.yaw_rad, frame.fix.height_m, frame.time_s) == (pytest.approx(math.pi / 2), 50.0, 5.0)
+
+
 def test_progress_reaches_the_total(tmp_path):
     for i in range(3):
         photo(tmp_path / f"{i}.JPG")

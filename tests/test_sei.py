@@ -189,6 +189,29 @@ def test_a_users_decoder_takes_ten_lines_and_may_fail(monkeypatch):
     assert sei.read(user_data(uuid, b"")) is None
 
 
+def test_a_decoder_is_found_by_its_entry_point_and_a_broken_one_is_passed_over(monkeypatch):
+    import importlib.metadata
+
+    class Point:
+        def __init__(self, what):
+            self._what = what
+
+        def load(self):
+            if self._what is None:
+                raise ImportError("broken plug-in")
+            return self._what
+
+    uuid = bytes(range(100, 116))
+    mine = sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=47.0, lon_deg=8.0))
+    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))
+    monkeypatch.setattr(
+        importlib.metadata, "entry_points", lambda group: [Point(None), Point("no decoder"), Point(mine)]
+    )
+    sei._load_entry_points.cache_clear()
+    assert sei.read(user_data(uuid, b"x")).decoders == ("mine",)
+    sei._load_entry_points.cache_clear()
+
+
 @pytest.mark.parametrize("bad", [{"lat_deg": 0.0, "lon_deg": 0.0}, {"lat_deg": 91.0, "lon_deg": 5.0}])
 def test_impossible_positions_are_dropped(bad):
     reading = sei.read([(5, sei.encode(Sample(yaw_deg=5.0, **bad)))])
