@@ -208,9 +208,12 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
         draw_lines(picture, [np.array([p.camera.nadir for p in own])], (150, 155, 165), 1)
     for leg in report["legs"]:
         own = by_vehicle.get(leg["vehicle"], [])[leg["first"] : leg["last"] + 1]
-        draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], _LEGS[leg["state"]], 3)
+        colour = _LEGS[leg["state"]] if report["basemap"] else _VEHICLES[0]
+        draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], colour, 3)
     scale_bar(picture)
     text = "Green: matched to the map. Orange: carried by the others. Red: failed. Grey: turns."
+    if not report["basemap"]:
+        text = "Straight legs of the flights; grey: turns."
     return Figure("Legs", data_uri(picture.rgb), text)
 
 
