@@ -83,6 +83,7 @@ def _by_lens(cameras: Sequence[Camera]) -> dict[Lens, list[int]]:
     return groups
 
 
+@lru_cache(maxsize=256)
 def _corners(lens: Lens) -> Array:
     """Rays (4, 3), camera depth 1, of the corners of the box that holds all the undistorted picture, clockwise."""
     x0, x1, y0, y1 = lens_row(lens, 0.0)[OUTER:INNER]

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.camera import Camera
+from orthoswarm.camera import Camera, Lens
 from orthoswarm.geo import GroundGrid
+from orthoswarm.kernels import kernel
 from orthoswarm.mosaic.coverage import by_tile
-from orthoswarm.mosaic.footprint import footprint_boxes
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, footprint_boxes
 from orthoswarm.mosaic.labels import label_tile
-from orthoswarm.mosaic.lattice import Shots, heights
+from orthoswarm.mosaic.lattice import Shots, heights, project
 from orthoswarm.placement import PlacedFrame, Terrain
 
 Array = NDArray[np.float64]
@@ -65,16 +66,17 @@ def estimate_gains(
         return {}
     some = [frames[i] for i in known]
     cameras = [f.camera for f in some]
-    small = np.stack([thumbnails[f.frame.image] for f in some]).astype(np.float64)
+    small = np.stack([thumbnails[f.frame.image] for f in some])
+    shots = Shots.of(cameras, [False] * len(cameras))
     names = sorted({f.frame.vehicle for f in frames})
     vehicle = np.array([names.index(f.frame.vehicle) for f in some])
 
-    labels, grid = _coarse_labels(cameras, terrain)
+    labels, grid = _coarse_labels(cameras, shots, terrain)
     seams = _seams(labels, grid)
-    inner = _consecutive(cameras, vehicle, terrain)
+    inner = _consecutive(cameras, shots, vehicle, terrain)
     ratios, good = [], []
     for meeting in (seams, inner):
-        ratio, usable = _log_ratios(meeting, cameras, small, terrain)
+        ratio, usable = _log_ratios(meeting, shots, small, terrain)
         ratios.append(ratio)
         good.append(usable)
     usable = np.concatenate(good)
@@ -95,7 +97,7 @@ def _factor(log_gain: Array) -> NDArray[np.float32]:
     return np.exp(np.clip(log_gain, -_CLIP, _CLIP)).astype(np.float32)
 
 
-def _coarse_labels(cameras: Sequence[Camera], terrain: Terrain) -> tuple[Ints, GroundGrid]:
+def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> tuple[Ints, GroundGrid]:
     """The mosaic's labels (index + 1) on cells of a 64th of a picture."""
     boxes = footprint_boxes(cameras, float(terrain.z.min()), float(terrain.z.max()))
     boxes = boxes[boxes[:, 0] <= boxes[:, 2]]
@@ -106,7 +108,6 @@ def _coarse_labels(cameras: Sequence[Camera], terrain: Terrain) -> tuple[Ints, G
     east, north = (float(x) for x in boxes[:, 2:].max(0))
     cell = max(side / _CELLS_ACROSS, float(np.sqrt((east - west) * (north - south) / _MAX_CELLS)), 1e-3)
     grid = GroundGrid.around(0, (west, south, east, north), cell)
-    shots = Shots.of(cameras, [False] * len(cameras))
     labels = np.zeros((grid.height, grid.width), np.int32)
     for (r, c), ids in by_tile(cameras, grid, _TILE, terrain).items():
         part = np.zeros((min(_TILE, grid.height - r), min(_TILE, grid.width - c)), np.int32)
@@ -130,60 +131,69 @@ def _seams(labels: Ints, grid: GroundGrid) -> _Meetings:
     return _Meetings(*(np.concatenate([p[k] for p in parts]) for k in range(3)))
 
 
-def _consecutive(cameras: Sequence[Camera], vehicle: NDArray[np.intp], terrain: Terrain) -> _Meetings:
-    """A 4 x 3 grid of points of each frame with the next one of its vehicle and with the one before: alike in both."""
-    u, v = np.meshgrid([0.2, 0.4, 0.6, 0.8], [0.2, 0.5, 0.8])
-    parts: list[tuple[Array, list[tuple[int, int]]]] = []
-    for i, camera in enumerate(cameras):
-        size = (camera.lens.width - 1.0, camera.lens.height - 1.0)
-        pixels = np.stack([u.ravel(), v.ravel()], 1) * size
-        below = float(terrain.height(camera.position[:2]))
-        pairs = [(i, j) for j in (i - 1, i + 1) if 0 <= j < len(cameras) and vehicle[j] == vehicle[i]]
-        parts.append((camera.to_ground(pixels, below), pairs))
-    ground = [g for g, pairs in parts for _ in pairs]
-    pairs = [p for _, own in parts for p in own]
-    if not pairs:
-        return _Meetings(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)))
-    index = np.repeat(np.array(pairs, np.int32), u.size, 0)
-    return _Meetings(index[:, 0], index[:, 1], np.concatenate(ground))
+def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.intp], terrain: Terrain) -> _Meetings:
+    """A 3 x 2 grid of points of each frame with the next one of its vehicle and with the one before: alike in both."""
+    u, v = np.meshgrid([0.2, 0.5, 0.8], [0.3, 0.7])
+    share = np.stack([u.ravel(), v.ravel()], 1)
+    by_lens: dict[Lens, Array] = {}
+    for lens in {camera.lens for camera in cameras}:
+        pixels = share * (lens.width - 1.0, lens.height - 1.0)
+        xy = lens.undistort((pixels - lens.principal_point) / lens.focal_px)
+        by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
+    rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
+    height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
+    descent = np.where(rays[..., 2:] < -LEAST_DESCENT, -rays[..., 2:], np.nan)
+    ground = shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
+
+    same = np.nonzero(vehicle[1:] == vehicle[:-1])[0]
+    a, b = np.concatenate([same, same + 1]), np.concatenate([same + 1, same])
+    points = len(share)
+    return _Meetings(
+        np.repeat(a, points).astype(np.int32), np.repeat(b, points).astype(np.int32), ground[a].reshape(-1, 2)
+    )
 
 
 def _log_ratios(
-    meetings: _Meetings, cameras: Sequence[Camera], small: Array, terrain: Terrain
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Log of colour a over colour b (M, 3), and where it means something."""
+    meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Log of colour a over colour b (M, 3), and where it means something (M,)."""
+    ratio, usable = np.zeros((len(meetings.a), 3), np.float32), np.zeros(len(meetings.a), bool)
+    west, north = (float(v) for v in shots.position[:, :2].mean(0))
+    position, rotation = shots.about(west, north)
     ground = np.nan_to_num(meetings.ground)
-    point = np.concatenate([ground, terrain.height(ground)[:, None]], 1)
-    colours: list[Array] = []
-    usable = np.asarray(np.isfinite(meetings.ground).all(axis=1))
-    for side in (meetings.a, meetings.b):
-        colour, inside = _look(side, point, cameras, small)
-        usable = usable & inside & np.asarray(((colour > _DARK) & (colour < _BRIGHT)).all(axis=1))
-        colours.append(np.maximum(colour, 1.0))
-    return np.asarray(np.log(colours[0] / colours[1])), usable
+    place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
+    _compare(meetings.a, meetings.b, place, position, rotation, shots.lens, shots.size, small, ratio, usable)
+    return ratio, usable & np.asarray(np.isfinite(meetings.ground).all(axis=1))
 
 
-def _look(index: Ints, point: Array, cameras: Sequence[Camera], small: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Thumbnail colours (M, 3), bilinear, of points (M, 3) in cameras of an index (M,), and whether they are seen."""
-    pixel = np.full((len(index), 2), np.nan)
-    size = np.array([(c.lens.width, c.lens.height) for c in cameras], float)
-    order = np.argsort(index, kind="stable")
-    starts = np.flatnonzero(np.r_[True, np.diff(index[order]) > 0]) if len(index) else np.empty(0, np.intp)
-    for own in np.split(order, starts[1:]):
-        if len(own):
-            pixel[own] = cameras[index[own[0]]].project(point[own])
-    inside = np.asarray(((pixel >= 0) & (pixel <= size[index] - 1.0)).all(axis=1))
-    rows, columns = small.shape[1:3]
-    at = np.where(inside[:, None], (pixel + 0.5) / size[index], 0.5) * (columns, rows) - 0.5
-    at = np.clip(at, 0.0, (columns - 1.000001, rows - 1.000001))
-    j, i = at.astype(np.intp).T
-    fx, fy = (at - at.astype(np.intp)).T[:, :, None]
-    top = small[index, i, j] * (1 - fx) + small[index, i, j + 1] * fx
-    low = small[index, i + 1, j] * (1 - fx) + small[index, i + 1, j + 1] * fx
-    return np.asarray(top * (1 - fy) + low * fy), inside
+@kernel
+def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable):  # type: ignore[no-untyped-def]
+    rows, columns = small.shape[1], small.shape[2]
+    for m in range(len(a)):
+        seen = 0
+        for side in range(2):
+            k = a[m] if side == 0 else b[m]
+            u, v = project(position[k], rotation[k], lens[k], place[m, 0], place[m, 1], place[m, 2])
+            if u < 0.0 or v < 0.0 or u > size[k, 0] - 1.0 or v > size[k, 1] - 1.0:
+                break
+            x = min(max((u + 0.5) / size[k, 0] * columns - 0.5, 0.0), columns - 1.000001)
+            y = min(max((v + 0.5) / size[k, 1] * rows - 0.5, 0.0), rows - 1.000001)
+            j, i = int(x), int(y)
+            fx, fy = x - j, y - i
+            good = True
+            for channel in range(3):
+                top = small[k, i, j, channel] * (1.0 - fx) + small[k, i, j + 1, channel] * fx
+                low = small[k, i + 1, j, channel] * (1.0 - fx) + small[k, i + 1, j + 1, channel] * fx
+                value = top * (1.0 - fy) + low * fy
+                good = good and value > _DARK and value < _BRIGHT
+                ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
+            seen += good
+        usable[m] = seen == 2
 
 
-def _solve(a: Ints, b: Ints, ratio: Array, vehicle: NDArray[np.intp], vehicles: int) -> tuple[Array, Array]:
+def _solve(
+    a: Ints, b: Ints, ratio: NDArray[np.float32], vehicle: NDArray[np.intp], vehicles: int
+) -> tuple[Array, Array]:
     """Log gains of vehicles (V, 3) and frames (N, 3): g_a - g_b = -ratio, robust (Geman-McClure), with priors to 0."""
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import splu

@@ -91,12 +91,12 @@ class RealtimeMosaic:
         keys = self._tiles_in(box) if number else []
         if not keys:
             return Added([], 0, "it lies outside the map's area")
-        height = float(camera.position[2]) - ground_z_m
-        packed, factor = pack(picture, reduction(grid.gsd_m, height / lens.focal_px))
+        east, north, up = camera.position.tolist()
+        packed, factor = pack(picture, reduction(grid.gsd_m, (up - ground_z_m) / lens.focal_px))
         shot = _Shot(
             picture=packed,
             planes=planes[:number],
-            centre=grid.to_pixel(camera.position[:2]),
+            centre=np.array([(east - grid.west) / grid.gsd_m - 0.5, (grid.north - north) / grid.gsd_m - 0.5]),
             radius=reach(camera, ground_z_m) / grid.gsd_m,
             matrix=ground_to_camera(camera, ground_z_m, grid.gsd_m),
             lens=_reduced_lens(camera, factor),
@@ -148,7 +148,7 @@ def ground_to_camera(camera: Camera, ground_z_m: float, gsd_m: float) -> Array:
     positive before the camera whatever the tilt, and no large easting enters.
     """
     drop = ground_z_m - float(camera.position[2])
-    return np.asarray(camera.rotation.T @ np.diag([gsd_m, -gsd_m, drop]))
+    return np.asarray(camera.rotation.T * (gsd_m, -gsd_m, drop))
 
 
 def _reduced_lens(camera: Camera, factor: int) -> Array:
