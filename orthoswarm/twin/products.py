@@ -157,7 +157,7 @@ def write_frames(spec: TwinSpec, site: Site, flights: list[Flight], path: Path) 
         degrees = np.degrees(np.c_[flight.angles[:, 0] + convergence, flight.angles[:, 1:]])
         degrees[:, 0] = (degrees[:, 0] + 180.0) % 360.0 - 180.0
         for i in range(0, len(flight.time_s), spec.every):
-            moment = datetime.fromtimestamp(flight.time_s[i], UTC).isoformat(timespec="milliseconds")
+            moment = datetime.fromtimestamp(round(float(flight.time_s[i]), 3), UTC).isoformat(timespec="milliseconds")
             rows.append(
                 [photo_name(flight.vehicle, i), flight.vehicle, moment.replace("+00:00", "Z")]
                 + [f"{x:.4f}" for x in flight.position[i]]
