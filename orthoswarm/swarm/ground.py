@@ -44,7 +44,7 @@ class GroundModel:
             expected = np.full(len(points), self.level_m)
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
-        return Ground(expected, sigma_m, 20.0, self.height(points[:, :2]), self.lean, c)
+        return Ground(expected, sigma_m, 20.0, self.height(points[:, :2]), c=c)
 
 
 def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:

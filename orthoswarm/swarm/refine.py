@@ -228,6 +228,7 @@ def refine_all(
             progress("solo", n + 1, len(units))
     coarse = [to_solution(s, origin, None, coarse=True) for s in states]
     states = _second_passes(states, basemap, origin, run, progress)
+    _level(states)
     terrain = _shifted(common_terrain(states), origin)
     fine = [to_solution(s, origin, terrain) for s in states]
     return Refined(merge_units(coarse), merge_units(fine), terrain)
@@ -254,6 +255,16 @@ def _second_passes(
         if progress:
             progress("joint", n + 1, len(states))
     return out
+
+
+def _level(states: Sequence[VehicleState]) -> None:
+    """Lift or lower whole vehicles, cameras and ground together, by what is left between their levels."""
+    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
+    for state, correction in zip(states, network.correction_m, strict=True):
+        adj = state.flight.adjustment
+        adj.rig.position[:, 2] += correction
+        adj.points[:, 2] += correction
+        state.dense[0][:, 2] += correction
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:

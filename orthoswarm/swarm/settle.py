@@ -85,15 +85,12 @@ def mode_shift(shift: Array) -> Array:
     return np.asarray(centre)
 
 
-def as_ties(matches: MapMatches, points: Array, surface: GroundModel) -> Ties:
-    """Ties for the adjustment: where the map would show each point if it leaned by its height over the ground.
+def as_ties(matches: MapMatches, points: Array) -> Ties:
+    """Ties for the adjustment: where the map shows the ground that each point's surroundings lie on.
 
-    The match is the ground's, which does not lean; the adjustment's model adds the lean of the point itself.
+    What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map by its lean.
     """
-    own = points[matches.point]
-    height = own[:, 2] - surface.height(own[:, :2])
-    xy = own[:, :2] + matches.shift + height[:, None] * np.asarray(surface.lean)
-    return Ties(matches.point, xy, np.full(len(matches.point), TIE_SIGMA_M))
+    return Ties(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
 
 
 def weighed(ties: Ties, residual: Array) -> Ties:
@@ -165,7 +162,7 @@ def settle(
     matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
     shift_cameras(flight, np.broadcast_to(mode_shift(matches.shift), (len(flight.frames), 2)).copy())
     matches = replace(matches, shift=matches.shift - mode_shift(matches.shift))
-    ties = as_ties(matches, flight.adjustment.points, surface)
+    ties = as_ties(matches, flight.adjustment.points)
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
         if k in (1, 3):
@@ -193,7 +190,7 @@ def _second_round(
     flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
 ) -> tuple[GroundModel, Ties, MapMatches]:
     matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, 5.0))
-    ties = as_ties(matches, flight.adjustment.points, surface)
+    ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
         if k in (0, 1):
