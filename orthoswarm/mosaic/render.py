@@ -30,8 +30,9 @@ from orthoswarm.placement import PlacedFrame, Terrain
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
 Bounds = tuple[float, float, float, float]
-Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterable[Any]]
-"""Applies a module-level function to every argument, in this process or in others; results in any order."""
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Applies a module-level function to every argument, in this process or in others; results in any order. It should
+take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
 Progress = Callable[[int, int], None]
 
 _FRAMES_PER_TASK = 64
@@ -39,7 +40,7 @@ _STAGING = "staging"
 _COARSE_CELLS = 1_000_000
 
 
-def serial(function: Callable[[Any], Any], arguments: Sequence[Any]) -> Iterable[Any]:
+def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable[Any]:
     """Run the work here, one after the other: the default Run."""
     return map(function, arguments)
 
@@ -179,12 +180,14 @@ class _Job:
     def label(self, place: Place, candidates: dict[Key, Ints], again: Iterable[int]) -> dict[int, list[Window]]:
         """Label tiles; gives each frame's windows."""
         lost = np.array(sorted(again), np.int32)
-        tasks = []
-        for key, ids in candidates.items():
-            good = ids[self.usable[ids]]
-            tasks.append(LabelTask(place, key, good, self.shots.take(good), self.local(key), lost))
+
+        def tasks() -> Iterator[LabelTask]:
+            for key, ids in candidates.items():
+                good = ids[self.usable[ids]]
+                yield LabelTask(place, key, good, self.shots.take(good), self.local(key), lost)
+
         windows: dict[int, list[Window]] = defaultdict(list)
-        for result in self.run(label_pass, tasks):
+        for result in self.run(label_pass, tasks()):
             for i, window in result:
                 windows[i].append(window)
         return {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
@@ -196,7 +199,7 @@ class _Job:
         """Read and sample the pictures; gives those that could not be read, and why."""
         failed: dict[int, str] = {}
         done = 0
-        for result in self.run(sample_pass, list(self.sample_tasks(place, windows))):
+        for result in self.run(sample_pass, self.sample_tasks(place, windows)):
             for picture in result:
                 if picture.reason is not None:
                     failed[picture.index] = picture.reason
