@@ -42,7 +42,7 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         follows = recorded[i] + offset
         gap = float(np.hypot(*(follows - straight)[:2]))
         step = float(np.hypot(*(adj.rig.position[b] - adj.rig.position[a])[:2]))
-        adj.rig.position[i] = follows if gap < max(4.0, 0.3 * step) else straight
+        adj.rig.position[i] = follows if a == b or gap < max(4.0, 0.3 * step) else straight  # a == b: at an end
         near = a if i - a <= b - i else b
         turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
         adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
