@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.camera import fov_rad
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
@@ -23,6 +24,7 @@ from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.levels import level_network
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
+from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
@@ -36,6 +38,10 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 
+TAKEOFF_LEVEL_M = 1.0
+"""How well the takeoff level is known to be the level of the ground, one sigma."""
+TIE_SHARE = 0.5
+"""Part of the ties' scatter that neighbouring ties have in common (terrain, map content), so that no number helps."""
 MAP_FLOOR_PX = 0.13
 """What no residual tells (map content that stands above the ground everywhere), in pixels of the compared map."""
 
@@ -114,6 +120,7 @@ def solo(
         (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
     )  # fmt: skip
     if basemap is not None:
+        state.had_map = True
         _onto_map(state, basemap, origin, watch)
     flight.pictures.drop()
     state.timings = watch.seconds
@@ -155,6 +162,20 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
     adj = flight.adjustment
     state.sigma_m, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), state.ties, 6.0, 0.05)
     watch.lap("sigma")
+
+
+def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
+    """How far the field of view may be off because the takeoff spot need not be at the ground's middle level.
+
+    Over flat ground straight down only f / h is observable; the more relief, the less the level is known.
+    """
+    if not flight.calibration.trusted_height or not flight.records.has_height.any():
+        return 0.0
+    relief = 0.0 if surface.fit is None else surface.fit.sd_m
+    rig = flight.rig()
+    share = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
+    half = 0.5 * fov_rad(float(rig.lens[0, F]), int(rig.lens[0, WIDTH]))
+    return float(np.degrees(np.sin(2 * half))) * share
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,8 +343,12 @@ def second_pass(
     watch.lap("second adjustment")
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
-    floor = MAP_FLOOR_PX * map_gsd(flight, basemap) if basemap is not None and state.on_map else 0.05
-    sigma, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
+    floor = 0.05
+    if basemap is not None and state.on_map:
+        spread = float(np.median(state.ties.sigma_m)) if len(state.ties.sigma_m) else 0.0
+        floor = max(MAP_FLOOR_PX * map_gsd(flight, basemap), TIE_SHARE * spread)
+    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
+    state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     release(flight)
     if not flight.sparse:

@@ -31,7 +31,8 @@ class VehicleState:
         roofs: raised points on the map and their heights;
             ground_shift: float64 (2,) what ground points were off by then.
         dense: extra ground points (K, 3) and sigmas (K,).
-        on_map: True if it lies on the map. sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
+        on_map: True if it lies on the map; had_map: if there was one.
+        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
 
@@ -50,6 +51,7 @@ class VehicleState:
     fov_sigma_deg: float
     timings: dict[str, float] = field(default_factory=dict)
     ground_shift: Array = field(default_factory=lambda: np.zeros(2))
+    had_map: bool = False
 
 
 class Stopwatch:
@@ -108,7 +110,11 @@ def full_resolution(rig: Rig, flight: Flight) -> Rig:
 
 
 def leg_states(state: VehicleState) -> list[Leg]:
-    """How the map held each leg: matched with enough agreeing ties of its own, else carried by the others."""
+    """How the map held each leg.
+
+    Matched with enough agreeing ties of its own, else carried (by others, or without a map by the receiver); failed
+    where there is a map and the vehicle was not found on it.
+    """
     flight = state.flight
     out = []
     for k in range(int(flight.leg.max()) + 1 if len(flight.leg) else 0):
@@ -118,7 +124,7 @@ def leg_states(state: VehicleState) -> list[Leg]:
         agree = mine & (np.hypot(*residual.T) < 1.2) if len(residual) == len(mine) else mine
         share = float(agree.sum()) / max(int(mine.sum()), 1)
         matched = state.on_map and int(agree.sum()) >= LEG_TIES and share > 0.4
-        how: LegState = "matched" if matched else ("carried" if state.on_map else "failed")
+        how: LegState = "matched" if matched else ("failed" if state.had_map and not state.on_map else "carried")
         sigma = float(np.median(state.sigma_m[members]))
         out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))
     return out
