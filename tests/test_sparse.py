@@ -15,6 +15,7 @@ from orthoswarm.swarm.heading import wrap
 from orthoswarm.swarm.rig import HEIGHT, WIDTH, F
 from orthoswarm.swarm.sparse import SparseStart, assemble, read_records, sparse_start
 from orthoswarm.swarm.sparse_flight import open_sparse_flight, reduced
+from orthoswarm.swarm.sparse_joint import open_sparse_flights, own_lenses
 from orthoswarm.swarm.sparse_solve import solve_sparse
 from orthoswarm.swarm.start2d import start_in_plane
 from tests.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
@@ -89,13 +90,14 @@ def test_observation_sigmas_end_as_large_as_the_noise():
     assert np.median(adjustment.tracks.sigma_px) == pytest.approx(0.7, rel=0.2)
 
 
-def test_reduced_pictures_give_the_same_cameras():
-    world = crosshatch(tilt_deg=8.0)
-    start = begin(world)
-    full, half = solve_sparse(start), solve_sparse(reduced(start, 2.0, (400, 300)))
-    assert half.rig.lens[0, F] == pytest.approx(full.rig.lens[0, F] / 2.0, rel=1e-3)
-    assert np.abs(half.rig.position - full.rig.position).max() < 0.2
+def test_reduced_pictures_have_the_same_cameras():
+    full = solve_sparse(begin(crosshatch(tilt_deg=8.0)))
+    half = reduced(full, 2.0, (400, 300))
+    assert half.rig.lens[0, F] == pytest.approx(full.rig.lens[0, F] / 2.0, rel=2e-3)
+    assert np.abs(half.rig.position - full.rig.position).max() < 0.1
     assert half.rig.lens[0, [WIDTH, HEIGHT]].tolist() == [400, 300]
+    ratio = np.nanmedian(np.hypot(*half.residuals().T)) / np.nanmedian(np.hypot(*full.residuals().T))
+    assert ratio == pytest.approx(0.5, abs=0.02)
 
 
 def test_findings_say_what_tags_got_wrong():
@@ -134,6 +136,26 @@ def test_runs_of_photos_are_named_by_their_ends():
     assert runs(names, np.array([1, 1, 1, 0, 1, 0, 0, 0, 0, 0], bool)) == "a to c, e"
 
 
+def two_vehicles():
+    """The legs along north and those along east as two vehicles with lenses that differ a little."""
+    world = crosshatch(tilt_deg=10.0, gps_sigma=1.0)
+    return world, [replace(f, vehicle="a" if k < 18 else "b") for k, f in enumerate(world.frames)]
+
+
+def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then():
+    world, frames = two_vehicles()
+    records = read_records(frames, GRID, ORIGIN, share_lenses=True)
+    plane = start_in_plane(records, world.pairs, world.features)
+    start = assemble(frames, records, world.features, world.pairs, plane, {}, len(world.pairs))
+    assert len(start.rig.lens) == 1
+    assert len(start.plane.tags) == 2
+    own = own_lenses(solve_sparse(start), start)
+    assert len(own.rig.lens) == 2
+    for lens in own.rig.lens:
+        assert np.degrees(fov_rad(float(lens[F]), 800)) == pytest.approx(80.0, abs=1.0)
+    assert shape_error(own, world) < 0.5
+
+
 def flat_flight(count: int = 5):
     """Pictures cut from one texture as a level camera at 60 m over flat ground would see it, north up."""
     ground = texture(7, 900, 1500)
@@ -158,6 +180,22 @@ def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
     step = np.diff(adjustment.rig.position[:, 1])
     assert np.median(step) == pytest.approx(20.0, abs=1.5)
     assert np.abs(wrap(one.plane.yaw)).max() < np.radians(5.0)
+
+
+def test_vehicles_come_apart_as_they_were_found_together():
+    frames, pictures = flat_flight(6)
+    frames = [replace(f, vehicle="a" if k % 2 else "b") for k, f in enumerate(frames)]
+    vehicles = {v: [f for f in frames if f.vehicle == v] for v in "ba"}
+    flights = open_sparse_flights(vehicles, GRID, ORIGIN, lambda f: pictures[f.image])
+    assert list(flights) == ["b", "a"]
+    north = {f.image: p[1] for v in flights.values() for f, p in zip(v.frames, v.adjustment.rig.position)}
+    steps = np.diff([north[f.image] for f in frames])
+    assert np.median(steps) == pytest.approx(20.0, abs=1.5)
+    assert np.ptp(steps) < 1.0
+    for flight in flights.values():
+        assert flight.sparse
+        assert len(flight.adjustment.rig.lens) == 1
+        assert np.nanmedian(np.hypot(*flight.adjustment.residuals().T)) < 0.5
 
 
 def test_damaged_and_mismatched_pictures_are_left_out_with_their_reason():
@@ -224,6 +262,7 @@ def test_brighton_flips_are_found_and_the_flight_is_ready_for_the_later_steps(re
     assert [f.image for f, flip in zip(frames, flipped) if flip] == [f"DJI_00{k}.JPG" for k in range(24, 30)]
     assert any("DJI_0024.JPG to DJI_0029.JPG" in w for w in flight.warnings)
     assert flight.survived.all()
+    assert flight.sparse
     assert flight.leg.tolist() == [0] * 6 + [1] * 6 + [2] * 6
     up = -adjustment.rig.rotation[:, :2, 1]
     assert np.abs(wrap(np.arctan2(up[:, 0], up[:, 1]) - np.radians(45.0))).max() < np.radians(12.0)
@@ -288,3 +327,28 @@ def test_all_sheffield_photos_lie_on_the_control_points(real_data):
     _, adjustment, grid, origin, _ = solved(frames)
     assert control_point_rms(frames, adjustment, grid, origin, folder / "gcp_file_4000px.txt") < 0.6
     assert fov_deg(adjustment) == pytest.approx(81.2, abs=1.0)
+
+
+@pytest.mark.slow
+def test_legs_of_sheffield_as_vehicles_fit_together(real_data):
+    from orthoswarm.pipeline import split_legs
+
+    folder = real_data("sheffield_cross_800")
+    frames = real_frames(folder, 2)
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    origin = np.round(grid.to_grid([frames[0].fix.lat_deg], [frames[0].fix.lon_deg])[0])
+    vehicles: dict[str, list] = {}
+    for frame in split_legs(frames, grid):
+        vehicles.setdefault(frame.vehicle, []).append(frame)
+    assert len(vehicles) >= 8
+    flights = open_sparse_flights(vehicles, grid, origin, lambda f: read_gray(f.path))
+    rows = [line.split() for line in (folder / "gcp_file_4000px.txt").read_text().splitlines()[1:]]
+    off = []
+    for flight in flights.values():
+        index = {f.image: k for k, f in enumerate(flight.frames)}
+        for r in (r for r in rows if r[5] in index):
+            uv = np.array([[(float(r[3]) + 0.5) * 0.2 - 0.5, (float(r[4]) + 0.5) * 0.2 - 0.5]])
+            xy = flight.adjustment.rig.to_ground(np.array([index[r[5]]]), uv, np.zeros(1))
+            off.append(xy[0] + origin - np.array([float(r[0]), float(r[1])]))
+    spread = np.array(off) - np.mean(off, axis=0)
+    assert np.sqrt((spread**2).sum(1).mean()) < 0.8

@@ -24,9 +24,9 @@ _LISTED = 3
 def flipped_yaw(records: Records, start: Start2D) -> Flags:
     """Photos whose recorded yaw is turned by 180 degrees against the picture's, bool (N,)."""
     flipped = np.zeros(len(records), bool)
-    for k, tag in enumerate(start.tags):
+    for v, tag in enumerate(start.tags):
         if tag.source:
-            rows = (records.lens == k) & start.yaw_known
+            rows = (records.vehicle == v) & start.yaw_known
             off = np.abs(wrap(start.yaw - tag_yaw(records, tag.source) - tag.offset))
             flipped |= rows & (np.nan_to_num(off) > _FLIP)
     return flipped
@@ -67,15 +67,19 @@ def runs(names: Sequence[str], flags: Flags) -> str:
     return text if len(parts) <= _LISTED else f"{text} and {len(parts) - _LISTED} more runs"
 
 
+def _name(frames: Sequence[Frame], records: Records, vehicle: int) -> str:
+    return frames[int(np.argmax(records.vehicle == vehicle))].vehicle
+
+
 def _yaw_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
     names = [f.image for f in frames]
     found = []
     flips = flipped_yaw(records, start)
     if flips.any():
         found.append(f"the recorded yaw is turned by 180 degrees on {int(flips.sum())} photos ({runs(names, flips)})")
-    for k, tag in enumerate(start.tags):
-        rows = (records.lens == k) & start.yaw_known
-        who = frames[int(np.argmax(records.lens == k))].vehicle
+    for v, tag in enumerate(start.tags):
+        rows = (records.vehicle == v) & start.yaw_known
+        who = _name(frames, records, v)
         if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
             found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
         elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
@@ -94,11 +98,11 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
     found = []
     tagged = records.tag_level()
     between = np.degrees(tilt_of(np.asarray(start.level @ np.swapaxes(tagged, 1, 2))))
-    for k in range(len(start.focal)):
-        rows = records.lens == k
+    for v in range(len(start.tags)):
+        rows = records.vehicle == v
         sigma = np.degrees(start.tilt_sigma[records.segment[rows]].max())
         off, seen = float(np.median(between[rows])), float(np.degrees(np.median(tilt_of(start.level[rows]))))
-        who = frames[int(np.argmax(rows))].vehicle
+        who = _name(frames, records, v)
         one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY
         if off < max(_SLOPE_DEG if one_way else _TILT_DEG, 3.0 * sigma):
             continue
@@ -113,20 +117,25 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
 
 
 def _height_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
-    found = []
-    for k in range(len(start.focal)):
-        rows = records.lens == k
-        who = frames[int(np.argmax(rows))].vehicle
+    found, without = [], []
+    for v in range(len(start.tags)):
+        rows = records.vehicle == v
+        k = int(records.lens[rows][0])
+        who = _name(frames, records, v)
         recorded, seen = records.height_m[rows], float(np.median(start.height[rows]))
         if not start.scale_known[k]:
             continue
         if not np.isfinite(recorded).any():
-            found.append(f"{who}: no height is recorded; {seen:.0f} m come from metres per pixel")
+            without.append((who, seen))
             continue
         said = float(np.nanmedian(recorded))
         doubt = max(_HEIGHT_SHARE, 3.0 * float(start.focal_sigma[k]))
         if said <= 2.0 or abs(np.log(seen / said)) > doubt:
             found.append(f"{who}: the recorded height of {said:.0f} m contradicts the pictures, which say {seen:.0f} m")
+    if without:
+        names = ", ".join(who for who, _ in without[:_LISTED]) + (" and others" if len(without) > _LISTED else "")
+        seen = float(np.median([height for _, height in without]))
+        found.append(f"{names}: no height is recorded; {seen:.0f} m come from metres per pixel")
     return found
 
 
@@ -142,7 +151,7 @@ def _position_findings(frames: Sequence[Frame], records: Records, start: Start2D
         rows = records.vehicle == v
         moving = speed[rows & (speed > 0.3)]
         if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
-            who = frames[int(np.argmax(rows))].vehicle
+            who = _name(frames, records, v)
             found.append(f"{who}: recorded positions lag by {lag:.1f} s")
     return found
 

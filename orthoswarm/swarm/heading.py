@@ -22,7 +22,7 @@ _AGREE = float(np.radians(20.0))
 
 @dataclass(frozen=True, slots=True)
 class TagHeading:
-    """How one lens's recorded angles relate to the pictures' headings.
+    """How one vehicle's recorded angles relate to the pictures' headings.
 
     Attributes:
         source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
@@ -164,11 +164,11 @@ def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
 
 
 def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
-    """Which recorded angle of some photos of one lens follows the pictures' headings, up to a constant.
+    """Which recorded angle of some photos of one vehicle follows the pictures' headings, up to a constant.
 
     Args:
         records: all records.
-        rows: photos of one lens whose heading the pictures told.
+        rows: photos of one vehicle whose heading the pictures told.
         yaw: float64 (N,), the pictures' headings.
     """
     best = TagHeading("", 0.0, 0.0)

@@ -131,7 +131,7 @@ def build_pair_graph(builder: PairGraphBuilder) -> Start2D:
     """Find features, pairs and start values of all photos; the builder holds what was found."""
     records = builder.records
     builder.detect_all()
-    builder.try_pairs(consecutive(records.lens, records.time_s))
+    builder.try_pairs(consecutive(records.vehicle, records.time_s))
     start = builder.start()
     for count in (_FIRST_COUNT, _COUNT):
         builder.try_pairs(builder.near(start, count, REACH_SHARE))
@@ -146,6 +146,6 @@ def build_pair_graph(builder: PairGraphBuilder) -> Start2D:
     if weak.any():
         builder.redetect(weak)
         builder.try_pairs(builder.near(start, _MORE_COUNT, _WIDE_REACH_SHARE, weak))
-        builder.try_pairs(consecutive(records.lens, records.time_s))
+        builder.try_pairs(consecutive(records.vehicle, records.time_s))
         start = builder.start()
     return start

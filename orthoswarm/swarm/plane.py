@@ -34,7 +34,7 @@ class Records:
         time_s: float64 (N,). height_m: float64 (N,) above takeoff or ground. altitude_m: float64 (N,) absolute.
         yaw: float64 (N,) grid azimuth of the picture's up direction; flight_yaw: of the airframe, radians.
         pitch: float64 (N,), -pi/2 is nadir; roll: float64 (N,).
-        lens: int32 (N,). segment: int32 (N,), see `segments`. vehicle: int32 (N,).
+        lens: int32 (N,). segment: int32 (N,), see `segments`. vehicle: int32 (N,), a vehicle with one of its lenses.
         width: float64 (N,), columns of the picture; rows: float64 (N,).
         fov_hint: float64 (L,), from tags, radians.
     """

@@ -70,19 +70,21 @@ class SparseStart:
     pairs: tuple[int, int]
 
 
-def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Records:
+def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, share_lenses: bool = False) -> Records:
     """What frames recorded, as arrays in the local frame.
 
     Args:
         frames: photos of one or several vehicles, of a vehicle in order of time.
         grid: the area's grid.
         origin: float64 (2,), grid coordinates of the local frame's origin.
+        share_lenses: vehicles whose cameras and picture sizes go by the same name share one lens.
     """
     lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
     xy = grid.to_grid(lat, lon) - origin[:2]
     convergence = grid.convergence_rad(lat, lon)
-    vehicle = _numbers([f.vehicle for f in frames])
-    lens = _numbers([(f.vehicle, f.camera, f.width, f.height) for f in frames])
+    units = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
+    vehicle = _numbers(units)
+    lens = _numbers([unit[1:] for unit in units]) if share_lenses else vehicle
     height, altitude = _column(frames, "height_m"), _column(frames, "altitude_m")
     pitch = _column(frames, "pitch_rad")
     time_s = np.array([np.nan if f.time_s is None else f.time_s for f in frames], float)
@@ -99,7 +101,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Rec
         pitch=pitch,
         roll=_column(frames, "roll_rad"),
         lens=lens,
-        segment=split_segments(lens, time_s, level, pitch),
+        segment=split_segments(vehicle, time_s, level, pitch),
         vehicle=vehicle,
         width=np.array([f.width for f in frames], float),
         rows=np.array([f.height for f in frames], float),

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm import records as dense
+from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.calibrate import Calibration
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.heading import wrap
@@ -17,7 +19,7 @@ from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.rig import CX, CY, HEIGHT, WIDTH, F, Tracks
 from orthoswarm.swarm.segments import photo_legs
 from orthoswarm.swarm.sparse import SparseStart, read_records, sparse_start
-from orthoswarm.swarm.sparse_solve import heights_above_ground, solve_sparse
+from orthoswarm.swarm.sparse_solve import datum, heights_above_ground, solve_sparse
 
 
 def open_sparse_flight(
@@ -40,32 +42,66 @@ def open_sparse_flight(
         workers: threads; the result does not depend on it.
         progress: called with stage, done, all.
     """
+    start = sparse_start(frames, read_records(frames, grid, origin), read, workers, progress)
+    return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), solve_sparse(start), start.warnings)
+
+
+def flight_of(
+    frames: Sequence[Frame],
+    grid: LocalGrid,
+    origin: Array,
+    read: ReadGray,
+    start: SparseStart,
+    rows: NDArray[np.int64],
+    adjustment: Adjustment,
+    warnings: Sequence[str],
+) -> Flight:
+    """A vehicle's flight from photos that were adjusted alone or together with others.
+
+    Args:
+        frames: of the vehicle.
+        grid: the area's grid.
+        origin: float64 (2,), of the local frame.
+        read: gives a photo's grey values at full size.
+        start: of all photos that were matched together.
+        rows: which of them are the vehicle's.
+        adjustment: of the vehicle's photos alone, in pixels of the full pictures.
+        warnings: findings to be told with this vehicle.
+    """
     records = dense.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
-    start = sparse_start(frames, read_records(frames, grid, origin), read, workers, progress)
-    start = reduced(start, pictures.scale, pictures.size)
-    adjustment = solve_sparse(start)
-    pictures.damaged.update({k: reason for k, reason in start.reasons.items() if k in start.damaged})
-    yaw = wrap(start.plane.yaw)
+    adjustment = reduced(adjustment, pictures.scale, pictures.size)
+    number = {int(row): k for k, row in enumerate(rows)}
+    pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
+    yaw = wrap(start.plane.yaw[rows])
+    mine = list(warnings)
     calibration = Calibration(
         float(adjustment.rig.lens[0, F]),
         float(np.median(heights_above_ground(adjustment))),
         np.asarray(wrap(yaw - records.yaw)),
-        bool(start.height_known.any()),
+        bool(start.height_known[rows].any()),
         start.pairs[1],
-        list(start.warnings),
+        mine,
     )
-    leg = photo_legs(start.plane.position, start.segment, start.records.time_s)
-    held = start.placed.astype(np.float64)
-    return Flight(frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(start.warnings))
+    leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
+    held = start.placed[rows].astype(np.float64)
+    return Flight(frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(mine), sparse=True)
 
 
-def reduced(start: SparseStart, step: float, size: tuple[int, int]) -> SparseStart:
-    """The same in pixels of pictures reduced `step` times to a size (columns, rows)."""
-    lens = start.rig.lens.copy()
+def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
+    """The same in pixels of pictures reduced `step` times to a size (columns, rows), its weights computed anew."""
+    rig, t, p = adjustment.rig, adjustment.tracks, adjustment.priors
+    lens, lens_prior, lens_sigma = rig.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
     lens[:, [F, CX, CY]] /= step
     lens[:, WIDTH], lens[:, HEIGHT] = size
-    t = start.tracks
+    lens_prior[:, 0] -= np.log(step)
+    lens_prior[:, 4:] /= step
+    lens_sigma[:, 4:] /= step
     tracks = Tracks(t.camera, t.point, (t.uv + 0.5) / step - 0.5, (t.sigma_px / np.float32(step)).astype(np.float32))
-    rig = replace(start.rig, lens=lens)
-    return replace(start, rig=rig, tracks=tracks, log_focal=start.log_focal - np.log(step))
+    priors = replace(p, lens=lens_prior, lens_sigma=lens_sigma)
+    out = Adjustment.begin(replace(rig, lens=lens), tracks, priors, adjustment.points)
+    out.common[:] = adjustment.common
+    common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
+    common_lens[:, 4:] /= step
+    out.step(9.0, datum(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0))
+    return out

@@ -58,7 +58,7 @@ class Start2D:
         gps_residual: complex (N,), recorded minus network's position, lag removed. lag: float64 (V,) seconds.
         yaw_known: bool (N,), whether pictures told the heading. scale_known: bool (L,), the ground scale.
         recorded_focal: float64 (L,), focal length that the recorded heights imply, NaN where they are impossible.
-        tags: for each lens, which recorded heading follows the pictures.
+        tags: for each vehicle, which recorded heading follows the pictures.
         graph: pairs between level pictures. misfit: median misfit of pairs in pixels, before and after levelling.
     """
 
@@ -134,7 +134,8 @@ def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[F
     for s in range(segments):
         turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
         level[records.segment == s] = turn @ level[records.segment == s]
-    tags = tuple(tag_heading(records, np.flatnonzero(yaw_known & (records.lens == k)), yaw) for k in range(len(focal)))
+    vehicles = [np.flatnonzero(yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)]
+    tags = tuple(tag_heading(records, rows, yaw) for rows in vehicles)
     each = metres[records.segment] * relative
     return Start2D(
         position=network.position,
@@ -205,8 +206,8 @@ def _fill_headings(records: Records, yaw: Array, known: Flags, component: Ints, 
     velocity = records.velocity()
     course = np.where(np.abs(velocity) > 0.3, wrap(np.pi / 2 - np.angle(velocity)), np.nan)
     guess = np.full(len(yaw), np.nan)
-    for k, tag in enumerate(tags):
-        rows = records.lens == k
+    for v, tag in enumerate(tags):
+        rows = records.vehicle == v
         source = tag.source or ("yaw" if np.isfinite(records.yaw[rows]).any() else "flight_yaw")
         guess[rows] = tag_yaw(records, source)[rows] + tag.offset
     guess = np.where(np.isfinite(guess), guess, course)

@@ -1,0 +1,132 @@
+"""Sparse photos of several vehicles matched and adjusted together, then taken apart into flights.
+
+Each vehicle alone would leave its own scale, tilt and drift: seams between legs and vehicles close only if the photos
+on both sides of them are adjusted together. Cameras that go by the same name share a lens until all else is found; then
+each vehicle has its own, close to the common one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.frame import Frame
+from orthoswarm.geo import LocalGrid
+from orthoswarm.swarm.adjust import Adjustment
+from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.matching import Progress, ReadGray
+from orthoswarm.swarm.plane import Array
+from orthoswarm.swarm.priors import GroupModel, Priors
+from orthoswarm.swarm.rig import Tracks
+from orthoswarm.swarm.sparse import SparseStart, read_records, sparse_start
+from orthoswarm.swarm.sparse_flight import flight_of
+from orthoswarm.swarm.sparse_solve import datum, solve_sparse
+
+_MOST_LENSES = 16
+_OWN_LENS_STEPS = 4
+_OWN_LENS_SIGMA = (0.01, 0.01, 0.01, 0.05)
+"""Of log f, k1, k2, k3 about the common lens."""
+_OWN_CENTRE_SHARE = 0.004
+_HELD_POSITION_M = 0.3
+_HELD_ATTITUDE = float(np.radians(0.3))
+_HELD_LENS = 0.003
+_MOVABLE = GroupModel(
+    bias_sigma=(_HELD_ATTITUDE, _HELD_ATTITUDE, _HELD_ATTITUDE), height_sigma=1.0, lag_sigma=0.0, drift_sigma=15.0,
+    drift_bend=0.5, knot_every=60,
+)  # fmt: skip
+
+
+def open_sparse_flights(
+    vehicles: Mapping[str, Sequence[Frame]],
+    grid: LocalGrid,
+    origin: Array,
+    read: ReadGray,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> dict[str, Flight]:
+    """Match the photos of several vehicles with each other and adjust them together, without a map.
+
+    Args:
+        vehicles: id -> frames in order of time, of one lens each.
+        grid: the area's grid.
+        origin: float64 (2,), of the local frame.
+        read: gives a photo's grey values at full size.
+        workers: threads; the result does not depend on it.
+        progress: called with stage, done, all.
+
+    Returns:
+        A flight for each vehicle. Its adjustment holds its own photos only, with priors at what was found together: it
+        may be moved as a whole (onto a map), but keeps its shape.
+    """
+    frames = [frame for part in vehicles.values() for frame in part]
+    records = read_records(frames, grid, origin, share_lenses=True)
+    start = sparse_start(frames, records, read, workers, progress)
+    adjustment = solve_sparse(start)
+    if len(vehicles) <= _MOST_LENSES:
+        adjustment = own_lenses(adjustment, start)
+    told = _told(start.warnings, list(vehicles))
+    flights, first = {}, 0
+    for name, part in vehicles.items():
+        rows = np.arange(first, first + len(part))
+        first += len(part)
+        alone = _apart(adjustment, start, rows)
+        flights[name] = flight_of(part, grid, origin, read, start, rows, alone, told[name])
+    return flights
+
+
+def _told(warnings: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
+    """Findings by vehicle; those that concern several go with the first one."""
+    told: dict[str, list[str]] = {name: [] for name in names}
+    for text in warnings:
+        own = [name for name in names if text.startswith(f"{name}:")]
+        told[own[0] if own else names[0]].append(text)
+    return told
+
+
+def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
+    """Let every vehicle have its own lens, close to the one that it shared, and adjust on."""
+    vehicle = start.records.vehicle
+    first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
+    lens = adjustment.rig.lens[adjustment.rig.lens_id[first]].copy()
+    p = adjustment.priors
+    sigma = np.empty((len(lens), 6))
+    sigma[:, :4] = _OWN_LENS_SIGMA
+    sigma[:, 4:] = _OWN_CENTRE_SHARE * lens[:, 6:7]
+    sigma[p.lens_sigma[adjustment.rig.lens_id[first]] == 0] = 0.0
+    rig = replace(adjustment.rig, lens=lens, lens_id=vehicle.astype(np.int32))
+    priors = replace(p, lens=np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]]), lens_sigma=sigma)
+    own = Adjustment.begin(rig, adjustment.tracks, priors, adjustment.points)
+    own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
+    for _ in range(_OWN_LENS_STEPS):
+        own.step(9.0, datum(own))
+    return own
+
+
+def _apart(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
+    """The adjustment of some photos by themselves, as found together with all others."""
+    local = np.full(len(adjustment.rig), -1, np.int32)
+    local[rows] = np.arange(len(rows), dtype=np.int32)
+    t = adjustment.tracks
+    mine = local[t.camera] >= 0
+    count = np.bincount(t.point[mine], minlength=len(adjustment.points))
+    kept = np.flatnonzero(mine & (count[t.point] >= 2))
+    points, point = np.unique(t.point[kept], return_inverse=True)
+    tracks = Tracks(local[t.camera[kept]], point.reshape(-1).astype(np.int32), t.uv[kept], t.sigma_px[kept])
+    rig = adjustment.rig.take(rows)
+    lens_row = int(rig.lens_id[0])
+    rig = replace(rig, lens=rig.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
+    lens = np.concatenate([[np.log(rig.lens[0, 0])], rig.lens[0, 1:6]])[None]
+    free = adjustment.priors.lens_sigma[lens_row] > 0
+    priors = Priors(
+        position=rig.position.copy(),
+        position_sigma=np.full((len(rows), 3), _HELD_POSITION_M),
+        rotation=rig.rotation.copy(),
+        rotation_sigma=np.full((len(rows), 3), _HELD_ATTITUDE),
+        velocity=start.velocity[rows],
+        group=np.zeros(len(rows), np.int32),
+        models=(_MOVABLE,),
+        lens=lens,
+        lens_sigma=np.where(free, _HELD_LENS * np.array([1, 1, 1, 1, rig.lens[0, 6], rig.lens[0, 6]]), 0.0)[None],
+    )
+    return Adjustment.begin(rig, tracks, priors, adjustment.points[points])
