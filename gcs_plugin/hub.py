@@ -19,6 +19,7 @@ from gcs_plugin.mission.exchange import Address
 from gcs_plugin.packets import Framer, Packet
 from gcs_plugin.signing import Signing
 from gcs_plugin.tlog import TlogWriter
+from orthoswarm.errors import InputError
 
 _PEER_S: Final = 30.0
 _BEAT_S: Final = 1.0
@@ -69,6 +70,7 @@ class Hub:
             wall: UTC epoch seconds.
         """
         self.own, self._sink, self._clock, self._wall = own, sink, clock, wall
+        opened = _make_links(links)
         self._tlog = TlogWriter(tlog) if tlog else None
         self._beat_at = 0.0
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -78,7 +80,7 @@ class Hub:
         self._selector.register(self._ear, selectors.EVENT_READ, None)
         self.sides: list[Side] = []
         self._by_link: dict[Link, Side] = {}
-        for link in [parse_link(link) if isinstance(link, str) else link for link in links]:
+        for link in opened:
             packer = dialect.MAVLink(None, own.system, own.component)
             side = Side(link, packer, Signing(key, link_id=len(self.sides)) if key else None)
             if side.signing is not None:
@@ -178,3 +180,16 @@ class Hub:
             dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
         )
         self.send(side, peer, heartbeat)
+
+
+def _make_links(links: Iterable[Link | str]) -> list[Link]:
+    """Links of their addresses; all are closed again if one of them is wrong."""
+    made: list[Link] = []
+    try:
+        for link in links:
+            made.append(parse_link(link) if isinstance(link, str) else link)
+    except InputError:
+        for link in made:
+            link.close()
+        raise
+    return made
