@@ -28,6 +28,7 @@ from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
+from orthoswarm.swarm.sparse_joint import open_sparse_flights
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
@@ -38,7 +39,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 
-TAKEOFF_LEVEL_M = 1.0
+TAKEOFF_LEVEL_M = 2.0
 """How well the takeoff level is known to be the level of the ground, one sigma."""
 TIE_SHARE = 0.5
 """Part of the ties' scatter that neighbouring ties have in common (terrain, map content), so that no number helps."""
@@ -95,18 +96,36 @@ def solo(
     frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
 ) -> VehicleState:
     """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
+    state = followed(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
+    if state is None:
+        watch = Stopwatch()
+        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
+        watch.lap("tracks")
+        state = _from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, watch)
+    return state
+
+
+def followed(
+    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
+) -> VehicleState | None:
+    """Refine one vehicle by itself; None where its pictures cannot be followed from one to the next."""
     watch = Stopwatch()
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
-    if flight is None:
-        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
-        flight.sparse = True
-        watch.lap("tracks")
-        surface = fit_surface(flight.adjustment, GroundModel())
-    else:
-        watch.lap("tracks")
-        surface = _relative(flight)
+    watch.lap("tracks")
+    return None if flight is None else _from_flight(flight, _relative(flight), origin, basemap, watch)
+
+
+def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None) -> VehicleState:
+    """Refine one vehicle whose photos were matched and adjusted together with those of others."""
+    return _from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, Stopwatch())
+
+
+def _from_flight(
+    flight: Flight, surface: GroundModel, origin: Array, basemap: MapWindow | None, watch: Stopwatch
+) -> VehicleState:
+    """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
     adj = flight.adjustment
     belief = surface.belief(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
@@ -116,7 +135,7 @@ def solo(
     watch.lap("relative")
     none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     state = VehicleState(
-        frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
+        flight.frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
         (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
     )  # fmt: skip
     if basemap is not None:
@@ -240,19 +259,39 @@ def refine_all(
     if not vehicles:
         raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
-    task = partial(solo, epsg=grid.epsg, origin=origin, basemap=basemap, options=options or Options())
-    states = []
-    units = split_units(vehicles)
-    for n, state in enumerate(run(task, units)):
-        states.append(state)
-        if progress:
-            progress("solo", n + 1, len(units))
+    states = _first_passes(split_units(vehicles), basemap, grid, origin, options or Options(), run, progress)
     coarse = [to_solution(s, origin, None, coarse=True) for s in states]
     states = _second_passes(states, basemap, origin, run, progress)
     _level(states)
     terrain = _shifted(common_terrain(states), origin)
     fine = [to_solution(s, origin, terrain) for s in states]
     return Refined(merge_units(coarse), merge_units(fine), terrain)
+
+
+def _first_passes(
+    units: list[list[Frame]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    origin: Array,
+    options: Options,
+    run: Run,
+    progress: Callable[[str, int, int], None] | None,
+) -> list[VehicleState]:
+    """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first."""
+    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options)
+    states: list[VehicleState | None] = []
+    for n, state in enumerate(run(task, units)):
+        states.append(state)
+        if progress:
+            progress("solo", n + 1, len(units))
+    waiting = [k for k, state in enumerate(states) if state is None]
+    if len(waiting) == 1:
+        flights = [open_sparse_flight(units[waiting[0]], grid, origin, read_frame, progress=progress)]
+    else:
+        flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, progress=progress)
+    for k, state in zip(waiting, run(partial(matched, origin=origin, basemap=basemap), flights), strict=True):
+        states[k] = state
+    return [state for state in states if state is not None]
 
 
 def _second_passes(
