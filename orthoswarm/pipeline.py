@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap, Bounds
+from orthoswarm.carried import carry, odd_ones
 from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import TILE_PX, write_cog
@@ -185,12 +186,18 @@ class _Batch:
 
     def refine(self, state: _State) -> _Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
+        recorded = state.recorded.placed
+        few = odd_ones([p.frame for p in recorded])
+        odd = [p for p, alone in zip(recorded, few, strict=True) if alone]
+        if odd:
+            names = f"{len(odd)} pictures" if len(odd) > 1 else "1 picture"
+            state.warnings.append(f"{names} of another camera or size, too few to be refined, follow their neighbours")
         known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
         if known is not None:
             self.clock.stages += known[1]
             return known[0]
         outer = Clock(self.workers.usage)
-        frames = [p.frame for p in state.recorded.placed]
+        frames = [p.frame for p, odd in zip(recorded, few, strict=True) if not odd]
         with outer.stage("refine", len(frames)) as stage:
             try:
                 refinement = self.call_refiner(frames, state)
@@ -202,6 +209,9 @@ class _Batch:
                 fault = f"{type(error).__name__}: {error}"
                 state.warnings.append(f"the refinement failed ({fault}); the map is the real-time one")
                 return None
+        if odd:
+            for solutions in (refinement.coarse, refinement.fine):
+                _append(solutions, carry(odd, recorded, [p for s in solutions for p in s.placed]))
         stages = _split_time(stage, refinement, self.options.until, state.basemap is not None)
         self.clock.stages += stages
         self.space.remember("refinement", (refinement, stages))
@@ -405,6 +415,13 @@ def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> floa
     if terrain is None or not placed:
         return 0.0
     return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+
+
+def _append(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
+    """Add frames to the solutions of their vehicles (to the first one if a vehicle has none)."""
+    for p in carried:
+        own = next((i for i, s in enumerate(solutions) if s.vehicle == p.frame.vehicle), 0)
+        solutions[own] = replace(solutions[own], placed=[*solutions[own].placed, p])
 
 
 def _bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoswarm.camera import angles_from_rotation
+from orthoswarm.camera import Camera, angles_from_rotation, rotation_from_angles
+from orthoswarm.carried import carry, odd_ones
 from orthoswarm.frame import Fix, Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.recorded import THETA_HAT_RAD, area_grid, course, recorded_cameras
@@ -84,3 +85,23 @@ def test_a_position_that_cannot_be_is_left_out():
     made = recorded_cameras(frames, GRID)
     assert [r.image for r in made.rejected] == ["a/3.jpg", "a/4.jpg"] and len(made.placed) == 4
     assert "90 km from the others" in made.rejected[0].reason
+
+
+def test_odd_pictures_follow_their_neighbours():
+    frames = [frame(i, 0, 20.0 * i) for i in range(6)] + [replace(frame(6, 30, 50), width=800, height=600)]
+    recorded = recorded_cameras(frames, GRID).placed
+    assert odd_ones(frames).tolist() == [False] * 6 + [True]
+    assert not odd_ones(frames[6:]).any()
+
+    def refined(p):
+        turned = rotation_from_angles(0.1, 0, 0) @ rotation_from_angles(0, 0, 0).T
+        lens = replace(p.camera.lens, focal_px=0.8 * p.camera.lens.focal_px)
+        camera = Camera(p.camera.position + [3.0, -2.0, 5.0], turned @ p.camera.rotation, lens)
+        return replace(p, camera=camera, stage="fine", sigma_m=0.1)
+
+    (made,) = carry(recorded[6:], recorded, [refined(p) for p in recorded[:6]])
+    wanted = refined(recorded[6]).camera
+    np.testing.assert_allclose(made.camera.position, wanted.position)
+    np.testing.assert_allclose(made.camera.rotation, wanted.rotation)
+    assert made.camera.lens == wanted.lens and made.stage == "fine" and made.weak and made.sigma_m > 1
+    assert carry(recorded[6:], recorded, []) == []

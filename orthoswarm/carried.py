@@ -1,0 +1,57 @@
+"""Pictures too few of their kind to be refined (another size or camera): placed as their neighbours were moved."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.camera import Camera
+from orthoswarm.frame import Frame
+from orthoswarm.placement import PlacedFrame
+
+FEWEST = 3
+_NEIGHBOURS = 5
+_EXTRA_SIGMA_M = 2.0
+
+
+def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """Which frames have fewer than FEWEST of their vehicle, camera and size, where others have enough: bool (N,)."""
+    kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
+    count = Counter(kinds)
+    few = np.array([count[kind] < FEWEST for kind in kinds], bool)
+    return few if not few.all() else np.zeros(len(frames), bool)
+
+
+def carry(
+    odd: Sequence[PlacedFrame], recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]
+) -> list[PlacedFrame]:
+    """Place frames by what refinement changed in their nearest neighbours: position, attitude, focal length.
+
+    Args:
+        odd: as recorded.
+        recorded: the refined frames as recorded, with the same assumed field of view.
+        refined: frames after refinement.
+    """
+    before = {p.frame.image: p for p in recorded}
+    pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before and not p.weak]
+    return [_carried(one, _near(one, pairs)) for one in odd] if pairs else []
+
+
+def _near(one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> list[tuple[PlacedFrame, PlacedFrame]]:
+    """The refined frames nearest to a frame, of its own vehicle if there are any."""
+    own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
+    away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]
+    return [own[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
+
+
+def _carried(one: PlacedFrame, near: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> PlacedFrame:
+    shift = np.median([after.camera.position - old.camera.position for old, after in near], axis=0)
+    old, after = near[0]
+    turn = after.camera.rotation @ old.camera.rotation.T
+    ratio = float(np.median([a.camera.lens.focal_px / o.camera.lens.focal_px for o, a in near]))
+    lens = replace(one.camera.lens, focal_px=one.camera.lens.focal_px * ratio)
+    camera = Camera(one.camera.position + shift, turn @ one.camera.rotation, lens)
+    sigma = float(np.hypot(max(a.sigma_m for _, a in near), _EXTRA_SIGMA_M))
+    return PlacedFrame(one.frame, camera, after.stage, sigma, weak=True)
