@@ -96,7 +96,7 @@ def test_odd_pictures_follow_their_neighbours():
     def refined(p):
         turned = rotation_from_angles(0.1, 0, 0) @ rotation_from_angles(0, 0, 0).T
         lens = replace(p.camera.lens, focal_px=0.8 * p.camera.lens.focal_px)
-        camera = Camera(p.camera.position + [3.0, -2.0, 5.0], turned @ p.camera.rotation, lens)
+        camera = Camera(np.add(p.camera.position, (3.0, -2.0, 5.0)), turned @ p.camera.rotation, lens)
         return replace(p, camera=camera, stage="fine", sigma_m=0.1)
 
     (made,) = carry(recorded[6:], recorded, [refined(p) for p in recorded[:6]])
