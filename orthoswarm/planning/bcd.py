@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7
+_SNAP_M, _INTO_M = 1e-4, 0.01
 _TOOTH = 0.1
 
 
@@ -38,7 +39,7 @@ def cells(ground: Geometry) -> list[Geometry]:
     for polygon in shapely.get_parts(tilt.turn(ground)):
         polygon = shapely.geometry.polygon.orient(polygon)
         cuts = [_cut(polygon, corner) for corner in critical_points(polygon)]
-        lines = shapely.union_all([polygon.boundary, *[c for c in cuts if c is not None]])
+        lines = shapely.union_all([polygon.boundary, *[c for c in cuts if c is not None]], grid_size=_SNAP_M)
         for cell in shapely.get_parts(shapely.polygonize(shapely.get_parts(lines))):
             if shapely.contains_xy(polygon, *_point_in(cell)):
                 found.append(shapely.transform(cell, tilt.to_grid))
@@ -70,7 +71,11 @@ def _cut(polygon: Geometry, corner: Array) -> Geometry:
     line = shapely.LineString([(corner[0], low - 1.0), (corner[0], high + 1.0)])
     here = shapely.Point(corner)
     near = [p for p in shapely.get_parts(line.intersection(polygon)) if p.distance(here) < 1e-6 and p.length > 0]
-    return shapely.union_all(near) if near else None
+    if not near:
+        return None
+    bottom, top = min(p.bounds[1] for p in near), max(p.bounds[3] for p in near)
+    # A little into the walls, so that cut and wall are certain to meet.
+    return shapely.LineString([(corner[0], bottom - _INTO_M), (corner[0], top + _INTO_M)])
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 MOST_VEHICLES = 250  # MAVLink system ids
 _ITEMS_A_LEG = 4
 _SPARE_ITEMS = 40
+_FARTHEST_M = 100_000.0
 _FAIR, _UNFAIR = 1.15, 1.22
 
 
@@ -140,6 +141,10 @@ class Crew:
             InputError: the endurance is too short.
         """
         options, router = self._options, self._router
+        if self.starts is not None:
+            far = float(np.hypot(*(self.starts - legs[0, 0]).T).max())
+            if not far < _FARTHEST_M:
+                raise InputError(f"a start is {far / 1000:.0f} km from the area; check that it is given as LAT,LON")
         row = cut(legs, router, options.motion, self.vehicles, self._least_leg_m)
         pieces = share(row, self.vehicles, self.starts, self._returns, router, options.motion, self._limits)
         if pieces is None:
