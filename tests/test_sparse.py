@@ -1,6 +1,7 @@
 """The front end for sparse photos and its adjustment: made-up flights with truth, then real ones."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from orthoswarm.picture import PictureError, read_gray
 from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.findings import runs
 from orthoswarm.swarm.heading import wrap
+from orthoswarm.swarm.matching import serial
 from orthoswarm.swarm.rig import HEIGHT, WIDTH, F
 from orthoswarm.swarm.sparse import SparseStart, assemble, read_records, sparse_start
 from orthoswarm.swarm.sparse_flight import open_sparse_flight, reduced
@@ -172,7 +174,9 @@ def flat_flight(count: int = 5):
 def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
     frames, pictures = flat_flight()
     records = read_records(frames, GRID, ORIGIN)
-    results = [sparse_start(frames, records, lambda f: pictures[f.image], workers=workers) for workers in (1, 2)]
+    with ThreadPoolExecutor(2) as pool:
+        runs_in = (serial, lambda function, items: pool.map(function, items))
+        results = [sparse_start(frames, records, lambda f: pictures[f.image], run) for run in runs_in]
     one, two = results
     assert np.array_equal(one.tracks.uv, two.tracks.uv)
     assert np.array_equal(one.rig.position, two.rig.position)
@@ -185,14 +189,14 @@ def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
 def test_vehicles_come_apart_as_they_were_found_together():
     frames, pictures = flat_flight(6)
     frames = [replace(f, vehicle="a" if k % 2 else "b") for k, f in enumerate(frames)]
-    vehicles = {v: [f for f in frames if f.vehicle == v] for v in "ba"}
-    flights = open_sparse_flights(vehicles, GRID, ORIGIN, lambda f: pictures[f.image])
-    assert list(flights) == ["b", "a"]
-    north = {f.image: p[1] for v in flights.values() for f, p in zip(v.frames, v.adjustment.rig.position)}
+    units = [[f for f in frames if f.vehicle == v] for v in "ba"]
+    flights = open_sparse_flights(units, GRID, ORIGIN, lambda f: pictures[f.image])
+    assert [[f.image for f in flight.frames] for flight in flights] == [[f.image for f in unit] for unit in units]
+    north = {f.image: p[1] for v in flights for f, p in zip(v.frames, v.adjustment.rig.position)}
     steps = np.diff([north[f.image] for f in frames])
     assert np.median(steps) == pytest.approx(20.0, abs=1.5)
     assert np.ptp(steps) < 1.0
-    for flight in flights.values():
+    for flight in flights:
         assert flight.sparse
         assert len(flight.adjustment.rig.lens) == 1
         assert np.nanmedian(np.hypot(*flight.adjustment.residuals().T)) < 0.5
@@ -341,10 +345,10 @@ def test_legs_of_sheffield_as_vehicles_fit_together(real_data):
     for frame in split_legs(frames, grid):
         vehicles.setdefault(frame.vehicle, []).append(frame)
     assert len(vehicles) >= 8
-    flights = open_sparse_flights(vehicles, grid, origin, lambda f: read_gray(f.path))
+    flights = open_sparse_flights(list(vehicles.values()), grid, origin, lambda f: read_gray(f.path))
     rows = [line.split() for line in (folder / "gcp_file_4000px.txt").read_text().splitlines()[1:]]
     off = []
-    for flight in flights.values():
+    for flight in flights:
         index = {f.image: k for k, f in enumerate(flight.frames)}
         for r in (r for r in rows if r[5] in index):
             uv = np.array([[(float(r[3]) + 0.5) * 0.2 - 0.5, (float(r[4]) + 0.5) * 0.2 - 0.5]])

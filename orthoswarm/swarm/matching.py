@@ -5,9 +5,9 @@ pairs in order of time come first, then near ones, then more for photos that hav
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TypeVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ from orthoswarm.swarm.start2d import Start2D, start_in_plane
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
 Progress = Callable[[str, int, int], None]
-A = TypeVar("A")
-B = TypeVar("B")
+T = TypeVar("T")
 
 REACH_SHARE = 0.68
 _WIDE_REACH_SHARE = 0.8
@@ -33,6 +32,19 @@ _MORE_COUNT = 12
 _ENOUGH_PAIRS = 5
 _WEAK_PAIRS = 2
 _WEAK_MATCHES = 40
+_CHUNK = 64
+
+
+class Run(Protocol):
+    """How tasks are run: one after the other, in threads, in processes; results come in the order of the items."""
+
+    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+        """Yield function(item) for each item."""
+
+
+def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+    """Run tasks one after the other in this process."""
+    return map(function, items)
 
 
 @dataclass(slots=True)
@@ -41,7 +53,8 @@ class PairGraphBuilder:
 
     Attributes:
         frames: the photos. records: what they recorded. read_gray: gives a photo's grey values at any size.
-        workers: threads (OpenCV and numpy let go of the interpreter); results do not depend on it.
+        run: where features are found and matched; results do not depend on it.
+        progress: called with stage, done, all.
         features: of each photo. tried: pair -> match (empty where it failed).
         damaged: photo -> why it cannot be read.
     """
@@ -49,7 +62,7 @@ class PairGraphBuilder:
     frames: Sequence[Frame]
     records: Records
     read_gray: ReadGray
-    workers: int = 1
+    run: Run = serial
     progress: Progress | None = None
     features: list[Features] = field(default_factory=list)
     tried: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
@@ -57,14 +70,19 @@ class PairGraphBuilder:
 
     def detect_all(self) -> None:
         """Find the features of all photos."""
-        photos = list(range(len(self.frames)))
-        self.features = list(self._map("features", self._detect, photos))
+        self.features = [Features.none(f.width, f.height) for f in self.frames]
+        self._detect(list(range(len(self.frames))), WORKING_PIXELS)
 
     def try_pairs(self, pairs: Ints) -> None:
         """Match pairs that were not tried yet."""
         fresh = [(int(a), int(b)) for a, b in pairs if (int(a), int(b)) not in self.tried]
-        for pair, match in zip(fresh, self._map("pairs", self._match, fresh), strict=True):
-            self.tried[pair] = match
+        chunks = [fresh[k : k + _CHUNK] for k in range(0, len(fresh), _CHUNK)]
+        tasks = [(chunk, {k: self.features[k] for pair in chunk for k in pair}) for chunk in chunks]
+        done = 0
+        for chunk, matches in zip(chunks, self.run(match_chunk, tasks), strict=True):
+            self.tried.update(zip(chunk, matches, strict=True))
+            done += len(chunk)
+            self._tell("pairs", done, len(fresh))
 
     def pairs(self) -> list[Pair]:
         """The matched pairs in order."""
@@ -90,41 +108,41 @@ class PairGraphBuilder:
         return start_in_plane(self.records, self.pairs(), self.features)
 
     def redetect(self, weak: NDArray[np.bool_]) -> None:
-        """Find features of weak photos on larger pictures and forget their failed pairs."""
-        rows = np.flatnonzero(weak)
-        found = self._map("features", lambda k: self._detect(k, FINE_PIXELS), [int(k) for k in rows])
-        for k, features in zip(rows.tolist(), found, strict=True):
-            self.features[k] = features
+        """Find features of weak photos on larger pictures and forget their pairs."""
+        self._detect(np.flatnonzero(weak).tolist(), FINE_PIXELS)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
 
-    def _detect(self, k: int, pixels: int = WORKING_PIXELS) -> Features:
-        frame = self.frames[k]
-        try:
-            gray = self.read_gray(frame)
-        except PictureError as error:
-            self.damaged[k] = str(error)
-            return Features.none(frame.width, frame.height)
-        rows, columns = gray.shape
-        if abs(columns * frame.height - rows * frame.width) > 0.02 * columns * frame.height:
-            self.damaged[k] = f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"
-            return Features.none(frame.width, frame.height)
-        return detect(gray, frame.width, frame.height, pixels)
+    def _detect(self, photos: list[int], pixels: int) -> None:
+        task = partial(features_of, read_gray=self.read_gray, pixels=pixels)
+        found = self.run(task, [self.frames[k] for k in photos])
+        for n, (k, result) in enumerate(zip(photos, found, strict=True)):
+            if isinstance(result, str):
+                self.damaged[k] = result
+            else:
+                self.features[k] = result
+            self._tell("features", n + 1, len(photos))
 
-    def _match(self, pair: tuple[int, int]) -> NDArray[np.int32]:
-        return match_features(self.features[pair[0]], self.features[pair[1]])
+    def _tell(self, stage: str, done: int, total: int) -> None:
+        if self.progress:
+            self.progress(stage, done, total)
 
-    def _map(self, stage: str, function: Callable[[A], B], items: Sequence[A]) -> Iterable[B]:
-        if self.workers > 1 and len(items) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                yield from self._counted(stage, pool.map(function, items), len(items))
-        else:
-            yield from self._counted(stage, map(function, items), len(items))
 
-    def _counted(self, stage: str, results: Iterable[B], total: int) -> Iterable[B]:
-        for n, result in enumerate(results):
-            if self.progress:
-                self.progress(stage, n + 1, total)
-            yield result
+def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features | str:
+    """Features of a photo, or why it cannot be used."""
+    try:
+        gray = read_gray(frame)
+    except PictureError as error:
+        return str(error)
+    rows, columns = gray.shape
+    if abs(columns * frame.height - rows * frame.width) > 0.02 * columns * frame.height:
+        return f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"
+    return detect(gray, frame.width, frame.height, pixels)
+
+
+def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
+    """Matches of some pairs, given the features of their photos."""
+    pairs, features = task
+    return [match_features(features[a], features[b]) for a, b in pairs]
 
 
 def build_pair_graph(builder: PairGraphBuilder) -> Start2D:

@@ -18,7 +18,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow, Solution, Terrain
 from orthoswarm.swarm.adjust import Ties
-from orthoswarm.swarm.flight import Flight, open_flight, weigh_records
+from orthoswarm.swarm.flight import Flight, free_strong_lens, open_flight, weigh_records
 from orthoswarm.swarm.ground import GroundModel, fit_surface, ground_points
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.levels import level_network
@@ -149,13 +149,16 @@ def _from_flight(
 def _relative(flight: Flight) -> GroundModel:
     """The adjustment without a map, its ground fitted as soon as the points allow."""
     surface = GroundModel()
-    for k, c in enumerate((1e4, 1e4, 100.0, 100.0, 9.0, 9.0)):
+    schedule = [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]
+    for k, c in enumerate(schedule):
         first = k < 2
         flight.adjustment.step(
             c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
         )
         if k == 3:
             weigh_records(flight)
+            if free_strong_lens(flight):
+                schedule += [9.0] * 4
         if k >= 3:
             surface = fit_surface(flight.adjustment, surface)
     return surface
@@ -285,12 +288,13 @@ def _first_passes(
         if progress:
             progress("solo", n + 1, len(units))
     waiting = [k for k, state in enumerate(states) if state is None]
-    if len(waiting) == 1:
-        flights = [open_sparse_flight(units[waiting[0]], grid, origin, read_frame, progress=progress)]
-    else:
-        flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, progress=progress)
-    for k, state in zip(waiting, run(partial(matched, origin=origin, basemap=basemap), flights), strict=True):
-        states[k] = state
+    if waiting:
+        watch = Stopwatch()
+        flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, run, progress)
+        watch.lap("tracks")
+        for k, state in zip(waiting, run(partial(matched, origin=origin, basemap=basemap), flights), strict=True):
+            state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
+            states[k] = state
     return [state for state in states if state is not None]
 
 

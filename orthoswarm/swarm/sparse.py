@@ -14,7 +14,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm.chains import build_tracks, thin_tracks
 from orthoswarm.swarm.features import Features
 from orthoswarm.swarm.findings import findings, flipped_yaw, unplaced_reasons
-from orthoswarm.swarm.matching import PairGraphBuilder, Progress, ReadGray, build_pair_graph
+from orthoswarm.swarm.matching import PairGraphBuilder, Progress, ReadGray, Run, build_pair_graph, serial
 from orthoswarm.swarm.network import LAG_SPREAD_S
 from orthoswarm.swarm.pairs import Pair
 from orthoswarm.swarm.plane import Array, Flags, Ints, Records
@@ -113,7 +113,7 @@ def sparse_start(
     frames: Sequence[Frame],
     records: Records,
     read_gray: ReadGray,
-    workers: int = 1,
+    run: Run = serial,
     progress: Progress | None = None,
 ) -> SparseStart:
     """Match photos with each other and find start values of all of them.
@@ -123,10 +123,10 @@ def sparse_start(
         records: see `read_records`.
         read_gray: gives a photo's grey values, uint8 (rows, columns), at any size (a reduced decode is welcome); may
             raise PictureError.
-        workers: threads; the result does not depend on it.
+        run: where features are found and matched; the result does not depend on it.
         progress: called with stage, done, all.
     """
-    builder = PairGraphBuilder(frames, records, read_gray, workers, progress)
+    builder = PairGraphBuilder(frames, records, read_gray, run, progress)
     start = build_pair_graph(builder)
     return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
 

@@ -13,7 +13,7 @@ from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.calibrate import Calibration
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.heading import wrap
-from orthoswarm.swarm.matching import Progress, ReadGray
+from orthoswarm.swarm.matching import Progress, ReadGray, Run, serial
 from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.rig import CX, CY, HEIGHT, WIDTH, F, Tracks
@@ -27,7 +27,7 @@ def open_sparse_flight(
     grid: LocalGrid,
     origin: Array,
     read: ReadGray,
-    workers: int = 1,
+    run: Run = serial,
     progress: Progress | None = None,
 ) -> Flight:
     """Match a vehicle's photos with each other and adjust them without a map.
@@ -39,10 +39,11 @@ def open_sparse_flight(
         grid: the area's grid.
         origin: float64 (2,), of the local frame.
         read: gives a photo's grey values at full size.
-        workers: threads; the result does not depend on it.
+        run: where features are found and matched; the result does not depend on it.
         progress: called with stage, done, all.
     """
-    start = sparse_start(frames, read_records(frames, grid, origin), read, workers, progress)
+    frames = [replace(frame, camera=frames[0].camera) for frame in frames]
+    start = sparse_start(frames, read_records(frames, grid, origin), read, run, progress)
     return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), solve_sparse(start), start.warnings)
 
 

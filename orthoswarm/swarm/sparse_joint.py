@@ -5,7 +5,7 @@ on both sides of them are adjusted together. Cameras that go by the same name sh
 each vehicle has its own, close to the common one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +15,12 @@ from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.flight import Flight
-from orthoswarm.swarm.matching import Progress, ReadGray
+from orthoswarm.swarm.matching import Progress, ReadGray, Run, serial
 from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.rig import Tracks
 from orthoswarm.swarm.sparse import SparseStart, read_records, sparse_start
-from orthoswarm.swarm.sparse_flight import flight_of
+from orthoswarm.swarm.sparse_flight import flight_of, open_sparse_flight
 from orthoswarm.swarm.sparse_solve import datum, solve_sparse
 
 _MOST_LENSES = 16
@@ -38,49 +38,52 @@ _MOVABLE = GroupModel(
 
 
 def open_sparse_flights(
-    vehicles: Mapping[str, Sequence[Frame]],
+    units: Sequence[Sequence[Frame]],
     grid: LocalGrid,
     origin: Array,
     read: ReadGray,
-    workers: int = 1,
+    run: Run = serial,
     progress: Progress | None = None,
-) -> dict[str, Flight]:
+) -> list[Flight]:
     """Match the photos of several vehicles with each other and adjust them together, without a map.
 
     Args:
-        vehicles: id -> frames in order of time, of one lens each.
+        units: frames of one vehicle and one lens each, in order of time.
         grid: the area's grid.
         origin: float64 (2,), of the local frame.
         read: gives a photo's grey values at full size.
-        workers: threads; the result does not depend on it.
+        run: where features are found and matched; the result does not depend on it.
         progress: called with stage, done, all.
 
     Returns:
-        A flight for each vehicle. Its adjustment holds its own photos only, with priors at what was found together: it
+        A flight for each unit. Its adjustment holds its own photos only, with priors at what was found together: it
         may be moved as a whole (onto a map), but keeps its shape.
     """
-    frames = [frame for part in vehicles.values() for frame in part]
+    if len(units) == 1:
+        return [open_sparse_flight(units[0], grid, origin, read, run, progress)]
+    units = [[replace(frame, camera=part[0].camera) for frame in part] for part in units]
+    frames = [frame for part in units for frame in part]
     records = read_records(frames, grid, origin, share_lenses=True)
-    start = sparse_start(frames, records, read, workers, progress)
+    start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
-    if len(vehicles) <= _MOST_LENSES:
+    if int(records.vehicle.max()) < _MOST_LENSES:
         adjustment = own_lenses(adjustment, start)
-    told = _told(start.warnings, list(vehicles))
-    flights, first = {}, 0
-    for name, part in vehicles.items():
+    told = _told(start.warnings, [part[0].vehicle for part in units])
+    flights, first = [], 0
+    for part, warnings in zip(units, told, strict=True):
         rows = np.arange(first, first + len(part))
         first += len(part)
         alone = _apart(adjustment, start, rows)
-        flights[name] = flight_of(part, grid, origin, read, start, rows, alone, told[name])
+        flights.append(flight_of(part, grid, origin, read, start, rows, alone, warnings))
     return flights
 
 
-def _told(warnings: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
-    """Findings by vehicle; those that concern several go with the first one."""
-    told: dict[str, list[str]] = {name: [] for name in names}
+def _told(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
+    """Findings by unit; those that concern several go with the first one."""
+    told: list[list[str]] = [[] for _ in names]
     for text in warnings:
-        own = [name for name in names if text.startswith(f"{name}:")]
-        told[own[0] if own else names[0]].append(text)
+        own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
+        told[own[0] if own else 0].append(text)
     return told
 
 
