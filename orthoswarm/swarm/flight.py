@@ -15,13 +15,14 @@ from orthoswarm.swarm.legs import split_legs
 from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.records import Records, read_records
-from orthoswarm.swarm.rig import Rig, Tracks
+from orthoswarm.swarm.rig import K1, Rig, Tracks
 from orthoswarm.swarm.sights import Sights, sights
 from orthoswarm.swarm.tracks import follow, predicted_homography
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
+STRONG_K1 = 0.12
 FEWEST = 10
 FOLLOWED_OVERLAP = 0.78
 """Fewer pictures, or less forward overlap, are matched in pairs instead of being followed."""
@@ -100,6 +101,21 @@ def weigh_records(flight: Flight) -> None:
         sigma[:, 2] = z
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
+
+
+def free_strong_lens(flight: Flight) -> bool:
+    """Give a strongly distorting lens all its parameters; a weak one keeps two, which is better held.
+
+    Returns:
+        True if more parameters are free now (some more steps are due).
+    """
+    adj = flight.adjustment
+    if float(np.abs(adj.rig.lens[:, K1]).max()) < STRONG_K1:
+        return False
+    width = flight.pictures.size[0]
+    sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.rig.lens), 1))
+    adj.priors = replace(adj.priors, lens_sigma=sigma)
+    return True
 
 
 def _jitter(values: Array) -> Array:
