@@ -17,12 +17,14 @@ from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.records import Records, read_records
 from orthoswarm.swarm.rig import K1, Rig, Tracks
 from orthoswarm.swarm.sights import Sights, sights
-from orthoswarm.swarm.tracks import follow, predicted_homography
+from orthoswarm.swarm.tracks import CELL_PX, follow, predicted_homography
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 STRONG_K1 = 0.12
+FEW = 100
+"""Flights of fewer pictures are followed at four times as many corners."""
 FEWEST = 10
 FOLLOWED_OVERLAP = 0.78
 """Fewer pictures, or less forward overlap, are matched in pairs instead of being followed."""
@@ -137,7 +139,8 @@ def _track(records: Records, pictures: Pictures, calibration: Calibration) -> tu
         step = np.array([steps[i, 0], steps[i, 1], 0.0])
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
-    return follow(len(rotation), pictures.gray, prediction)
+    few = len(rotation) < FEW
+    return follow(len(rotation), pictures.gray, prediction, cell_px=CELL_PX // 2 if few else CELL_PX)
 
 
 def _begin(records: Records, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:

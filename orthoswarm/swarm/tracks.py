@@ -47,9 +47,11 @@ class Tracker:
 
     Attributes:
         scale: full-resolution pixels per pixel of the pictures that are fed.
+        cell_px: one track is kept in each cell of this size.
     """
 
     scale: float = 1.0
+    cell_px: int = CELL_PX
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
@@ -113,7 +115,7 @@ class Tracker:
         kept = live.take(good)
         kept.uv, kept.age = found[good], kept.age + 1
         self._to_first_sight(kept, gray)
-        self._live = _oldest_per_cell(kept, gray.shape)
+        self._live = _oldest_per_cell(kept, gray.shape, self.cell_px)
         return float(good.sum()) / max(before, 1)
 
     def _to_first_sight(self, live: _Live, gray: Gray) -> None:
@@ -145,15 +147,16 @@ class Tracker:
 
     def _start(self, gray: Gray) -> None:
         """New corners: the strongest of each empty cell."""
-        rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
+        size = self.cell_px
+        rows, cols = gray.shape[0] // size, gray.shape[1] // size
         if rows == 0 or cols == 0:
             return
-        top, left = (gray.shape[0] - rows * CELL_PX) // 2, (gray.shape[1] - cols * CELL_PX) // 2
+        top, left = (gray.shape[0] - rows * size) // 2, (gray.shape[1] - cols * size) // 2
         taken = np.zeros((rows, cols), bool)
-        r = ((self._live.uv[:, 1] - top) // CELL_PX).astype(int).clip(0, rows - 1)
-        c = ((self._live.uv[:, 0] - left) // CELL_PX).astype(int).clip(0, cols - 1)
+        r = ((self._live.uv[:, 1] - top) // size).astype(int).clip(0, rows - 1)
+        c = ((self._live.uv[:, 0] - left) // size).astype(int).clip(0, cols - 1)
         taken[r, c] = True
-        uv = corners(gray, ~taken, top, left)
+        uv = corners(gray, ~taken, size, top, left)
         if len(uv):
             ident = np.arange(self._next, self._next + len(uv))
             self._next += len(uv)
@@ -166,7 +169,9 @@ class Tracker:
             )
 
 
-def corners(gray: Gray, empty: NDArray[np.bool_], top: int = 0, left: int = 0) -> NDArray[np.float32]:
+def corners(
+    gray: Gray, empty: NDArray[np.bool_], size: int = CELL_PX, top: int = 0, left: int = 0
+) -> NDArray[np.float32]:
     """The strongest corner (minimum eigenvalue) of each wanted cell: float32 (K, 2), column and row.
 
     Cells without texture give none. Only the rows of cells that are wanted are computed.
@@ -174,18 +179,18 @@ def corners(gray: Gray, empty: NDArray[np.bool_], top: int = 0, left: int = 0) -
     found: list[tuple[float, float]] = []
     floor = 1e-4
     for row in np.flatnonzero(empty.any(1)):
-        y0 = top + int(row) * CELL_PX
-        a, b = max(y0 - 3, 0), min(y0 + CELL_PX + 3, gray.shape[0])
+        y0 = top + int(row) * size
+        a, b = max(y0 - 3, 0), min(y0 + size + 3, gray.shape[0])
         for first, last in _runs(empty[row]):
-            x0, x1 = left + first * CELL_PX, left + last * CELL_PX
+            x0, x1 = left + first * size, left + last * size
             c, d = max(x0 - 3, 0), min(x1 + 3, gray.shape[1])
-            score = cv2.cornerMinEigenVal(gray[a:b, c:d], 5, ksize=3)[y0 - a : y0 - a + CELL_PX, x0 - c : x1 - c]
+            score = cv2.cornerMinEigenVal(gray[a:b, c:d], 5, ksize=3)[y0 - a : y0 - a + size, x0 - c : x1 - c]
             _mask_border(score, y0, x0, gray.shape)
-            cells = score.reshape(CELL_PX, last - first, CELL_PX).transpose(1, 0, 2).reshape(last - first, -1)
+            cells = score.reshape(size, last - first, size).transpose(1, 0, 2).reshape(last - first, -1)
             best = cells.argmax(1)
             for n, k in enumerate(best):
                 if cells[n, k] > floor:
-                    found.append((x0 + n * CELL_PX + int(k) % CELL_PX, y0 + int(k) // CELL_PX))
+                    found.append((x0 + n * size + int(k) % size, y0 + int(k) // size))
     return np.array(found, np.float32).reshape(-1, 2)
 
 
@@ -253,10 +258,10 @@ def _global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[
     return (4.0 * dx, 4.0 * dy) if response > 0.05 else None
 
 
-def _oldest_per_cell(live: _Live, shape: tuple[int, ...]) -> _Live:
+def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
     """One track a cell, the one followed longest: spread matters more than strength."""
-    cols = shape[1] // CELL_PX + 1
-    cell = (live.uv[:, 1] // CELL_PX).astype(np.int64) * cols + (live.uv[:, 0] // CELL_PX).astype(np.int64)
+    cols = shape[1] // size + 1
+    cell = (live.uv[:, 1] // size).astype(np.int64) * cols + (live.uv[:, 0] // size).astype(np.int64)
     order = np.lexsort((live.ident, -live.age))
     _, first = np.unique(cell[order], return_index=True)
     keep = np.sort(order[first])
@@ -282,9 +287,10 @@ def follow(
     read: Callable[[int], Gray],
     prediction: Callable[[int], Array | None],
     scale: float = 1.0,
+    cell_px: int = CELL_PX,
 ) -> tuple[Tracks, NDArray[np.float64]]:
     """Track through pictures 0..count-1; returns the tracks and the share that survived into each picture."""
-    tracker = Tracker(scale)
+    tracker = Tracker(scale, cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))
