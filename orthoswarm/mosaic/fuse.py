@@ -16,6 +16,8 @@ _ONE = np.uint32(1)
 _8 = np.uint32(8)
 _FULL = np.uint32(256)
 _FRACTION = np.uint32(255)
+RUN = 32
+"""Pixels that vector code handles at once."""
 
 
 @kernel
@@ -158,16 +160,66 @@ def _blend(texels, stride, at, weight, keep, target):  # type: ignore[no-untyped
 
 
 @kernel
-def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, lens, gsd_m, reals, integers):  # type: ignore[no-untyped-def]
+def _score(new, row_score, dx0, dy2, area, outside_left, inside_end):  # type: ignore[no-untyped-def]
+    """Set new to the orthogonality of a row's pixels where it beats what is there, else 0; first and last such pixel.
+
+    Pixels before outside_left and from inside_end on are not in the footprint.
+    """
+    zero, one, least = np.float32(0.0), np.float32(1.0), np.float32(1e-6)
+    begin, end = np.int32(outside_left), np.int32(inside_end)
+    first, last = np.int32(1 << 30), np.int32(0)
+    for k in range(new.shape[0]):
+        i = np.int32(k)
+        dx = dx0 + np.float32(i)
+        q = one / max((dx * dx + dy2) * area, least)
+        better = (q > row_score[k]) & (i >= begin) & (i < end)
+        new[k] = q if better else zero
+        first = min(first, i if better else np.int32(1 << 30))
+        last = max(last, i + np.int32(1) if better else np.int32(0))
+    return first, last
+
+
+@kernel
+def _locate(new, us, vs, at, weight, start, step, lens, limits, stride):  # type: ignore[no-untyped-def]
+    """Texel indices and weights of a run of pixels; sets new to 0 outside the picture; gives how many stay.
+
+    start and step: homogeneous coordinates (x, y, w) of the first pixel and from pixel to pixel, float32.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    x0, y0, w0 = start
+    mx, my, mw = step
+    k1, k2, k3, focal, pu, pv = lens
+    u_low, u_high, v_low, v_high, u_last, v_last = limits
+    for i in range(new.shape[0]):
+        n = np.float32(i)
+        inverse = one / (w0 + mw * n)
+        us[i] = (x0 + mx * n) * inverse
+        vs[i] = (y0 + my * n) * inverse
+    if k1 != zero or k2 != zero or k3 != zero:
+        _distort(us, vs, k1, k2, k3)
+    hits = np.int32(0)
+    for i in range(new.shape[0]):
+        fu, fv = us[i] * focal + pu, vs[i] * focal + pv
+        inside = (fu >= u_low) & (fv >= v_low) & (fu <= u_high) & (fv <= v_high) & (new[i] > zero)
+        new[i] = new[i] if inside else zero
+        ui, vi = np.uint32(min(max(fu, zero), u_last)), np.uint32(min(max(fv, zero), v_last))
+        at[i] = (vi >> _8) * stride + (ui >> _8)
+        weight[i] = (ui & _FRACTION) | ((vi & _FRACTION) << _8)
+        hits += np.int32(inside)
+    return hits
+
+
+@kernel
+def fuse(packed, score, part, picture, planes, centre, radius, matrix, lens, gsd_m, reals, integers):  # type: ignore[no-untyped-def]
     """Draw a picture where it sees the ground more orthogonally than what is there; gives the number of pixels won.
 
     Paper III.B: a pixel takes the picture with the largest 1 / ||P_oc - P||. Equal distance: what is there stays.
+    Runs are widened to multiples of RUN pixels, because what is left over by vector code would be most of a short run.
 
     Args:
-        packed: uint32 (T, C), the tile's colours.
-        score: float32 (T, C), 1 / squared distance in 1/m^2, 0 = empty.
-        row0: the tile's first row on the canvas.
-        col0: its first column.
+        packed: uint32 (T, T), the tile's colours; T a multiple of RUN.
+        score: float32 (T, T), 1 / squared distance in 1/m^2, 0 = empty.
+        part: the tile's first row and column on the canvas, and how many of its rows and columns lie on it.
         picture: uint32 (H, W), colours R, G, B, 255 in memory order.
         planes: float64 (K, 3), half planes of the footprint in canvas pixels.
         centre: float64 (2,), nadir point in canvas pixels (column, row).
@@ -177,71 +229,57 @@ def fuse(packed, score, row0, col0, picture, planes, centre, radius, matrix, len
         lens: float64 (10,), k1, k2, k3, focal length in pixels, principal column and row, least and greatest column
             used, least and greatest row used (they may lie half a pixel beyond the outermost centres).
         gsd_m: ground pixel.
-        reals: float32 (3, C), scratch.
-        integers: uint32 (2, C), scratch.
+        reals: float32 (3, T + RUN), scratch.
+        integers: uint32 (2, T + RUN), scratch.
     """
+    row0, col0, rows, columns = part
     height, width = picture.shape
-    columns = packed.shape[1]
-    k1, k2, k3 = np.float32(lens[0]), np.float32(lens[1]), np.float32(lens[2])
-    distorted = lens[0] != 0.0 or lens[1] != 0.0 or lens[2] != 0.0
-    # in 1/256 pixels, rounded
-    focal, pu, pv = np.float32(256.0 * lens[3]), np.float32(256.0 * lens[4] + 0.5), np.float32(256.0 * lens[5] + 0.5)
-    u_low, u_high = np.float32(256.0 * lens[6] + 0.5), np.float32(256.0 * lens[7] + 0.5)
-    v_low, v_high = np.float32(256.0 * lens[8] + 0.5), np.float32(256.0 * lens[9] + 0.5)
-    u_last, v_last = np.float32(256 * (width - 1) - 1), np.float32(256 * (height - 1) - 1)
-    area, least = np.float32(gsd_m * gsd_m), np.float32(1e-6)
-    zero, one, stride = np.float32(0.0), np.float32(1.0), np.uint32(width)
-    mx, my, mw = np.float32(matrix[0, 0]), np.float32(matrix[1, 0]), np.float32(matrix[2, 0])
+    f32 = np.float32
+    # picture coordinates in 1/256 pixels, plus 1/2 to round
+    optics = (
+        f32(lens[0]),
+        f32(lens[1]),
+        f32(lens[2]),
+        f32(256.0 * lens[3]),
+        f32(256.0 * lens[4] + 0.5),
+        f32(256.0 * lens[5] + 0.5),
+    )
+    limits = (
+        f32(256.0 * lens[6] + 0.5), f32(256.0 * lens[7] + 0.5), f32(256.0 * lens[8] + 0.5), f32(256.0 * lens[9] + 0.5),
+        f32(256 * (width - 1) - 1), f32(256 * (height - 1) - 1),
+    )  # fmt: skip
+    step = (f32(matrix[0, 0]), f32(matrix[1, 0]), f32(matrix[2, 0]))
+    area, stride, zero = f32(gsd_m * gsd_m), np.uint32(width), f32(0.0)
     texels = picture.ravel()
     won = np.int64(0)
-    for r in range(packed.shape[0]):
+    for r in range(rows):
         first, last = row_span(planes, centre, radius, row0 + r, col0, col0 + columns)
-        count = last - first
-        if count <= 0:
+        if last <= first:
             continue
-        row_score, row_packed = score[r, first - col0 : last - col0], packed[r, first - col0 : last - col0]
-        new = reals[0, :count]
-        dx0, dy = np.float32(first - centre[0]), np.float32(row0 + r - centre[1])
-        dy2 = dy * dy
-        wins = np.int32(0)
-        for i in range(count):
-            dx = dx0 + np.float32(i)
-            new[i] = one / max((dx * dx + dy2) * area, least)
-            wins += np.int32(new[i] > row_score[i])
-        if wins == 0:
+        left = (first - col0) // RUN * RUN
+        right = (last - col0 + RUN - 1) // RUN * RUN
+        row_score, new = score[r, left:right], reals[0, : right - left]
+        south = row0 + r - centre[1]
+        dx0, dy = f32(col0 + left - centre[0]), f32(south)
+        begin, end = _score(new, row_score, dx0, dy * dy, area, first - col0 - left, last - col0 - left)
+        if end == 0:
             continue
-        skip = 0
-        while new[skip] <= row_score[skip]:
-            skip += 1
-        while new[count - 1] <= row_score[count - 1]:
-            count -= 1
-        first, count = first + skip, count - skip
-        row_score, row_packed, new = row_score[skip:], row_packed[skip : skip + count], new[skip:]
-        us, vs, at, weight = reals[1, :count], reals[2, :count], integers[0, :count], integers[1, :count]
-        east, south = first - centre[0], row0 + r - centre[1]
-        x0 = np.float32(matrix[0, 0] * east + matrix[0, 1] * south + matrix[0, 2])
-        y0 = np.float32(matrix[1, 0] * east + matrix[1, 1] * south + matrix[1, 2])
-        w0 = np.float32(matrix[2, 0] * east + matrix[2, 1] * south + matrix[2, 2])
-        for i in range(count):
-            step = np.float32(i)
-            inverse = one / (w0 + mw * step)
-            us[i] = (x0 + mx * step) * inverse
-            vs[i] = (y0 + my * step) * inverse
-        if distorted:
-            _distort(us, vs, k1, k2, k3)
-        hits = wins - wins
-        for i in range(count):
-            fu, fv = us[i] * focal + pu, vs[i] * focal + pv
-            inside = (fu >= u_low) & (fv >= v_low) & (fu <= u_high) & (fv <= v_high) & (new[i] > row_score[i])
-            new[i] = new[i] if inside else zero
-            ui, vi = np.uint32(min(max(fu, zero), u_last)), np.uint32(min(max(fv, zero), v_last))
-            at[i] = (vi >> _8) * stride + (ui >> _8)
-            weight[i] = (ui & _FRACTION) | ((vi & _FRACTION) << _8)
-            hits += np.int32(inside)
+        wide = (end - begin + RUN - 1) // RUN * RUN
+        reals[0, right - left : right - left + RUN] = zero  # what a widened run may reach
+        run = reals[0, begin : begin + wide]
+        at, weight = integers[0, :wide], integers[1, :wide]
+        east = col0 + left + begin - centre[0]
+        start = (
+            f32(matrix[0, 0] * east + matrix[0, 1] * south + matrix[0, 2]),
+            f32(matrix[1, 0] * east + matrix[1, 1] * south + matrix[1, 2]),
+            f32(matrix[2, 0] * east + matrix[2, 1] * south + matrix[2, 2]),
+        )
+        hits = _locate(run, reals[1, :wide], reals[2, :wide], at, weight, start, step, optics, limits, stride)
         if hits == 0:
             continue
         won += hits
-        _blend(texels, stride, at, weight, new, row_packed)
-        for i in range(count):
+        _blend(texels, stride, at, weight, run, packed[r, left + begin : left + end])
+        row_score, new = row_score[begin:end], new[begin:end]
+        for i in range(end - begin):
             row_score[i] = max(row_score[i], new[i])
     return won

@@ -17,7 +17,7 @@ from orthoswarm.camera import Camera
 from orthoswarm.errors import InputError
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
-from orthoswarm.mosaic.fuse import aim, fuse, touches
+from orthoswarm.mosaic.fuse import RUN, aim, fuse, touches
 from orthoswarm.mosaic.lenses import INNER, OUTER, lens_row
 from orthoswarm.mosaic.passes import Read
 from orthoswarm.mosaic.reduce import pack, reduction
@@ -61,8 +61,8 @@ class RealtimeMosaic:
         if canvas.plane != "orthogonality":
             raise InputError(f"the canvas in {canvas.path} was rendered, not drawn in real time; use another folder")
         self.canvas = canvas
-        self._reals = np.empty((3, canvas.tile_px), np.float32)
-        self._integers = np.empty((2, canvas.tile_px), np.uint32)
+        self._reals = np.empty((3, canvas.tile_px + RUN), np.float32)
+        self._integers = np.empty((2, canvas.tile_px + RUN), np.uint32)
 
     def add(self, picture: Bytes, camera: Camera, ground_z_m: float = 0.0) -> Added:
         """Draw one frame.
@@ -120,9 +120,10 @@ class RealtimeMosaic:
         if not touches(shot.planes, shot.centre, shot.radius, row, column, rows, columns):
             return 0
         tile = self.canvas.begin(key)
+        part, gsd = (row, column, rows, columns), grid.gsd_m
         won = fuse(
-            tile.packed[:rows, :columns], tile.plane[:rows, :columns], row, column, shot.picture, shot.planes,
-            shot.centre, shot.radius, shot.matrix, shot.lens, grid.gsd_m, self._reals, self._integers,
+            tile.packed, tile.plane, part, shot.picture, shot.planes, shot.centre, shot.radius, shot.matrix, shot.lens,
+            gsd, self._reals, self._integers,
         )  # fmt: skip
         if won:
             self.canvas.commit(key)
