@@ -1,0 +1,68 @@
+"""News from the daemon to whoever listens: from any thread, without waiting for slow listeners."""
+
+import asyncio
+import contextlib
+import threading
+from collections import deque
+from typing import Any, Final
+
+_KEPT: Final = 2000
+
+
+class Subscription:
+    """One listener's queue: when it falls far behind, the oldest news go and it is told to look at everything anew."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop, self._bell = loop, asyncio.Event()
+        self._waiting: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._missed = False
+
+    def put(self, event: dict[str, Any]) -> None:
+        """Hand in news; any thread."""
+        if len(self._waiting) == _KEPT:
+            self._missed = True
+        self._waiting.append(event)
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._bell.set)
+
+    async def get(self) -> list[dict[str, Any]]:
+        """All news since the last call; waits for some."""
+        while not self._waiting:
+            self._bell.clear()
+            if not self._waiting:
+                await self._bell.wait()
+        if self._missed:
+            self._missed = False
+            self._waiting.clear()
+            return [{"type": "resync"}]
+        news = []
+        while self._waiting:
+            news.append(self._waiting.popleft())
+        return news
+
+
+class Events:
+    """Hands news to all listeners."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._listeners: set[Subscription] = set()
+
+    def publish(self, kind: str, /, **fields: Any) -> None:
+        """Tell all listeners; any thread."""
+        with self._lock:
+            listeners = list(self._listeners)
+        for listener in listeners:
+            listener.put({"type": kind, **fields})
+
+    def subscribe(self) -> Subscription:
+        """Begin to listen, in the running loop."""
+        subscription = Subscription(asyncio.get_running_loop())
+        with self._lock:
+            self._listeners.add(subscription)
+        return subscription
+
+    def unsubscribe(self, subscription: Subscription) -> None:
+        """Listen no more."""
+        with self._lock:
+            self._listeners.discard(subscription)

@@ -1,0 +1,72 @@
+"""The daemon's figures as Prometheus text."""
+
+import os
+import time
+from typing import TYPE_CHECKING, Final
+
+from orthoswarm import __version__
+from orthoswarm.workers import peak_rss_mb
+
+if TYPE_CHECKING:
+    from gcs_plugin.daemon.core import Daemon
+
+_QUANTILES: Final = (0.5, 0.9, 0.99)
+
+
+def prometheus(daemon: "Daemon") -> str:
+    """All figures, one metric a line with its help and type."""
+    lines: list[str] = []
+
+    def metric(name: str, kind: str, text: str, values: list[tuple[dict[str, str], float]]) -> None:
+        lines.append(f"# HELP orthoswarm_{name} {text}")
+        lines.append(f"# TYPE orthoswarm_{name} {kind}")
+        for labels, value in values:
+            inner = ",".join(f'{key}="{_escape(label)}"' for key, label in labels.items())
+            lines.append(f"orthoswarm_{name}{'{' + inner + '}' if inner else ''} {_number(value)}")
+
+    def single(name: str, kind: str, text: str, value: float) -> None:
+        metric(name, kind, text, [({}, value)])
+
+    drawer = daemon.drawer
+    metric("info", "gauge", "The program's version.", [({"version": __version__}, 1)])
+    single("uptime_seconds", "gauge", "Since the daemon was started.", time.time() - daemon.started)
+    rows = daemon.journal.rows("SELECT stage, COUNT(*) AS n FROM frames GROUP BY stage")
+    metric("frames", "gauge", "Frames in the workspace by stage.", [({"stage": r["stage"]}, r["n"]) for r in rows])
+    single("frames_accepted_total", "counter", "Pictures taken in since the start.", sum(daemon.posted.values()))
+    single("frames_drawn_total", "counter", "Frames drawn in real time since the start.", drawer.drawn)
+    single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
+    single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
+    recent = sorted(drawer.latencies)
+    metric(
+        "draw_latency_seconds", "gauge", "From arrival to the map, of the last thousand frames.",
+        [({"quantile": str(q)}, recent[min(len(recent) - 1, int(q * len(recent)))]) for q in _QUANTILES if recent],
+    )  # fmt: skip
+    metric(
+        "layer_version", "gauge", "Grows with every change of a layer.",
+        [({"layer": name}, layer.version) for name, layer in daemon.layers.items()],
+    )  # fmt: skip
+    counts: dict[tuple[str, str], int] = {}
+    for row in daemon.journal.rows("SELECT kind, state, COUNT(*) AS n FROM jobs GROUP BY kind, state"):
+        counts[row["kind"], row["state"]] = row["n"]
+    metric("jobs", "gauge", "Jobs by kind and state.", [({"kind": k, "state": s}, n) for (k, s), n in counts.items()])
+    single("journal_commits_total", "counter", "Commits since the start.", daemon.journal.commits)
+    single("problems", "gauge", "Things that are wrong at present.", len(daemon.problems()))
+    single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
+    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", _resident_mb())
+    return "\n".join(lines) + "\n"
+
+
+def _resident_mb() -> float:
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except (OSError, AttributeError):  # not Linux: the largest so far
+        return peak_rss_mb()
+
+
+def _escape(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").encode("utf-8", "replace").decode()
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)

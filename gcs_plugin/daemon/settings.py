@@ -1,0 +1,143 @@
+"""What the daemon is told: by flags, and by `orthoswarm.toml` in its workspace for what stays the same."""
+
+import re
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from orthoswarm.errors import InputError
+
+FILE: Final = "orthoswarm.toml"
+PORT: Final = 8650
+
+TEMPLATE: Final = """\
+# What `orthoswarm serve` in this folder does. Flags on the command line win over this file.
+
+# port = 8650
+# bind = "127.0.0.1"              # another address needs the token for everything
+# basemap = "before.tif"          # GeoTIFF, COG, MBTiles or folder z/x/y.png; relative to this file
+# links = ["udpin:0.0.0.0:14550", "serial:/dev/ttyUSB0:57600"]
+# fov_min_deg = 70                # smallest horizontal field of view in the swarm, for the real-time map
+# gsd_m = 0.1                     # ground pixel of the map; from the first pictures unless given
+# workers = 1                     # processes that refine
+# lost_after_s = 120              # a vehicle that is silent for so long in its mission is refined as it is
+
+# [[vehicle]]
+# id = "v1"                       # v and the MAVLink system id, unless system says otherwise
+# system = 1
+# name = "Falcon"
+# pictures = "udp://0.0.0.0:5600" # a live stream (rtsp, udp, tcp), or a folder into which photos or videos arrive
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSettings:
+    """One vehicle that was named.
+
+    Attributes:
+        id: in files and on the map. system: MAVLink system id, None without a link.
+        name: shown to people. pictures: stream or folder, empty for none.
+    """
+
+    id: str
+    system: int | None = None
+    name: str = ""
+    pictures: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Everything the daemon is told.
+
+    Attributes:
+        workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
+        links: MAVLink links. basemap: the map before the disaster, or None.
+        fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
+        workers: processes that refine. lost_after_s: when a silent vehicle's sortie counts as over.
+        vehicles: those that were named. token_file: where the token is, or goes.
+    """
+
+    workspace: Path
+    bind: str = "127.0.0.1"
+    port: int = PORT
+    links: tuple[str, ...] = ()
+    basemap: Path | None = None
+    fov_min_deg: float | None = None
+    gsd_m: float | None = None
+    workers: int = 1
+    lost_after_s: float = 120.0
+    vehicles: tuple[VehicleSettings, ...] = field(default=())
+    token_file: Path | None = None
+
+    def check(self) -> "Settings":
+        """Itself.
+
+        Raises:
+            InputError: a value that makes no sense.
+        """
+        if not 0 <= self.port <= 65535:
+            raise InputError(f"port {self.port} is no port; give 1 to 65535, or 0 for any free one")
+        if self.basemap is not None and not self.basemap.exists():
+            raise InputError(f"the basemap {self.basemap} does not exist; check the path")
+        if self.fov_min_deg is not None and not 5.0 <= self.fov_min_deg <= 150.0:
+            raise InputError(f"a field of view of {self.fov_min_deg:g} degrees is not possible; for example 70")
+        if self.gsd_m is not None and not 0.005 <= self.gsd_m <= 5.0:
+            raise InputError(f"{self.gsd_m:g} m is no ground pixel; give metres, for example 0.1")
+        if self.workers < 1:
+            raise InputError(f"{self.workers} workers are too few; give 1 or more")
+        names = [v.id for v in self.vehicles]
+        systems = [v.system for v in self.vehicles if v.system is not None]
+        for what, values in (("id", names), ("system id", systems)):
+            if len(set(values)) != len(values):
+                raise InputError(f"two vehicles in {FILE} have the same {what}; give each its own")
+        return self
+
+
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "fov_min_deg": (int, float),
+    "gsd_m": (int, float), "workers": (int,), "lost_after_s": (int, float), "vehicle": (list,),
+}  # fmt: skip
+
+
+def read_settings(workspace: Path) -> Settings:
+    """The settings in a workspace's file; the defaults where there is none.
+
+    Raises:
+        InputError: the file cannot be read or says something unknown.
+    """
+    path = workspace / FILE
+    if not path.exists():
+        return Settings(workspace)
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}); correct it") from None
+    for key, value in document.items():
+        if key not in _KINDS:
+            raise InputError(f"{path} says '{key}', which is unknown; choose from: {', '.join(_KINDS)}")
+        if isinstance(value, bool) or not isinstance(value, _KINDS[key]):
+            raise InputError(f"{key} in {path} is of the wrong kind; see `orthoswarm serve --init`")
+    vehicles = tuple(_vehicle(entry, path) for entry in document.pop("vehicle", ()))
+    if "links" in document:
+        document["links"] = tuple(str(link) for link in document["links"])
+    if "basemap" in document:
+        document["basemap"] = workspace / document["basemap"]
+    return replace(Settings(workspace), vehicles=vehicles, **document)
+
+
+def _vehicle(entry: Any, path: Path) -> VehicleSettings:
+    if not isinstance(entry, dict) or not isinstance(entry.get("id"), str) or not entry["id"]:
+        raise InputError(f'a [[vehicle]] in {path} has no id; give it one, for example id = "v1"')
+    unknown = set(entry) - {"id", "system", "name", "pictures"}
+    if unknown:
+        raise InputError(f"a [[vehicle]] in {path} says '{unknown.pop()}'; it has id, system, name and pictures")
+    system = entry.get("system", _system_of(entry["id"]))
+    if system is not None and (isinstance(system, bool) or not isinstance(system, int) or not 1 <= system <= 255):
+        raise InputError(f"the system id of {entry['id']} in {path} is not 1 to 255; correct it")
+    return VehicleSettings(entry["id"], system, str(entry.get("name", "")), str(entry.get("pictures", "")))
+
+
+def _system_of(vehicle: str) -> int | None:
+    found = re.fullmatch(r"v(\d{1,3})", vehicle)
+    return int(found[1]) if found and 1 <= int(found[1]) <= 255 else None

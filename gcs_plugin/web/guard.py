@@ -1,0 +1,161 @@
+"""Who may ask: same-origin pages and local programs; commands, and everything from other machines, need the token.
+
+A page of another site cannot reach the daemon: a foreign Origin is refused (cross-site requests), and so is a Host
+that is not the daemon's address (DNS rebinding). Commands need the token in a header, which no foreign form can set.
+"""
+
+import hmac
+import os
+import secrets
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+from orthoswarm.errors import InputError, OrthoSwarmError
+
+LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+_OPEN: Final = frozenset({"/healthz", "/", "/favicon.ico"})
+_OPEN_FOLDERS: Final = ("/static/",)
+_COMMANDS: Final = ("/api/missions", "/api/refine", "/api/export", "/api/plans", "/api/vehicles", "/api/jobs")
+_SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+_HEADERS: Final = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (
+        b"content-security-policy",
+        b"default-src 'self'; img-src 'self' blob: data:; worker-src 'self' blob:; style-src 'self' 'unsafe-inline';"
+        b" connect-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'",
+    ),
+]
+
+
+def take_token(path: Path) -> tuple[str, bool]:
+    """The token in a file, made if there is none; and whether it is new.
+
+    Raises:
+        InputError: the file holds none, or cannot be read or written.
+    """
+    try:
+        if path.exists():
+            token = path.read_text(encoding="ascii").strip()
+            if len(token) < 8:
+                raise InputError(f"{path} holds no token; put at least eight characters there, or remove it")
+            return token, False
+        token = secrets.token_urlsafe(24)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            file.write(token + "\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the token file {path} cannot be used ({error}); name another with --token-file") from None
+    return token, True
+
+
+class Guard:
+    """ASGI middleware that lets requests through or answers them itself.
+
+    Args:
+        app: the application.
+        token: what commands need.
+        bind: the address that is served; another than a loopback one makes the token needed for everything.
+    """
+
+    def __init__(self, app: Any, token: str, bind: str = "127.0.0.1") -> None:
+        self.app, self._token = app, token
+        self.local = bind.strip("[]") in LOOPBACK
+        self._hosts = LOOPBACK | {bind.strip("[]").lower()}
+
+    async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
+        """Handle one connection."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers: dict[str, str] = {}
+        for name, value in scope["headers"]:
+            headers.setdefault(name.decode("latin-1").lower(), value.decode("latin-1"))
+        refusal = self._refusal(scope, headers)
+        if refusal is None:
+            await self.app(scope, receive, _with_headers(send) if scope["type"] == "http" else send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal[1][:100]})
+        else:
+            await _answer(send, *refusal)
+
+    def _refusal(self, scope: dict[str, Any], headers: dict[str, str]) -> tuple[int, str] | None:
+        host = headers.get("host", "")
+        if self.local and _host_name(host) not in self._hosts:
+            return 403, "the Host header does not name this daemon; use the address that it printed"
+        origin = headers.get("origin")
+        if origin is not None and (urlsplit(origin).scheme not in ("http", "https") or _netloc(origin) != host.lower()):
+            return 403, "pages of other sites may not use this daemon; open its own page"
+        path = scope["path"]
+        if not self.local and path not in _OPEN and not path.startswith(_OPEN_FOLDERS):
+            return None if self._has_token(scope, headers, query=True) else _NEEDS_TOKEN
+        unsafe = scope["type"] == "http" and scope["method"] not in _SAFE
+        if unsafe and any(path == command or path.startswith(command + "/") for command in _COMMANDS):
+            return None if self._has_token(scope, headers, query=False) else _NEEDS_TOKEN
+        return None
+
+    def _has_token(self, scope: dict[str, Any], headers: dict[str, str], *, query: bool) -> bool:
+        """Whether the token is in a header, or (for what changes nothing: tile sources, events) in the address."""
+        said = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
+        reading = scope["type"] == "websocket" or scope["method"] in _SAFE
+        if not said and query and reading:
+            said = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        return hmac.compare_digest(said.encode("utf-8", "replace"), self._token.encode())
+
+
+_NEEDS_TOKEN: Final = (401, "this needs the daemon's token, as the header 'Authorization: Bearer TOKEN'")
+
+
+def _netloc(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
+def _host_name(host: str) -> str:
+    try:
+        return (urlsplit("//" + host).hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _with_headers(send: Any) -> Any:
+    async def sending(message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+        await send(message)
+
+    return sending
+
+
+async def _answer(send: Any, status: int, text: str) -> None:
+    import json
+
+    body = json.dumps({"detail": text}).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    if status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+class TooLarge(OrthoSwarmError):
+    """A request is larger than allowed."""
+
+
+def bounded(receive: Any, most_bytes: int) -> Any:
+    """An ASGI receive that raises TooLarge once a body grows beyond a size."""
+    seen = 0
+
+    async def receiving() -> Any:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > most_bytes:
+            raise TooLarge(f"the request is larger than {most_bytes // 1_000_000} MB; send a smaller picture")
+        return message
+
+    return receiving
