@@ -34,7 +34,7 @@ Handler = Callable[[Vehicle, Message, float], None]
 
 _LOST_S: Final = 5.0
 _TICK_S: Final = 0.25
-_BATCH_S: Final = 0.02
+_BATCH_S: Final = 0.04
 _IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 _HEARTBEAT, _ACK, _TEXT = _IDS["HEARTBEAT"], _IDS["COMMAND_ACK"], _IDS["STATUSTEXT"]
 _DETECTED: Final = frozenset(_IDS[name] for name in RELEVANT)

@@ -99,6 +99,9 @@ class Framer:
 
     def feed(self, data: bytes) -> list[Packet]:
         """All packets that are complete now; what is left over waits for the next call."""
+        if not self._rest and len(data) > 2 and data[0] == V2_MARKER and len(data) == data[1] + 12 and not data[2]:
+            packet = self._check(data)  # a datagram with one packet, the usual case
+            return [] if packet is None else [packet]
         if self._rest:
             data, self._rest = self._rest + data, b""
         packets: list[Packet] = []

@@ -330,6 +330,7 @@ def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
 def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], good: bool) -> int:
     """Tell events until all missions have ended; with --json all at once at the end."""
     told: list[FleetEvent] = []
+    print(f"following {', '.join(f'v{s}' for s in systems)}; Ctrl-C ends it, not the flights", file=sys.stderr)
 
     def tell(event: "FleetEvent") -> None:
         told.append(event)

@@ -271,12 +271,12 @@ class Pilot:
     autopilot: Autopilot
     modes: Modes
 
-    def set_mode(self, custom_mode: int) -> Command:
-        """Change the mode."""
+    def set_mode(self, custom_mode: int, insist_s: float = 3.0) -> Command:
+        """Change the mode; asked again for so long if it is refused."""
         return Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_DO_SET_MODE,
             params=mode_params(self.autopilot, custom_mode), verb=f"change to {self.modes.name(custom_mode)}",
-            insist_s=3.0,
+            insist_s=insist_s,
         )  # fmt: skip
 
     def start(self, *, in_air: bool = False, check: bool = True) -> Exchange:
@@ -293,7 +293,7 @@ class Pilot:
         )
         flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
         return InOrder(
-            self.vehicle, self.own, steps=[*steps, self.set_mode(self.modes.ready), arm, go, flies],
+            self.vehicle, self.own, steps=[*steps, self.set_mode(self.modes.ready, _ARM_S), arm, go, flies],
             done="flies its mission",
         )  # fmt: skip
 
