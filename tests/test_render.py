@@ -82,8 +82,8 @@ def test_each_pixel_comes_from_the_nearest_frame_that_sees_it(tmp_path, seed, ti
     d2 = np.full((len(flight.frames), grid.height, grid.width), np.inf)
     sure = np.ones((grid.height, grid.width), bool)
     for k, camera in enumerate(flight.cameras):
-        inside, distance = scene.seen(camera, grid, height, 1.0)
-        sure &= scene.seen(camera, grid, height, 0.7)[0] == scene.seen(camera, grid, height, 1.3)[0]
+        inside, distance = scene.seen(camera, grid, height, 0.0)
+        sure &= scene.seen(camera, grid, height, -0.3)[0] == scene.seen(camera, grid, height, 0.3)[0]
         d2[k][inside] = distance[inside]
     ordered = np.nan_to_num(np.sort(d2, 0)[:2], posinf=1e12)
     sure &= ~((ordered[1] - ordered[0] < 1e-2) & (ordered[0] < 1e12))
@@ -97,7 +97,7 @@ def test_what_any_frame_sees_is_covered_without_holes(canvas):
     flight = scene.survey(3, tilt_deg=8.0)
     stats = render(flight.frames, FLAT, canvas, read=flight.read)
     seen = np.any([scene.seen(c, canvas.grid, margin=-0.5)[0] for c in flight.cameras], 0)
-    well = np.any([scene.seen(c, canvas.grid, margin=1.01)[0] for c in flight.cameras], 0)
+    well = np.any([scene.seen(c, canvas.grid, margin=0.01)[0] for c in flight.cameras], 0)
     drawn = whole(canvas)[..., 3] == 255
     assert drawn[well].all()
     assert not drawn[~seen].any()
@@ -119,10 +119,28 @@ def test_weak_frames_show_only_where_no_other_sees(canvas):
     flight = scene.Flight().take(scene.camera(east=-40)).take(scene.camera(east=10), weak=True)
     render(flight.frames, FLAT, canvas, read=flight.read)
     mine = labels(canvas)
-    first = scene.seen(flight.cameras[0], canvas.grid, margin=1.01)[0]
-    second = scene.seen(flight.cameras[1], canvas.grid, margin=1.01)[0]
+    first = scene.seen(flight.cameras[0], canvas.grid, margin=0.01)[0]
+    second = scene.seen(flight.cameras[1], canvas.grid, margin=0.01)[0]
     assert (mine[first] == 1).all()
-    assert (mine[second & ~scene.seen(flight.cameras[0], canvas.grid, margin=0.99)[0]] == 2).all()
+    assert (mine[second & ~scene.seen(flight.cameras[0], canvas.grid, margin=-0.01)[0]] == 2).all()
+
+
+def test_equal_distance_goes_to_the_earlier_frame(canvas):
+    flight = scene.Flight()
+    for yaw in (0.0, 90.0, 30.0):  # one spot, seen by three; another one beside it
+        flight.take(scene.camera(yaw_deg=yaw))
+    flight.take(scene.camera(east=8.0))
+    render(flight.frames, FLAT, canvas, read=flight.read)
+    mine = labels(canvas)
+    first = scene.seen(flight.cameras[0], canvas.grid, margin=0.01)[0]
+    east = scene.pixel_centres(canvas.grid)[..., 0] - scene.EAST
+    assert set(np.unique(mine[first & (east < 4.0)])) == {1}
+    assert set(np.unique(mine)) == {0, 1, 2, 3, 4}
+
+
+def test_lone_small_picture_is_covered_to_its_border(canvas):
+    flight = scene.Flight().take(scene.camera(lens=Lens(80, 60, 45.0)))
+    assert render(flight.frames, FLAT, canvas, read=flight.read).covered_share > 0.97
 
 
 def test_unreadable_picture_is_replaced_by_its_neighbours_and_reported(canvas):

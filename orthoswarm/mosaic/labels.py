@@ -70,7 +70,7 @@ def _claim(best, label, r0, r1, c0, c1, mark, x, y, gsd):  # type: ignore[no-unt
         for i in range(c1 - c0):
             dx = dx0 + step * np.float32(i)
             d2 = dx * dx + dy2
-            nearer = d2 < row[i]
+            nearer = (d2 < row[i]) | ((d2 == row[i]) & (mark < owner[i]))
             owner[i] = mark if nearer else owner[i]
             row[i] = d2 if nearer else row[i]
             worst = max(worst, row[i])
@@ -90,7 +90,7 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
         for c in range(c0, c1):
             dx = dx0 + step * np.float32(c - c0)
             d2 = dx * dx + dy2
-            if d2 < best[r, c]:
+            if d2 < best[r, c] or (d2 == best[r, c] and mark < label[r, c]):
                 if not flat:
                     z = height_at(lattice, r, c)
                 rise = position[2] - z
@@ -124,7 +124,7 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd):  # type:
                 for c in range(c0, c1):
                     worst = max(worst, best[r, c])
             for k in np.argsort(least, kind="mergesort"):
-                if least[k] >= worst:
+                if least[k] > worst:
                     break
                 seen = _sight(position[k], rotation[k], lens[k], x0, x1, y0, y1, z0, z1)
                 if seen == _OUTSIDE:
@@ -152,7 +152,7 @@ def label_tile(
     Args:
         label: int32 (rows, columns), changed in place; pixels that have a label keep it.
         shots: the candidates.
-        marks: int32 (N,), the candidates' labels, none 0.
+        marks: int32 (N,), the candidates' labels, positive and rising.
         lattice: float32, the tile's heights, see lattice.heights.
         west: easting of the tile's left edge.
         north: northing of its upper edge.
@@ -163,7 +163,7 @@ def label_tile(
         index = np.nonzero(shots.weak == weak)[0]
         if len(index) == 0:
             continue
-        # what has a label is nearer than anything can be
+        # what has a label is nearer than anything can be, and stays
         best = np.where(label == 0, np.float32(np.inf), np.float32(-1.0))
         _label(best, label, position[index], rotation[index], shots.lens[index], marks[index], lattice, gsd_m)
 

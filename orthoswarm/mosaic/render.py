@@ -82,8 +82,8 @@ def render(
 ) -> RenderStats:
     """Render frames onto a canvas.
 
-    Each map pixel is taken from the frame with the nearest nadir point that sees it (within its picture by one pixel,
-    at most 75 degrees off nadir; terrain and distortion honoured), from a weak frame only where no other sees, by
+    Each map pixel is taken from the frame with the nearest nadir point that sees it (at most 75 degrees off
+    nadir; terrain and distortion honoured), from a weak frame only where no other sees, by
     bicubic interpolation of the picture, averaged first where the map is coarser. No blending.
 
     Args:
