@@ -1,4 +1,7 @@
-"""Pictures too few of their kind to be refined (another size or camera): placed as their neighbours were moved."""
+"""Pictures that cannot be refined: too few of their kind, or all taken at one spot.
+
+Metres per pixel come from the distance flown; where nothing was flown the record is better than any estimate.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,6 +17,7 @@ from orthoswarm.placement import PlacedFrame
 FEWEST = 3
 _NEIGHBOURS = 5
 _EXTRA_SIGMA_M = 2.0
+_SPOT_SHARE = 0.05
 
 
 def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
@@ -22,6 +26,20 @@ def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
     count = Counter(kinds)
     few = np.array([count[kind] < FEWEST for kind in kinds], bool)
     return few if not few.all() else np.zeros(len(frames), bool)
+
+
+def hovering(recorded: Sequence[PlacedFrame]) -> set[str]:
+    """Vehicles with several pictures that were all taken at one spot."""
+    members: dict[str, list[PlacedFrame]] = {}
+    for p in recorded:
+        members.setdefault(p.frame.vehicle, []).append(p)
+    out = set()
+    for vehicle, own in members.items():
+        positions = np.array([p.camera.position for p in own])
+        spread = np.subtract(*np.percentile(positions, [95, 5], axis=0))
+        if len(own) > FEWEST and np.hypot(*spread[:2]) < _SPOT_SHARE * float(np.median(positions[:, 2])):
+            out.add(vehicle)
+    return out
 
 
 def carry(

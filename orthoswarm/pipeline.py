@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap, Bounds
-from orthoswarm.carried import carry, odd_ones
+from orthoswarm.carried import carry, hovering, odd_ones
 from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import TILE_PX, write_cog
@@ -90,6 +90,7 @@ class _State:
     rejected: dict[str, Rejection] = field(default_factory=dict)
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
     gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    still: set[str] = field(default_factory=set)
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
 
@@ -163,7 +164,7 @@ class _Batch:
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
             warnings += _partial_cover(basemap, cameras)
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected)
+        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected, still=hovering(recorded.placed))
 
     def realtime(self, state: _State) -> list[PlacedFrame]:
         """The picture from recorded poses; the frames that it holds."""
@@ -186,7 +187,11 @@ class _Batch:
 
     def refine(self, state: _State) -> _Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
-        recorded = state.recorded.placed
+        recorded = [p for p in state.recorded.placed if p.frame.vehicle not in state.still]
+        for vehicle in sorted(state.still):
+            state.warnings.append(f"{vehicle}: all pictures were taken at one spot; they are placed as recorded")
+        if not recorded:
+            return None
         few = odd_ones([p.frame for p in recorded])
         odd = [p for p, alone in zip(recorded, few, strict=True) if alone]
         if odd:
@@ -247,8 +252,9 @@ class _Batch:
         with_map = state.basemap is not None and self.options.until == "fine"
         if with_map and not on_map:
             state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
-        coarse = [p for s in refinement.coarse for p in s.placed]
-        fine = [p for s in refinement.fine for p in s.placed]
+        still = [p for p in state.recorded.placed if p.frame.vehicle in state.still]
+        coarse = [p for s in refinement.coarse for p in s.placed] + still
+        fine = [p for s in refinement.fine for p in s.placed] + still
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):
                 state.gains = estimate_gains(fine, state.thumbnails, terrain or Terrain.flat())

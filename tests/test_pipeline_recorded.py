@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.camera import Camera, angles_from_rotation, rotation_from_angles
-from orthoswarm.carried import carry, odd_ones
+from orthoswarm.carried import carry, hovering, odd_ones
 from orthoswarm.frame import Fix, Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.recorded import THETA_HAT_RAD, area_grid, course, recorded_cameras
@@ -105,3 +105,9 @@ def test_odd_pictures_follow_their_neighbours():
     np.testing.assert_allclose(made.camera.rotation, wanted.rotation)
     assert made.camera.lens == wanted.lens and made.stage == "fine" and made.weak and made.sigma_m > 1
     assert carry(recorded[6:], recorded, []) == []
+
+
+def test_pictures_of_one_spot_are_known():
+    frames = [frame(i, 0.3 * (i % 2), 0.2 * (i % 3)) for i in range(9)]
+    frames += [frame(i, 0, 20.0 * i, vehicle="b") for i in range(9)] + [frame(0, 50, 50, vehicle="c")]
+    assert hovering(recorded_cameras(frames, GRID).placed) == {"a"}
