@@ -7,12 +7,12 @@ ground station, and asks for streams.
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
+from gcs_plugin.fleetevents import FleetEvent, mission_event
 from gcs_plugin.hub import Hub, Side
 from gcs_plugin.links import Link, Peer
 from gcs_plugin.mavlink import Autopilot, Message, dialect, is_autopilot
@@ -44,36 +44,6 @@ _BOOT_CLOCKS: Final = frozenset({_IDS["GLOBAL_POSITION_INT"], _IDS["SYSTEM_TIME"
 _STATES: Final = frozenset({_HEARTBEAT, _IDS["MISSION_CURRENT"], _IDS["EXTENDED_SYS_STATE"]})
 _OVERTAKEN: Final = 64
 _PHOTOS: Final = frozenset({_IDS["CAMERA_FEEDBACK"], _IDS["CAMERA_IMAGE_CAPTURED"]})
-_WORDS: Final = {
-    MissionEvent.STARTED: "has started its mission",
-    MissionEvent.SUSPENDED: "has left its mission",
-    MissionEvent.RESUMED: "goes on with its mission",
-    MissionEvent.COMPLETE: "has completed its mission",
-    MissionEvent.ABORTED: "has ended its mission without completing it",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class FleetEvent:
-    """Something that happened to a vehicle.
-
-    Attributes:
-        kind: `found`, `lost`, `regained`, `rebooted`, `conflict`, `text`, or a mission's `started`, `suspended`,
-            `resumed`, `complete`, `aborted`.
-        system: system id.
-        time_s: UTC epoch seconds.
-        text: one sentence.
-    """
-
-    kind: str
-    system: int
-    time_s: float
-    text: str
-
-
-def mission_event(event: MissionEvent) -> tuple[str, str]:
-    """Kind and words of what has happened to a mission."""
-    return event.value, _WORDS[event]
 
 
 class Fleet:
@@ -93,6 +63,7 @@ class Fleet:
         rates: Rates | None = None,
         key: bytes | None = None,
         tlog: Path | None = None,
+        remembered: Mapping[int, Mapping[str, Any]] | None = None,
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], float] = time.time,
     ) -> None:
@@ -104,6 +75,7 @@ class Fleet:
             rates: what vehicles are asked to send; 10 Hz of position and attitude unless said.
             key: signing key; with it only signed packets are believed.
             tlog: telemetry log to append to.
+            remembered: what `memory` said before a restart of this program, so that no completion is missed or doubled.
             clock: seconds that never go back.
             wall: UTC epoch seconds.
 
@@ -119,6 +91,7 @@ class Fleet:
         self._taps: list[Callable[[Packet, float], None]] = []
         self._counters: dict[tuple[Peer, int, int], int] = {}
         self._jobs: list[Exchange] = []
+        self._remembered = dict(remembered or {})
         self._tick_at = 0.0
         self._thread: int | None = None
 
@@ -217,6 +190,10 @@ class Fleet:
     def rtl(self, system: int) -> Exchange:
         """Let a vehicle fly home and land."""
         return self.begin(self._urgent(system).pilot.rtl())
+
+    def memory(self) -> dict[int, dict[str, Any]]:
+        """Where each vehicle's mission stands, as JSON values by system id; for `remembered` after a restart."""
+        return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
 
     def busy(self, system: int) -> bool:
         """True while a dialogue with a vehicle is under way."""
@@ -361,6 +338,9 @@ class Fleet:
             address, autopilot, modes_of(autopilot, heartbeat.type), CompletionDetector(autopilot),
             Streams(address, self.own, self._rates), heard=now, kind=int(heartbeat.type),
         )  # fmt: skip
+        before = self._remembered.pop(packet.system, None)
+        if before is not None and before.get("autopilot") == autopilot.value:
+            vehicle.detector = CompletionDetector.from_state(before)
         self.vehicles[packet.system] = vehicle
         self._event("found", vehicle, f"was found ({autopilot.value})")
         return vehicle

@@ -1,7 +1,9 @@
 """The fleet over simulated vehicles: found and lost, streams, routing, faults, commands, nothing sent unasked."""
 
+import json
 import threading
 import time
+from random import Random
 
 import pytest
 
@@ -10,7 +12,7 @@ from gcs_plugin.links import UdpLink
 from gcs_plugin.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL, MissionItem
-from gcs_plugin.packets import Framer
+from gcs_plugin.packets import Framer, checksum
 from gcs_plugin.sim.link import World
 from gcs_plugin.sim.radio import Faults
 from gcs_plugin.sim.swarm import SimSwarm, make_swarm
@@ -246,6 +248,49 @@ def test_an_unsigned_world_is_not_believed(make_world):
     world = make_world(SimVehicle(1, AP), key=bytes(32))
     world.wait(10.0)
     assert not world.fleet.vehicles and world.fleet.hub.rejected >= 9
+
+
+@pytest.mark.parametrize("gone_s", [5.0, 120.0])
+@BOTH
+def test_a_restarted_station_misses_and_doubles_no_completion(make_world, autopilot, gone_s):
+    world = make_world(SimVehicle(1, autopilot))
+    world.meet()
+    world.finish(world.fleet.upload(1, mission(autopilot, END)))
+    world.finish(world.fleet.start(1))
+    world.wait(20.0)
+    memory = json.loads(json.dumps({str(s): state for s, state in world.fleet.memory().items()}))
+    events = list(world.events)
+    world.fleet.close()
+    end = world.clock.now + gone_s
+    while world.clock.now < end:  # nobody listens
+        world.clock.now += 0.05
+        for _ in world.link.receive(None, 1, world.clock.now):
+            pass
+    world.fleet = Fleet(
+        [world.link], clock=world.clock, wall=world.clock.utc, remembered={int(s): m for s, m in memory.items()}
+    )
+    world.fleet.on_event(events.append)
+    world.until(lambda: False, 150.0)
+    assert [event.kind for event in events].count("complete") == 1
+
+
+def test_no_message_of_any_content_breaks_the_fleet(make_world):
+    """Links are open to everybody: each message of the dialect with random content, under a vehicle's name."""
+    world = make_world(SimVehicle(1, AP))
+    world.meet()
+    random = Random(4)
+    upload = world.fleet.upload(1, mission(AP, END))
+    for number, kind in sorted(dialect.mavlink_map.items()):
+        for size in (1, kind.unpacker.size):
+            payload = random.randbytes(size)
+            head = bytes([253, len(payload), 0, 0, random.randrange(256), 1, 1]) + number.to_bytes(3, "little")
+            crc = checksum(head[1:] + payload + bytes([kind.crc_extra]))
+            world.link.down.put((0, head + payload + crc.to_bytes(2, "little")), world.clock.now)
+        world.wait(0.04)
+    assert world.finish(upload)[0] is not None
+    world.wait(10.0)
+    assert not world.fleet.vehicles[1].lost
+    json.dumps(world.fleet.vehicles[1].summary(world.clock.now))
 
 
 def test_a_ground_station_beside_us_is_no_vehicle(make_world):

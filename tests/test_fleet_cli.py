@@ -91,6 +91,18 @@ def test_one_vehicle_is_started_paused_resumed_and_brought_home(swarm, folder, c
     assert code == 1 and "no mission" in said["vehicles"][0]["text"]
 
 
+def test_a_refused_mission_is_explained_in_words_and_in_json(swarm, folder, capsys):
+    path = folder / "v1.waypoints"
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].replace("\t16\t", "\t214\t")
+    path.write_text("\n".join(lines))
+    code, said = fleet(capsys, "upload", path, "--vehicle", "1", "--link", swarm, "--json")
+    row = said["vehicles"][0]
+    assert code == 1 and not row["ok"]
+    assert row["refusal"] == {"code": 3, "item": 3, "field": "command"}
+    assert "item 3 (DO_SET_CAM_TRIGG_INTERVAL) is a command that it does not know" in row["text"]
+
+
 def test_mavsdk_flies_them_too(swarm, folder, capsys):
     pytest.importorskip("mavsdk")
     both = ("--vehicle", "1,2", "--link", swarm, "--backend", "mavsdk", "--json")

@@ -237,6 +237,7 @@ def test_a_refusal_names_item_field_and_reason(autopilot, code):
         assert not outcome.ok
         assert (uploading.refusal.code, uploading.refusal.item, uploading.refusal.field) == (code, wrong, field)
         assert f"item {wrong}" in outcome.text and word in outcome.text
+        assert (outcome.code, outcome.item, outcome.field) == (code, wrong, field)
         assert ("mixture" in outcome.text) == (autopilot is AP)
 
 

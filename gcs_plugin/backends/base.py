@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal
 
-from gcs_plugin.fleet import FleetEvent
+from gcs_plugin.fleetevents import FleetEvent
 from gcs_plugin.mavlink import Autopilot
 from gcs_plugin.mission.exchange import Outcome
 from gcs_plugin.mission.items import Mission

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
-from gcs_plugin.fleet import Fleet, FleetEvent
+from gcs_plugin.fleet import Fleet
+from gcs_plugin.fleetevents import FleetEvent
 from gcs_plugin.links import Link
 from gcs_plugin.mavlink import Autopilot
 from gcs_plugin.mission.completion import Phase

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
-from gcs_plugin.fleet import FleetEvent, mission_event
+from gcs_plugin.fleetevents import FleetEvent, mission_event
 from gcs_plugin.mavlink import Autopilot, Message
 from gcs_plugin.mission.compare import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase

@@ -12,7 +12,7 @@ from orthoswarm.errors import InputError
 
 if TYPE_CHECKING:
     from gcs_plugin.backends import Backend
-    from gcs_plugin.fleet import FleetEvent
+    from gcs_plugin.fleetevents import FleetEvent
     from gcs_plugin.mission.exchange import Outcome
 
 _WAIT_S = 8.0
@@ -350,7 +350,7 @@ def _report(args: argparse.Namespace, outcomes: "dict[int, Outcome]", more: dict
     """Say how it went for each vehicle; 0 if well for all."""
     if args.json:
         rows = [
-            {"id": f"v{s}", "system": s, "ok": outcome.ok, "text": outcome.text, **more.get(s, {})}
+            {"id": f"v{s}", "system": s, "ok": outcome.ok, "text": outcome.text, **_refusal(outcome), **more.get(s, {})}
             for s, outcome in sorted(outcomes.items())
         ]
         print(json.dumps({"vehicles": rows}))
@@ -358,6 +358,13 @@ def _report(args: argparse.Namespace, outcomes: "dict[int, Outcome]", more: dict
         for _, outcome in sorted(outcomes.items()):
             print(outcome.text, file=sys.stdout if outcome.ok else sys.stderr)
     return 0 if outcomes and all(outcome.ok for outcome in outcomes.values()) else 1
+
+
+def _refusal(outcome: "Outcome") -> dict[str, Any]:
+    """What a vehicle refused."""
+    if outcome.code is None:
+        return {}
+    return {"refusal": {"code": outcome.code, "item": outcome.item, "field": outcome.field}}
 
 
 def _with_bar(work: Any) -> Any:

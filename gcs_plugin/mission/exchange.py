@@ -33,10 +33,16 @@ class Outcome:
     Attributes:
         ok: True if what was asked for is true in the vehicle now.
         text: one sentence for the user.
+        item: sequence number of the mission item that a vehicle refused, None if it is about something else.
+        field: the field of that item, empty if none.
+        code: the vehicle's MAV_MISSION_RESULT, None without a refusal.
     """
 
     ok: bool
     text: str
+    item: int | None = None
+    field: str = ""
+    code: int | None = None
 
 
 @dataclass(slots=True)

@@ -19,7 +19,7 @@ from typing import Final
 from gcs_plugin.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.compare import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import Exchange, RoundTrip
+from gcs_plugin.mission.exchange import Exchange, Outcome, RoundTrip
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.refusal import (
     ACCEPTED,
@@ -286,3 +286,6 @@ class MissionUpload(Exchange):
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and "upload again" not in text
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}")
+        if self.refusal is not None and self.outcome is not None:
+            refusal = self.refusal
+            self.outcome = Outcome(False, self.outcome.text, refusal.item, refusal.field, refusal.code)

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gcs_plugin.fleet import Fleet, FleetEvent
+from gcs_plugin.fleet import Fleet
+from gcs_plugin.fleetevents import FleetEvent
 from gcs_plugin.links import Link, Peer
 from gcs_plugin.mavlink import Message, dialect
 from gcs_plugin.mission.completion import MissionEvent

@@ -1,0 +1,37 @@
+"""What happens to the vehicles of a fleet, as values and in words."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from gcs_plugin.mission.completion import MissionEvent
+
+_WORDS: Final = {
+    MissionEvent.STARTED: "has started its mission",
+    MissionEvent.SUSPENDED: "has left its mission",
+    MissionEvent.RESUMED: "goes on with its mission",
+    MissionEvent.COMPLETE: "has completed its mission",
+    MissionEvent.ABORTED: "has ended its mission without completing it",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FleetEvent:
+    """Something that happened to a vehicle.
+
+    Attributes:
+        kind: `found`, `lost`, `regained`, `rebooted`, `conflict`, `text`, or a mission's `started`, `suspended`,
+            `resumed`, `complete`, `aborted`.
+        system: system id.
+        time_s: UTC epoch seconds.
+        text: one sentence.
+    """
+
+    kind: str
+    system: int
+    time_s: float
+    text: str
+
+
+def mission_event(event: MissionEvent) -> tuple[str, str]:
+    """Kind and words of what has happened to a mission."""
+    return event.value, _WORDS[event]
