@@ -24,8 +24,6 @@ _INFORMATION = 0.05
 """Share of independent matches: relief moves neighbouring points together."""
 _FLOOR_SHARE = 1e-3
 """Least misfit that is believed, as a share of the picture's width."""
-UNKNOWNS = 4
-"""Per side of a pair: nadir right, nadir up (radians), log f, bend."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,59 +243,64 @@ def _fit(p, q, n, floor, w):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _derivatives(z, flat, level, focal, bend, radius2, factor, g):  # type: ignore[no-untyped-def]
+    """Change of factor * flattened pixels (n,) by nadir right, nadir up, log f and bend: into g, complex (4, n)."""
+    h = 1e-5
+    for k in range(len(z)):
+        g[0, k] = factor * (_flatten(z[k], level, focal, bend, radius2, h, 0.0) - flat[k]) / h
+        g[1, k] = factor * (_flatten(z[k], level, focal, bend, radius2, 0.0, h) - flat[k]) / h
+        g[2, k] = factor * (_flatten(z[k], level, focal * (1.0 + h), bend, radius2, 0.0, 0.0) - flat[k]) / h
+        g[3, k] = factor * (_flatten(z[k], level, focal, bend + h, radius2, 0.0, 0.0) - flat[k]) / h
+
+
+@kernel
+def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
+    """Take from g (n,) the similarity of p (n,), whose weighted mean is cp, that fits it best."""
+    mean, total = 0.0j, 0.0
+    for k in range(n):
+        mean += w[k] * g[k]
+        total += w[k]
+    mean /= total
+    top, bottom = 0.0j, 1e-9
+    for k in range(n):
+        d = p[k] - cp
+        top += w[k] * d.conjugate() * (g[k] - mean)
+        bottom += w[k] * (d.real * d.real + d.imag * d.imag)
+    for k in range(n):
+        g[k] -= mean + top / bottom * (p[k] - cp)
+
+
+@kernel
 def _accumulate(first, second, start, p, q, level, lens, lens_id, segment, floor, normal, gradient, misfit):  # type: ignore[no-untyped-def]
     """Normal equations of tilt (2 S) and lens (2 L) after each pair's similarity is projected out."""
-    segments = 0
-    for k in range(len(segment)):
-        segments = max(segments, segment[k] + 1)
-    most = 0
+    segments, most = segment.max() + 1, 0
     for e in range(len(first)):
         most = max(most, start[e + 1] - start[e])
     zp, zq, w = np.empty(most, np.complex128), np.empty(most, np.complex128), np.empty(most)
-    g = np.empty((8, most), np.complex128)
-    r = np.empty(most, np.complex128)
+    g, r = np.empty((8, most), np.complex128), np.empty(most, np.complex128)
     column = np.empty(8, np.int64)
-    h = 1e-5
     for e in range(len(first)):
-        i, j = first[e], second[e]
-        n = start[e + 1] - start[e]
+        i, j, n = first[e], second[e], start[e + 1] - start[e]
+        pe, qe = p[start[e] : start[e + 1]], q[start[e] : start[e + 1]]
         fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
         fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
         for k in range(n):
-            zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
-            zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
+            zp[k] = _flatten(pe[k], level[i], fi, ki, ri, 0.0, 0.0)
+            zq[k] = _flatten(qe[k], level[j], fj, kj, rj, 0.0, 0.0)
         a, cp, cq, scale = _fit(zp, zq, n, floor[j], w)
         misfit[e] = scale
         for k in range(n):
-            m = start[e] + k
             r[k] = zq[k] - cq - a * (zp[k] - cp)
-            g[0, k] = -a * (_flatten(p[m], level[i], fi, ki, ri, h, 0.0) - zp[k]) / h
-            g[1, k] = -a * (_flatten(p[m], level[i], fi, ki, ri, 0.0, h) - zp[k]) / h
-            g[2, k] = -a * (_flatten(p[m], level[i], fi * (1.0 + h), ki, ri, 0.0, 0.0) - zp[k]) / h
-            g[3, k] = -a * (_flatten(p[m], level[i], fi, ki + h, ri, 0.0, 0.0) - zp[k]) / h
-            g[4, k] = (_flatten(q[m], level[j], fj, kj, rj, h, 0.0) - zq[k]) / h
-            g[5, k] = (_flatten(q[m], level[j], fj, kj, rj, 0.0, h) - zq[k]) / h
-            g[6, k] = (_flatten(q[m], level[j], fj * (1.0 + h), kj, rj, 0.0, 0.0) - zq[k]) / h
-            g[7, k] = (_flatten(q[m], level[j], fj, kj + h, rj, 0.0, 0.0) - zq[k]) / h
+        _derivatives(pe, zp, level[i], fi, ki, ri, -a, g[:4])
+        _derivatives(qe, zq, level[j], fj, kj, rj, 1.0 + 0.0j, g[4:])
         for side in range(2):
             photo = i if side == 0 else j
             column[4 * side] = 2 * segment[photo]
             column[4 * side + 1] = 2 * segment[photo] + 1
             column[4 * side + 2] = 2 * segments + 2 * lens_id[photo]
             column[4 * side + 3] = 2 * segments + 2 * lens_id[photo] + 1
-        for c in range(8):  # project a similarity out of each derivative
-            mean, total = 0.0j, 0.0
-            for k in range(n):
-                mean += w[k] * g[c, k]
-                total += w[k]
-            mean /= total
-            top, bottom = 0.0j, 1e-9
-            for k in range(n):
-                d = zp[k] - cp
-                top += w[k] * d.conjugate() * (g[c, k] - mean)
-                bottom += w[k] * (d.real * d.real + d.imag * d.imag)
-            for k in range(n):
-                g[c, k] -= mean + top / bottom * (zp[k] - cp)
+        for c in range(8):
+            _project_out(g[c], zp, cp, w, n)
         weight = 1.0 / (scale * scale)
         for c in range(8):
             value = 0.0
