@@ -1,0 +1,164 @@
+"""CFOG: channel features of orientated gradients, matched by FFT (Ye et al., TGRS 2019). No weights, any season.
+
+Each pixel gets the strength of its gradient in a few directions, blurred and normalised, so that light and colour do
+not matter and contrast may be inverted; tiles of these features are correlated at all shifts by FFT.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.matchers.base import Array, Floats, Mask, Matches
+
+DIRECTIONS = 6
+TILE_PX = 64
+_FEWEST_SHARE = 0.4
+_MIN_PEAK = 0.12
+_MAX_RATIO = 0.92
+_APART = 4
+
+
+def features(gray: Floats, valid: Mask) -> Floats:
+    """Features float32 (DIRECTIONS, rows, columns), zero where not valid; their mean over directions is zero."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(np.where(valid, gray, 0.0).astype(np.float32), (0, 0), 0.8)
+    gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0) > 0
+    length = np.sqrt(gx * gx + gy * gy)
+    middle = float(np.median(length[inner])) if inner.any() else 1.0
+    angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    channels = np.empty((DIRECTIONS, *gray.shape), np.float32)
+    for k, a in enumerate(angle):
+        strength = np.abs(np.float32(np.cos(a)) * gx + np.float32(np.sin(a)) * gy)
+        channels[k] = cv2.GaussianBlur(strength, (0, 0), 0.8)
+    channels = 0.25 * np.roll(channels, 1, 0) + 0.5 * channels + 0.25 * np.roll(channels, -1, 0)
+    norm = np.sqrt((channels * channels).sum(0)) + 1e-3
+    weight = np.where(inner, length / (length + max(middle, 1e-3)) / norm, 0.0).astype(np.float32)
+    channels -= channels.mean(0)
+    channels *= weight
+    return np.asarray(channels, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """Where a tile lies: shift (column, row) from the middle, height of the peak, second peak / peak."""
+
+    column: float
+    row: float
+    peak: float
+    ratio: float
+
+
+def correlate(tile: Floats, window: Floats) -> Peak:
+    """Best place of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
+    from scipy import fft
+
+    rows, cols = window.shape[1] - tile.shape[1] + 1, window.shape[2] - tile.shape[2] + 1
+    shape = tuple(int(fft.next_fast_len(n, real=True)) for n in window.shape[1:])
+    product = (fft.rfft2(window, shape) * np.conj(fft.rfft2(tile, shape))).sum(0)
+    dot = fft.irfft2(product, shape)[:rows, :cols]
+    weight = (np.abs(tile).sum(0) > 0).astype(np.float32)
+    energy = fft.irfft2(fft.rfft2((window * window).sum(0), shape) * np.conj(fft.rfft2(weight, shape)), shape)
+    energy = energy[:rows, :cols]
+    own = float((tile * tile).sum())
+    score = dot / np.sqrt(np.maximum(energy, 0.1 * float(energy.max()) + 1e-6) * max(own, 1e-6))
+    r, c = (int(v) for v in np.unravel_index(int(score.argmax()), score.shape))
+    peak = float(score[r, c])
+    rest = score.copy()
+    rest[max(0, r - _APART) : r + _APART + 1, max(0, c - _APART) : c + _APART + 1] = -1.0
+    ratio = float(rest.max()) / max(peak, 1e-9)
+    if not (0 < r < rows - 1 and 0 < c < cols - 1):
+        return Peak(c - (cols - 1) / 2, r - (rows - 1) / 2, peak, 1.0)
+    dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
+    dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
+    return Peak(c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, peak, ratio)
+
+
+def vertex(left: float, middle: float, right: float) -> float:
+    """Where a parabola through three neighbours has its top, -0.5 to 0.5 from the middle one."""
+    bend = left - 2.0 * middle + right
+    return 0.0 if bend >= -1e-12 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
+
+
+def match_tiles(
+    patch: Floats, window: Floats, valid: Mask, predict: Array, centres: NDArray[np.int64], search: int
+) -> Matches:
+    """Match tiles of a patch's features near where they are expected in a window's features.
+
+    Args:
+        patch: (D, h, w) features.
+        window: (D, H, W) features.
+        valid: bool (h, w) of the patch.
+        predict: float64 (N, 2), expected column and row in the window of each tile's centre.
+        centres: int64 (N, 2), column and row of the tiles' centres.
+        search: reach about the expectation, pixels.
+
+    Returns:
+        One match for each tile with a clear peak; the score is the peak.
+    """
+    half = TILE_PX // 2
+    a, b, score = [], [], []
+    for centre, expected in zip(centres, predict, strict=True):
+        c, r = int(centre[0]), int(centre[1])
+        cut = (slice(r - half, r + half), slice(c - half, c + half))
+        wc, wr = round(float(expected[0])), round(float(expected[1]))
+        c0, r0 = wc - half - search, wr - half - search
+        size = TILE_PX + 2 * search
+        if valid[cut].mean() < _FEWEST_SHARE or c0 < 0 or r0 < 0:
+            continue
+        area = window[:, r0 : r0 + size, c0 : c0 + size]
+        if area.shape[1:] != (size, size) or not area.any():
+            continue
+        found = correlate(patch[(slice(None), *cut)], area)
+        if found.peak >= _MIN_PEAK and found.ratio <= _MAX_RATIO:
+            a.append((c, r))
+            b.append((wc + found.column, wr + found.row))
+            score.append(found.peak)
+    if not a:
+        return Matches.none()
+    return Matches(np.array(a, float), np.array(b, float), np.array(score))
+
+
+def tile_centres(valid: Mask, step: int = TILE_PX) -> NDArray[np.int64]:
+    """Centres (column, row), int64 (N, 2), of tiles that lie in a patch and hold some of its valid part."""
+    half = TILE_PX // 2
+    rows, cols = valid.shape
+    c, r = np.arange(half, cols - half + 1, step), np.arange(half, rows - half + 1, step)
+    grid = np.stack(np.meshgrid(c, r), -1).reshape(-1, 2)
+    return np.asarray([p for p in grid if valid[p[1] - half : p[1] + half, p[0] - half : p[0] + half].mean() >= 0.4]
+                      or np.zeros((0, 2)), np.int64)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Cfog:
+    """Patch to map without weights: one shift of the whole patch first, then tiles about it.
+
+    Attributes:
+        search: reach of the tiles about the common shift, pixels.
+    """
+
+    search: int = 14
+
+    def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
+        """See MapMatcher."""
+        import cv2
+
+        size = (patch.shape[1] // 2, patch.shape[0] // 2)
+        if min(size) < 16 or not valid.any():
+            return Matches.none()
+        half_reach = reach // 2
+        wide = (size[0] + 2 * half_reach, size[1] + 2 * half_reach)
+        small = cv2.resize(patch, size, interpolation=cv2.INTER_AREA)
+        small_valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        # crop so that both halves keep the same grid
+        odd = reach - 2 * half_reach
+        inner = (slice(odd, odd + 2 * wide[1]), slice(odd, odd + 2 * wide[0]))
+        coarse = cv2.resize(window[inner], wide, interpolation=cv2.INTER_AREA)
+        coarse_known = cv2.resize(known[inner].astype(np.uint8), wide, interpolation=cv2.INTER_NEAREST) > 0
+        whole = correlate(features(small, small_valid), features(coarse, coarse_known))
+        shift = np.array([reach + 2 * whole.column, reach + 2 * whole.row])
+        centres = tile_centres(valid)
+        wanted = centres + shift
+        return match_tiles(features(patch, valid), features(window, known), valid, wanted, centres, self.search)

@@ -1,0 +1,120 @@
+"""The registry: matchers by name, built in or added by other packages through entry points.
+
+A package adds one with an entry point in the group `orthoswarm.matchers` whose value is a callable without arguments
+that returns a PictureMatcher or a MapMatcher:
+
+    [project.entry-points."orthoswarm.matchers"]
+    mine = "my_package:MyMatcher"
+"""
+
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+from orthoswarm.errors import InputError
+from orthoswarm.matchers.base import MapMatcher, PictureMatcher, UnavailableError
+
+GROUP = "orthoswarm.matchers"
+PICTURE_ORDER = ("xfeat", "sift")
+"""What matches pictures of a flight where nothing is asked for: the first that is available."""
+MAP_ORDER = ("xfeat-window", "cfog")
+"""The same for patches on the map."""
+
+
+def _learned(kind: Any) -> PictureMatcher:
+    from orthoswarm.matchers.learned import Learned
+
+    return Learned.make(kind)
+
+
+def _sift() -> PictureMatcher:
+    from orthoswarm.matchers.classic import Sift
+
+    return Sift()
+
+
+def _window() -> MapMatcher:
+    from orthoswarm.matchers.window import XFeatWindow
+
+    return XFeatWindow.make()
+
+
+def _cfog() -> MapMatcher:
+    from orthoswarm.matchers.cfog import Cfog
+
+    return Cfog()
+
+
+def _roma() -> MapMatcher:
+    from orthoswarm.matchers.roma import Roma
+
+    return Roma.make()
+
+
+PICTURE: dict[str, Callable[[], PictureMatcher]] = {
+    "xfeat": lambda: _learned("xfeat"),
+    "disk": lambda: _learned("disk"),
+    "aliked": lambda: _learned("aliked"),
+    "sift": _sift,
+}
+MAP: dict[str, Callable[[], MapMatcher]] = {"xfeat-window": _window, "cfog": _cfog, "roma": _roma}
+
+
+def picture_matcher(name: str | None = None) -> PictureMatcher:
+    """A matcher of pictures by name; without one the best that is available.
+
+    Raises:
+        InputError: if the name is unknown, or its weights or packages are missing.
+    """
+    matcher: PictureMatcher = _get(name, PICTURE, PICTURE_ORDER)
+    return matcher
+
+
+def map_matcher(name: str | None = None) -> MapMatcher:
+    """A matcher of patches to the map by name; without one the best that is available.
+
+    Raises:
+        InputError: if the name is unknown, or its weights or packages are missing.
+    """
+    matcher: MapMatcher = _get(name, MAP, MAP_ORDER)
+    return matcher
+
+
+def available() -> dict[str, str]:
+    """Every matcher by name, built in or added, and what keeps it from being used (an empty text: nothing)."""
+    out = {}
+    for name, make in {**PICTURE, **MAP, **_added()}.items():
+        try:
+            make()
+            out[name] = ""
+        except UnavailableError as error:
+            out[name] = str(error)
+        except Exception as error:  # other people's code
+            out[name] = f"it cannot be loaded ({type(error).__name__}: {error})"
+    return out
+
+
+def _added() -> dict[str, Callable[[], Any]]:
+    """Matchers of other packages."""
+    return {point.name: _entry(point) for point in entry_points(group=GROUP)}
+
+
+def _entry(point: Any) -> Callable[[], Any]:
+    return lambda: point.load()()
+
+
+def _get(name: str | None, own: dict[str, Any], order: tuple[str, ...]) -> Any:
+    if name is None:
+        for candidate in order:
+            try:
+                return own[candidate]()
+            except UnavailableError:
+                continue
+        raise InputError(f"no matcher is available; one of {', '.join(order)} is needed")
+    known = {**own, **_added()}
+    if name not in known:
+        raise InputError(f"there is no matcher '{name}'; choose one of {', '.join(sorted(known))}")
+    try:
+        return known[name]()
+    except UnavailableError as error:
+        raise InputError(f"the matcher '{name}' cannot be used: {error}") from None

@@ -1,0 +1,81 @@
+"""RoMa (Edstedt et al., CVPR 2024), the paper's dense matcher: an optional extra with weights that a user brings.
+
+`pip install orthoswarm[roma]`, then `orthoswarm weights import` of roma_outdoor.pth and dinov2_vitl14_pretrain.pth.
+On a CPU one match at 560 pixels takes about a minute; on a GPU half a second.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from orthoswarm.matchers.base import Floats, Mask, Matches, UnavailableError
+from orthoswarm.matchers.learned import device, read_state
+
+_COUNT = 4000
+_LEAST_CERTAINTY = 0.3
+
+
+def load(state: dict[str, Any], backbone: dict[str, Any], coarse_px: int = 560, upsample_px: int = 864) -> Any:
+    """The network from its own state and that of its DINOv2 backbone, on the fastest device of this machine.
+
+    Raises:
+        UnavailableError: if the package is missing or the states do not fit it.
+    """
+    try:
+        from romatch import roma_outdoor
+    except ImportError as error:
+        raise UnavailableError(f"the package romatch is missing ({error.name}); pip install orthoswarm[roma]") from None
+    try:
+        return roma_outdoor(
+            device=device(),
+            weights=state,
+            dinov2_weights=backbone,
+            coarse_res=coarse_px,
+            upsample_res=upsample_px,
+        )
+    except (RuntimeError, KeyError) as error:
+        first = str(error).splitlines()[0]
+        raise UnavailableError(f"the weights do not fit RoMa ({first}); import the published files again") from None
+
+
+@lru_cache(maxsize=1)
+def _network() -> Any:
+    return load(read_state("roma"), read_state("roma-dinov2"))
+
+
+@dataclass(frozen=True, slots=True)
+class Roma:
+    """Patch to map by RoMa: the patch against the window, matches beyond the reach dropped.
+
+    Attributes:
+        network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
+        count: matches to sample.
+    """
+
+    network: Any
+    count: int = _COUNT
+
+    @classmethod
+    def make(cls) -> "Roma":
+        """A matcher with the weights of this machine.
+
+        Raises:
+            UnavailableError: if the package or the weights are missing.
+        """
+        return cls(_network())
+
+    def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
+        """See MapMatcher."""
+        from PIL import Image
+
+        first, second = (Image.fromarray(np.clip(g, 0, 255).astype(np.uint8)).convert("RGB") for g in (patch, window))
+        warp, certainty = self.network.match(first, second, device=device())
+        found, sure = self.network.sample(warp, certainty, num=self.count)
+        a, b = self.network.to_pixel_coordinates(found, *patch.shape, *window.shape)
+        a, b = (t.detach().cpu().numpy().astype(np.float64) - 0.5 for t in (a, b))  # its pixel corners are integers
+        score = sure.detach().cpu().numpy().astype(np.float64)
+        near = np.abs(b - a - reach).max(1) <= reach
+        c, r = np.clip(np.round(a), 0, np.array(patch.shape)[::-1] - 1).astype(np.int64).T
+        return Matches(a, b, score).take(near & (score >= _LEAST_CERTAINTY) & valid[r, c])
