@@ -14,24 +14,26 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.basemap import Basemap, Bounds
+from orthoswarm.basemap import Basemap
 from orthoswarm.carried import carry, hovering, odd_ones
 from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
-from orthoswarm.export.cog import TILE_PX, write_cog
+from orthoswarm.export.cog import write_cog
 from orthoswarm.export.partial import disk_error, written_whole
+from orthoswarm.extent import drawn_window, ground_level, partial_cover, placed_bounds
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
-from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.gains import estimate_gains
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.render import RenderStats, render
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
-from orthoswarm.products import leg_rows, vehicle_rows, write_frames, write_json
-from orthoswarm.recorded import Recorded, area_grid, recorded_cameras
+from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
+from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras
 from orthoswarm.report.page import write_page
 from orthoswarm.stages import Clock, Stage
+from orthoswarm.vehicles import legs_as_vehicles
 from orthoswarm.workers import Workers
 from orthoswarm.workspace import Workspace, run_key
 
@@ -149,10 +151,10 @@ class _Batch:
         except OSError as error:  # pictures of videos are written
             raise disk_error(error, self.out) from None
         if not ingest.frames:
-            raise InputError(_nothing_to_map(ingest))
+            raise InputError(nothing_to_map(ingest))
         grid = area_grid(ingest.frames)
         if self.options.split_legs:
-            ingest = replace(ingest, frames=split_legs(ingest.frames, grid))
+            ingest = replace(ingest, frames=legs_as_vehicles(ingest.frames, grid))
         fov = self.options.fov_min_deg
         recorded = recorded_cameras(ingest.frames, grid, None if fov is None else float(np.radians(fov)))
         cameras = [p.camera for p in recorded.placed]
@@ -160,9 +162,9 @@ class _Batch:
         basemap = None
         warnings = [*ingest.warnings, *recorded.warnings]
         if self.options.basemap is not None:
-            near = _bounds(recorded.placed, 0.0, 0.0)
+            near = placed_bounds(recorded.placed, 0.0, 0.0)
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
-            warnings += _partial_cover(basemap, cameras)
+            warnings += partial_cover(basemap, recorded.placed)
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
         return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected, still=hovering(recorded.placed))
 
@@ -223,14 +225,16 @@ class _Batch:
         return refinement
 
     def call_refiner(self, frames: Sequence[Frame], state: _State) -> _Refinement:
-        from orthoswarm.swarm.refine import refine_all
+        from orthoswarm.paper import refine_all as refine_paper
+        from orthoswarm.swarm.refine import refine_all as refine_swarm
 
         vehicles: dict[str, list[Frame]] = {}
         for frame in frames:
             vehicles.setdefault(frame.vehicle, []).append(frame)
         basemap = state.basemap if self.options.until == "fine" else None
         run = self.space.remembering("vehicle", self.workers.map)
-        refined = refine_all(vehicles, basemap, state.grid, run=run, progress=self.progress)
+        refine: Any = refine_paper if self.options.refine == "paper" else refine_swarm
+        refined = refine(vehicles, basemap, state.grid, run=run, progress=self.progress)
         strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
         return _Refinement(strip[0], strip[1], refined.terrain)
 
@@ -275,7 +279,7 @@ class _Batch:
         fine = [p for s in refinement.fine for p in s.placed]
         level = ground_level(fine, refinement.terrain)
         nadirs = np.array([p.camera.nadir for p in fine])
-        model = read_dem(self.options.dem, state.grid.epsg, _bounds(fine, level, level), takeoff=nadirs)
+        model = read_dem(self.options.dem, state.grid.epsg, placed_bounds(fine, level, level), takeoff=nadirs)
         return replace(model, z=model.z + np.float32(level))
 
     def picture(self, state: _State, name: str, placed: Sequence[PlacedFrame], terrain: Terrain | None) -> None:
@@ -301,7 +305,7 @@ class _Batch:
         if not usable:
             reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
             raise OrthoSwarmError(f"no picture can be drawn: {reason}")
-        grid = GroundGrid.around(state.grid.epsg, _bounds(usable, low, high), state.gsd_m)
+        grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
         stem = name.removesuffix(".tif")
 
         def drawn(done: int, total: int) -> None:
@@ -315,7 +319,9 @@ class _Batch:
                 stats = mosaic(placed, canvas, run=self.workers.map, progress=drawn)
             else:
                 stats = render(placed, terrain, canvas, gains=state.gains, run=self.workers.map, progress=drawn)
-            write_cog(canvas, self.out / name, window=_drawn(canvas), progress=written, threads=self.workers.count)
+            write_cog(
+                canvas, self.out / name, window=drawn_window(canvas), progress=written, threads=self.workers.count
+            )
         self.space.clear_scratch()
         return stats
 
@@ -344,11 +350,11 @@ class _Batch:
         with self.clock.stage("final: report", len(placed)) as stage:
             z = ground_level(placed, state.terrain)
             write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
-            report = self.report(state, placed, refinement, z)
+            report = self.report(state, placed, refinement.fine if refinement else [], z)
             write_page(self.out, report, placed, list(state.rejected.values()), state.basemap)
         wall, cpu, memory = self.clock.totals()
         report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
-        report["stages"].append(_stage_row(stage))
+        report["stages"].append(stage_row(stage))
         write_json(self.out / "report.json", report)
         return report
 
@@ -361,29 +367,21 @@ class _Batch:
         return names
 
     def report(
-        self, state: _State, placed: Sequence[PlacedFrame], refinement: _Refinement | None, ground_z_m: float
+        self, state: _State, placed: Sequence[PlacedFrame], solutions: Sequence[Solution], ground_z_m: float
     ) -> dict[str, Any]:
-        solutions = refinement.fine if refinement else []
-        used = Counter(p.frame.vehicle for p in placed)
+        """The content of report.json so far."""
         wall, cpu, memory = self.clock.totals()
-        vehicles = vehicle_rows(solutions, used) or [
-            {"id": v, "frames": n, "fov_deg": _fov(placed, v), "fov_sigma_deg": None, "legs": 0}
-            for v, n in used.items()
-        ]
+        count, left_out = len(placed), len(state.rejected)
         return {
-            "frames": {
-                "input": len(placed) + len(state.rejected),
-                "used": len(placed),
-                "rejected": len(state.rejected),
-            },
-            "vehicles": vehicles,
+            "frames": {"input": count + left_out, "used": count, "rejected": left_out},
+            "vehicles": vehicle_rows(solutions, placed),
             "legs": leg_rows(solutions),
-            "stages": [_stage_row(s) for s in self.clock.stages],
+            "stages": [stage_row(s) for s in self.clock.stages],
             "wall_s": wall,
             "cpu_s": cpu,
             "peak_rss_mb": memory,
             "ground_z_m": ground_z_m,
-            "refine": self.options.refine if refinement else "none",
+            "refine": self.options.refine if solutions else "none",
             "warnings": list(dict.fromkeys(state.warnings)),
             "epsg": state.grid.epsg,
             "gsd_m": state.gsd_m,
@@ -391,36 +389,11 @@ class _Batch:
             "covered_share": state.drawn[1],
             "basemap": str(self.options.basemap) if self.options.basemap else None,
             "until": self.options.until,
-            "root": _root(state.ingest.frames),
+            "root": image_root(state.ingest.frames),
         }
 
 
 # -- helpers ------------------------------------------------------------------------------------------------------
-
-
-def split_legs(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
-    """Frames with each straight leg of a vehicle as a vehicle of its own (`id/leg1`); turns go to the leg before."""
-    from orthoswarm.swarm.legs import split_legs as find_legs
-
-    members: dict[str, list[Frame]] = {}
-    for frame in frames:
-        members.setdefault(frame.vehicle, []).append(frame)
-    out: list[Frame] = []
-    for vehicle, own in members.items():
-        ground = grid.to_grid([f.fix.lat_deg for f in own], [f.fix.lon_deg for f in own])
-        leg = find_legs(ground)
-        last = 0
-        for frame, number in zip(own, leg.tolist(), strict=True):
-            last = number if number >= 0 else last
-            out.append(replace(frame, vehicle=f"{vehicle}/leg{last + 1}"))
-    return out
-
-
-def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:
-    """Height of the plane on which homographies are stated: the middle of the ground below the cameras."""
-    if terrain is None or not placed:
-        return 0.0
-    return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
 
 
 def _append(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
@@ -428,35 +401,6 @@ def _append(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
     for p in carried:
         own = next((i for i, s in enumerate(solutions) if s.vehicle == p.frame.vehicle), 0)
         solutions[own] = replace(solutions[own], placed=[*solutions[own].placed, p])
-
-
-def _bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:
-    boxes = footprint_boxes([p.camera for p in placed], low, high)
-    boxes = boxes[np.isfinite(boxes).all(axis=1)]
-    if not len(boxes):
-        raise OrthoSwarmError("no picture looks at the ground; check the pitch angles (-90 is straight down)")
-    west, south = boxes[:, :2].min(axis=0)
-    east, north = boxes[:, 2:].max(axis=0)
-    return float(west), float(south), float(east), float(north)
-
-
-def _drawn(canvas: Canvas) -> tuple[int, int, int, int]:
-    """The window of a canvas that holds what was drawn, on tiles and on pixels of its coarsest overview."""
-    row0, row1, col0, col1 = canvas.drawn
-    step = TILE_PX
-    while max(row1 - row0, col1 - col0) > TILE_PX * step:
-        step *= 2
-    return row0 // step * step, row1, col0 // step * step, col1
-
-
-def _partial_cover(basemap: Basemap, cameras: Sequence[Any]) -> list[str]:
-    """A warning where pictures were taken outside the map."""
-    west, south, east, north = basemap.bounds
-    xy = np.array([c.position[:2] for c in cameras])
-    inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
-    if inside.mean() > 0.98:
-        return []
-    return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]
 
 
 def _coarse_terrain(solutions: Sequence[Solution]) -> Terrain | None:
@@ -478,29 +422,5 @@ def _split_time(stage: Stage, refinement: _Refinement, until: str, with_map: boo
     ]
 
 
-def _root(frames: Sequence[Frame]) -> str | None:
-    """The folder that picture names are relative to; None where they are pictures of videos."""
-    for frame in frames:
-        path = frame.path.absolute().as_posix()
-        if path.endswith("/" + frame.image):
-            return path.removesuffix("/" + frame.image) or "/"
-    return None
-
-
-def _stage_row(stage: Stage) -> dict[str, Any]:
-    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
-
-
-def _fov(placed: Sequence[PlacedFrame], vehicle: str) -> float:
-    return float(np.median([np.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]))
-
-
 def _named(vehicle: str, warning: str) -> str:
     return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"
-
-
-def _nothing_to_map(ingest: Ingest) -> str:
-    if not ingest.rejected:
-        return "no picture was found in the input; name a folder of photos or a video"
-    reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
-    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"

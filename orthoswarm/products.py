@@ -3,6 +3,7 @@
 import json
 import math
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 from orthoswarm.camera import Camera, Lens, angles_from_rotation
 from orthoswarm.export.footprints import write_footprints
 from orthoswarm.export.partial import written_whole
-from orthoswarm.frame import Rejection
+from orthoswarm.frame import Frame, Rejection
 from orthoswarm.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.placement import PlacedFrame, Solution
+from orthoswarm.stages import Stage
 
 Array = NDArray[np.float64]
 
@@ -178,24 +180,44 @@ def read_frames(path: Path) -> Iterator[dict[str, Any]]:
                 yield json.loads(line)
 
 
-def vehicle_rows(solutions: Sequence[Solution], placed: Mapping[str, int]) -> list[dict[str, Any]]:
-    """`vehicles` of report.json; placed is the number of frames of each vehicle that were used."""
-    return [
+def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -> list[dict[str, Any]]:
+    """`vehicles` of report.json: those that were refined, then those that were placed as recorded."""
+    used = Counter(p.frame.vehicle for p in placed)
+    rows: list[dict[str, Any]] = [
         {
             "id": s.vehicle,
-            "frames": placed.get(s.vehicle, 0),
+            "frames": used.pop(s.vehicle, 0),
             "fov_deg": finite(s.fov_deg),
             "fov_sigma_deg": finite(s.fov_sigma_deg),
             "legs": len(s.legs),
         }
         for s in solutions
     ]
+    for vehicle, count in used.items():
+        assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
+        fov = statistics.median(assumed)
+        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0})
+    return rows
 
 
 def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
     """`legs` of report.json."""
     rows = [asdict(leg) for s in solutions for leg in s.legs]
     return [row | {"confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])} for row in rows]
+
+
+def stage_row(stage: Stage) -> dict[str, Any]:
+    """One of `stages` of report.json."""
+    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
+
+
+def image_root(frames: Sequence[Frame]) -> str | None:
+    """The folder that picture names are relative to; None where they are pictures of videos."""
+    for frame in frames:
+        path = frame.path.absolute().as_posix()
+        if path.endswith("/" + frame.image):
+            return path.removesuffix("/" + frame.image) or "/"
+    return None
 
 
 def finite(value: float) -> float | None:

@@ -4,6 +4,7 @@ Positions as recorded, an assumed field of view (theta-hat) where the pictures d
 no angles are known, yaw from the course flown where there is none. What was assumed is said in a warning.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.frame import Frame, Rejection
+from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.placement import PlacedFrame
 
@@ -173,3 +174,11 @@ def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
     return Rejection(
         frame.image, f"its position is {where}; correct it or map it by itself", frame.vehicle, frame.time_s
     )
+
+
+def nothing_to_map(ingest: Ingest) -> str:
+    """Why inputs without a single frame are of no use, one sentence."""
+    if not ingest.rejected:
+        return "no picture was found in the input; name a folder of photos or a video"
+    reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
+    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"

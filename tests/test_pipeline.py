@@ -13,7 +13,9 @@ import rasterio
 from gcs_plugin.cli import main
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export import cog
-from orthoswarm.pipeline import PRODUCTS, Options, ground_level, run, split_legs
+from orthoswarm.extent import ground_level
+from orthoswarm.pipeline import PRODUCTS, Options, run
+from orthoswarm.vehicles import legs_as_vehicles
 from orthoswarm.workers import Processes, Serial
 from orthoswarm.workspace import Workspace
 from telemetry import LoadOptions, load
@@ -269,7 +271,7 @@ def test_legs_become_vehicles(flight, tmp_path):
     scene, shots, _ = flight
     scene.fly(tmp_path / "photos", shots["a"])
     frames = load([tmp_path / "photos"]).frames
-    named = [f.vehicle for f in split_legs(frames, scene.grid)]
+    named = [f.vehicle for f in legs_as_vehicles(frames, scene.grid)]
     assert named[0] == "photos/leg1" and named[-1] == "photos/leg2"
     assert named == sorted(named) and 6 <= named.count("photos/leg1") <= 10
     report = make(tmp_path / "photos", tmp_path / "out", Options(split_legs=True, until="realtime"))

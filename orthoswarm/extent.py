@@ -1,0 +1,53 @@
+"""Where pictures and their ground lie: bounds, the drawn part of a canvas, the ground's level, cover by a map."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.mosaic.canvas import Canvas
+from orthoswarm.mosaic.footprint import footprint_boxes
+from orthoswarm.placement import MapWindow, PlacedFrame, Terrain
+
+Bounds = tuple[float, float, float, float]
+
+
+def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:
+    """West, south, east, north of all ground between two heights that any picture sees.
+
+    Raises:
+        OrthoSwarmError: if none looks at the ground.
+    """
+    boxes = footprint_boxes([p.camera for p in placed], low, high)
+    boxes = boxes[np.isfinite(boxes).all(axis=1)]
+    if not len(boxes):
+        raise OrthoSwarmError("no picture looks at the ground; check the pitch angles (-90 is straight down)")
+    west, south = boxes[:, :2].min(axis=0)
+    east, north = boxes[:, 2:].max(axis=0)
+    return float(west), float(south), float(east), float(north)
+
+
+def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:
+    """Height of the plane on which homographies are stated: the middle of the ground below the cameras."""
+    if terrain is None or not placed:
+        return 0.0
+    return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+
+
+def drawn_window(canvas: Canvas) -> tuple[int, int, int, int]:
+    """The window of a canvas that holds what was drawn, on tiles and on pixels of its coarsest overview."""
+    row0, row1, col0, col1 = canvas.drawn
+    step = canvas.tile_px
+    while max(row1 - row0, col1 - col0) > canvas.tile_px * step:
+        step *= 2
+    return row0 // step * step, row1, col0 // step * step, col1
+
+
+def partial_cover(basemap: MapWindow, placed: Sequence[PlacedFrame]) -> list[str]:
+    """A warning where pictures were taken outside the map."""
+    west, south, east, north = basemap.bounds
+    xy = np.array([p.camera.nadir for p in placed])
+    inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
+    if inside.mean() > 0.98:
+        return []
+    return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]
