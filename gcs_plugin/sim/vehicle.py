@@ -27,7 +27,7 @@ _POSITION: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 _ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
 _CURRENT: Final = int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT)
 _PX4_DEFAULTS: Final = {_POSITION: 50.0, _ATTITUDE: 50.0, _CURRENT: 1.0, 245: 5.0, 1: 1.0, 24: 1.0, 2: 1.0}
-_FOCUS_HOME: Final = (47.397742, 8.545594, 488.0)
+_HOME: Final = (47.397742, 8.545594, 488.0)
 
 
 @dataclass(slots=True)
@@ -47,7 +47,7 @@ class SimVehicle:
 
     system: int
     autopilot: Autopilot = Autopilot.ARDUPILOT
-    home: tuple[float, float, float] = _FOCUS_HOME
+    home: tuple[float, float, float] = _HOME
     airframe: Airframe = field(default_factory=Airframe)
     boot_utc_s: float = 1_700_000_000.0
     ready_s: float = 0.0
