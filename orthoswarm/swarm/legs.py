@@ -7,46 +7,64 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
+REACH = 3
+"""Frames before and after between which a bend is measured."""
+
+
 def split_legs(
-    position: Array, time_s: Array | None = None, turn_rad: float = np.radians(30.0), shortest: int = 3
+    position: Array, time_s: Array | None = None, turn_rad: float = np.radians(35.0), shortest: int = 3
 ) -> Ints:
     """Leg of each frame, -1 for frames in turns and strays: int32 (N,), numbered in order.
+
+    Legs end at corners of the path (where it bends most, over a few frames), at jumps and at pauses.
 
     Args:
         position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
         time_s: float64 (N,) or None; a gap over 60 s ends a leg.
-        turn_rad: a leg ends where the course leaves its own mean by more than this.
+        turn_rad: least bend of a corner.
         shortest: fewer frames are no leg.
     """
     n = len(position)
     leg = np.full(n, -1, np.int32)
     if n < 2:
-        return np.zeros(n, np.int32) if n else leg
-    span = min(4, n - 1)
-    ahead = np.minimum(np.arange(n) + span, n - 1)
-    behind = np.maximum(np.arange(n) - span, 0)
-    forward = position[ahead, :2] - position[:, :2]
-    backward = position[:, :2] - position[behind, :2]
-    course = np.where((np.arange(n) == n - 1)[:, None] | (np.hypot(*forward.T) < 1e-6)[:, None], backward, forward)
-    angle = np.arctan2(course[:, 0], course[:, 1])
-    bend = np.abs(_wrap(np.arctan2(forward[:, 0], forward[:, 1]) - np.arctan2(backward[:, 0], backward[:, 1])))
-    bend[[0, n - 1]] = 0.0
-    gap = np.zeros(n, bool)
-    if time_s is not None and np.isfinite(time_s).all():
-        gap[1:] = np.diff(time_s) > 60.0
+        return np.zeros(n, np.int32)
+    bend = _bend(position)
+    breaks = _breaks(position, time_s)
+    corner = np.zeros(n, bool)
+    for i in range(n):
+        near = slice(max(0, i - REACH + 1), i + REACH)
+        corner[i] = bend[i] > turn_rad and bend[i] == bend[near].max()
     first, number = 0, 0
-    for i in range(1, n + 1):
-        inside = slice(first, i)
-        mean = np.angle(np.exp(1j * angle[inside]).sum())
-        ends = i == n or gap[i] or abs(_wrap(angle[i] - mean)) > turn_rad
-        if ends:
-            members = np.arange(first, i)
-            members = members[bend[members] < 2 * turn_rad] if len(members) > 2 * span else members
-            if len(members) >= shortest:
-                leg[members] = number
+    for i in range(n + 1):
+        if i == n or corner[i] or breaks[i]:
+            if i - first >= shortest:
+                leg[first:i] = number
                 number += 1
-            first = i
+            first = i + 1 if i < n and corner[i] else i
     return leg
+
+
+def _bend(position: Array) -> Array:
+    """Angle between the way to a frame and the way from it, over REACH frames; 0 at the ends and where it hovers."""
+    n = len(position)
+    i = np.arange(n)
+    ahead = position[np.minimum(i + REACH, n - 1), :2] - position[:, :2]
+    behind = position[:, :2] - position[np.maximum(i - REACH, 0), :2]
+    moving = (np.hypot(*ahead.T) > 1e-6) & (np.hypot(*behind.T) > 1e-6)
+    turn = _wrap(np.arctan2(ahead[:, 0], ahead[:, 1]) - np.arctan2(behind[:, 0], behind[:, 1]))
+    return np.where(moving, np.abs(turn), 0.0)
+
+
+def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
+    """Frames before which the flight was interrupted: a pause of a minute, or a jump of many steps."""
+    n = len(position)
+    out = np.zeros(n, bool)
+    step = np.hypot(*np.diff(position[:, :2], axis=0).T)
+    usual = float(np.median(step))
+    out[1:] = step > 6.0 * usual + 30.0
+    if time_s is not None and np.isfinite(time_s).all():
+        out[1:] |= np.diff(time_s) > 60.0
+    return out
 
 
 def _wrap(angle: Array) -> Array:

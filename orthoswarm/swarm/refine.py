@@ -4,6 +4,7 @@ Solo pass of each vehicle -> lean voted over all of them -> second pass with nei
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -370,6 +371,7 @@ def second_pass(
 ) -> VehicleState:
     """One vehicle again: common level and lean, links into held neighbours, fresh ties; then denser ground."""
     state, others, correction = item
+    state = deepcopy(state)  # neighbours see this vehicle as its solo pass left it, in whatever order they are run
     watch = Stopwatch()
     flight = state.flight
     state.surface = replace(state.surface, lean=lean, level_m=state.surface.level_m + correction)

@@ -1,0 +1,151 @@
+"""Finding strips and points on a map, and what is concluded from them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from orthoswarm.camera import rotation_from_angles
+from orthoswarm.geo import GroundGrid
+from orthoswarm.swarm.coarse import correlate, orientation_field, register
+from orthoswarm.swarm.loadedmap import LoadedMap
+from orthoswarm.swarm.rig import Rig
+from orthoswarm.swarm.settle import mode_shift
+from orthoswarm.swarm.sights import one_per_cell
+from orthoswarm.swarm.ties import MapMatches, match_points, vote_lean
+
+GSD = 0.5
+
+
+def texture(size, seed=1):
+    rng = np.random.default_rng(seed)
+    parts = [
+        cv2.resize(rng.random((size // s, size // s)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+        for s in (3, 7, 16, 50)
+    ]
+    return cv2.normalize(sum(parts), None, 0, 255, cv2.NORM_MINMAX)
+
+
+@dataclass
+class FlatMap:
+    """A map of 500 m x 500 m around the local origin."""
+
+    values: np.ndarray
+    epsg: int = 32633
+    native_gsd_m: float = GSD
+
+    @property
+    def bounds(self):
+        return (-250.0, -250.0, 250.0, 250.0)
+
+    def gray(self, bounds, gsd_m):
+        grid = GroundGrid.around(self.epsg, bounds, gsd_m)
+        columns, rows = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
+        east, north = np.moveaxis(grid.to_ground(np.stack([columns, rows], -1)), -1, 0)
+        u, v = (east + 250) / GSD - 0.5, (250 - north) / GSD - 0.5
+        out = cv2.remap(self.values, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        return out, (u >= 0) & (v >= 0) & (u < 999) & (v < 999)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return FlatMap(texture(1000))
+
+
+def pictures_of(world, offset):
+    """Six nadir pictures whose record is `offset` metres away from where they were taken."""
+    true = np.array([[x, 10.0, 100.0] for x in np.linspace(-60, 60, 6)])
+    rotation = np.repeat(rotation_from_angles([0.0], [-np.pi / 2], [0.0]), 6, axis=0)
+    rig = Rig(true, rotation, np.zeros(6, np.int32), np.array([[300.0, 0, 0, 0, 0, 0, 320, 240]]))
+    columns, rows = np.meshgrid(np.arange(320), np.arange(240))
+    images = []
+    for i in range(6):
+        ground = rig.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float))
+        u, v = (ground[..., 0] + 250) / GSD - 0.5, (250 - ground[..., 1]) / GSD - 0.5
+        image = cv2.remap(world.values, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+        images.append(np.clip(255 - 0.7 * image, 0, 255).astype(np.uint8))  # light and dark have changed places
+    return Rig(true + np.array([*offset, 0.0]), rotation, rig.lens_id, rig.lens), images
+
+
+def test_a_strip_is_found_although_light_and_dark_changed_places(world):
+    rig, images = pictures_of(world, (17.0, -9.0))
+    found = register(rig, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=40.0, gsd_m=1.0)
+    np.testing.assert_allclose(found.shift, (-17.0, 9.0), atol=0.3)
+    assert found.ratio < 0.6
+
+
+def test_a_map_elsewhere_gives_no_match(world):
+    rig, images = pictures_of(world, (0.0, 0.0))
+    away = Rig(rig.position + np.array([900.0, 0, 0]), rig.rotation, rig.lens_id, rig.lens)
+    assert register(away, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0) is None
+
+
+def test_correlation_finds_fractions_of_a_pixel():
+    image = texture(300, seed=5)
+    moved = cv2.warpAffine(image, np.array([[1, 0, 3.4], [0, 1, -2.7]]), (300, 300))
+    inner = orientation_field(image[50:250, 50:250], np.ones((200, 200), bool))
+    outer = orientation_field(moved[30:270, 30:270], np.ones((240, 240), bool))
+    column, row, _, ratio = correlate(inner, outer, 20)
+    assert column == pytest.approx(3.4, abs=0.2)
+    assert row == pytest.approx(-2.7, abs=0.2)
+    assert ratio < 0.5
+
+
+def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
+    inverted = FlatMap((255 - world.values).astype(np.float32))
+    rig, images = pictures_of(inverted, (1.5, -0.8))
+    points = np.array([[x, y, 0.0] for x in (-40.0, 0.0, 40.0) for y in (-5.0, 10.0, 25.0)])
+    points += np.array([1.5, -0.8, 0.0])
+    camera = np.abs(points[:, None, 0] - rig.position[None, :, 0]).argmin(1).astype(np.int32)
+    ground = LoadedMap.load(inverted, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
+    flipped = [255 - im for im in images]
+    found = match_points(rig, points, np.arange(9), camera, lambda i: flipped[i], ground, 16, 10, np.zeros(9))
+    assert len(found.point) == 9
+    np.testing.assert_allclose(found.shift, np.tile([-1.5, 0.8], (9, 1)), atol=0.1)
+    assert (found.ratio < 0.8).all()
+
+
+def test_raised_corners_are_tied_by_the_ground_around_them(world):
+    rig, images = pictures_of(world, (0.0, 0.0))
+    raised = np.array([[30.0, 20.0, 3.0], [-25.0, -8.0, 2.0]])
+    camera = np.array([2, 2], np.int32)
+    ground = LoadedMap.load(world, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
+    plain = [255 - im for im in images]
+    found = match_points(rig, raised, np.arange(2), camera, lambda i: plain[i], ground, 16, 10, np.zeros(2))
+    np.testing.assert_allclose(found.shift, 0.0, atol=0.1)
+
+
+def roofs(height, lean, seed=0, wild=0.3):
+    rng = np.random.default_rng(seed)
+    shift = np.outer(height, lean) + rng.normal(0, 0.2, (len(height), 2))
+    bad = rng.random(len(height)) < wild
+    shift[bad] = rng.uniform(-8, 8, (int(bad.sum()), 2))
+    n = len(height)
+    return MapMatches(np.arange(n, dtype=np.int32), np.zeros(n, np.int32), shift, np.ones(n), np.zeros(n))
+
+
+def test_the_lean_is_voted_among_outliers():
+    height = np.random.default_rng(1).uniform(4, 25, 60)
+    found = vote_lean(roofs(height, np.array([0.2, -0.12])), height, np.zeros(2))
+    np.testing.assert_allclose(found, (0.2, -0.12), atol=0.02)
+
+
+def test_few_or_contradictory_roofs_vote_for_nothing():
+    height = np.random.default_rng(1).uniform(4, 25, 60)
+    assert vote_lean(roofs(height[:8], np.array([0.2, -0.12])), height[:8], np.zeros(2)) is None
+    assert vote_lean(roofs(height, np.array([0.2, -0.12]), wild=1.0), height, np.zeros(2)) is None
+
+
+def test_the_agreed_shift_outvotes_a_scattered_majority():
+    rng = np.random.default_rng(2)
+    shift = np.concatenate([rng.normal((1.2, -0.7), 0.15, (40, 2)), rng.uniform(-10, 10, (60, 2))])
+    np.testing.assert_allclose(mode_shift(shift), (1.2, -0.7), atol=0.08)
+    np.testing.assert_array_equal(mode_shift(np.zeros((0, 2))), 0.0)
+
+
+def test_each_cell_of_each_leg_gives_its_best_point():
+    points = np.array([[1.0, 1, 0], [2, 2, 0], [3, 3, 0], [55, 1, 0]])
+    leg = np.array([0, 0, 1, 0], np.int32)
+    chosen = one_per_cell(points, leg, np.array([0.5, 0.2, 0.9, np.inf]), 50.0)
+    np.testing.assert_array_equal(chosen, [1, 2])

@@ -1,0 +1,151 @@
+"""The refiner end to end on a small twin: on the map, without one, one vehicle at a time, damaged input."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoswarm.basemap import Basemap
+from orthoswarm.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all, solo
+from orthoswarm.twin.make import make_twin
+from orthoswarm.twin.presets import spec
+from telemetry import load
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("twin") / "tiny"
+    make_twin(spec("tiny", seed=1), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(twin):
+    frames = load([twin / "photos"]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
+    with (twin / "truth" / "frames.csv").open() as file:
+        header = next(csv.reader(file))
+        truth = {row[0]: dict(zip(header[:12], row, strict=False)) for row in csv.reader(file)}
+    return vehicles, grid, Basemap.open(twin / "basemap.tif", grid.epsg), truth
+
+
+@pytest.fixture(scope="module")
+def refined(scene):
+    vehicles, grid, basemap, _ = scene
+    return refine_all(vehicles, basemap, grid)
+
+
+def true_camera(row, frame, grid):
+    east, north, height = (float(row[k]) for k in ("easting", "northing", "height"))
+    lat, lon = grid.to_geographic([east, north])
+    yaw = np.radians(float(row["yaw_deg"])) - grid.convergence_rad(lat, lon)
+    rotation = rotation_from_angles(yaw, np.radians(float(row["pitch_deg"])), np.radians(float(row["roll_deg"])))
+    lens = Lens(frame.width, frame.height, focal_px(np.radians(float(row["fov_deg"])), frame.width))
+    return Camera(np.array([east, north, height]), rotation, lens)
+
+
+def errors(solution, truth, grid):
+    out = []
+    for p in solution.placed:
+        true = true_camera(truth[p.frame.image], p.frame, grid)
+        middle = np.array([0.5 * (p.frame.width - 1), 0.5 * (p.frame.height - 1)])
+        out.append(p.camera.to_ground(middle) - true.to_ground(middle))
+    return np.hypot(*np.array(out).T)
+
+
+def test_pictures_come_to_lie_on_the_map(refined, scene):
+    vehicles, grid, _, truth = scene
+    for solution in refined.fine:
+        assert len(solution.placed) == len(vehicles[solution.vehicle])
+        assert all(p.stage == "fine" for p in solution.placed)
+        error = errors(solution, truth, grid)
+        assert np.median(error) < 0.35
+        assert error.max() < 1.0
+        assert any(leg.state == "matched" for leg in solution.legs)
+        row = truth[solution.placed[0].frame.image]
+        assert solution.fov_deg == pytest.approx(float(row["fov_deg"]), abs=1.0)
+
+
+def test_the_map_helps(refined, scene):
+    _, grid, _, truth = scene
+    fine = np.concatenate([errors(s, truth, grid) for s in refined.fine])
+    coarse = np.concatenate([errors(s, truth, grid) for s in refined.coarse])
+    assert np.median(fine) < 0.6 * np.median(coarse)
+
+
+def test_stated_errors_are_of_the_size_of_the_true_ones(refined, scene):
+    _, grid, _, truth = scene
+    error = np.concatenate([errors(s, truth, grid) for s in refined.fine])
+    sigma = np.array([p.sigma_m for s in refined.fine for p in s.placed])
+    assert (error < 2.5 * sigma).mean() > 0.8
+    assert np.median(sigma) < 6 * np.median(error)
+
+
+def test_without_a_map_the_flight_lies_in_the_frame_of_its_receiver(scene):
+    vehicles, grid, _, truth = scene
+    result = refine_all(vehicles, None, grid)
+    for solution in result.fine:
+        assert all(p.stage == "coarse" for p in solution.placed)
+        assert all(leg.state == "carried" for leg in solution.legs)
+        assert np.median(errors(solution, truth, grid)) < 3.0
+        assert min(p.sigma_m for p in solution.placed) > 0.3
+
+
+def test_the_order_of_vehicles_does_not_matter(refined, scene):
+    vehicles, grid, basemap, _ = scene
+    turned = refine_all(dict(reversed(vehicles.items())), basemap, grid)
+    by_image = {p.frame.image: p.camera.position for s in turned.fine for p in s.placed}
+    for solution in refined.fine:
+        for p in solution.placed:
+            np.testing.assert_allclose(p.camera.position, by_image[p.frame.image], atol=1e-4)
+
+
+def test_a_vehicle_that_completes_later_is_refined_beside_the_first(scene):
+    vehicles, grid, basemap, truth = scene
+    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
+    refiner = SwarmRefiner(grid.epsg, origin)
+    first, second = vehicles.values()
+    one = refiner.refine(first, [], basemap)
+    before = [p.camera.position.copy() for p in one.placed]
+    two = refiner.refine(second, [one], basemap)
+    assert len(two.placed) == len(second)
+    assert np.median(errors(two, truth, grid)) < 0.4
+    np.testing.assert_array_equal(before, [p.camera.position for p in one.placed])
+
+
+def test_damaged_pictures_are_dropped_with_a_reason_and_the_rest_is_placed(twin, tmp_path, scene):
+    _, grid, basemap, _ = scene
+    photos = tmp_path / "photos"
+    shutil.copytree(twin / "photos", photos)
+    victim = sorted(Path(photos).rglob("*.JPG"))[7]
+    victim.write_bytes(victim.read_bytes()[:9000] + bytes(20000))
+    frames = [f for f in load([photos]).frames if f.vehicle == "uav01"]
+    result = refine_all({"uav01": frames}, basemap, grid)
+    (solution,) = result.fine
+    named = {f"{victim.parent.name}/{victim.name}"}
+    assert set(solution.dropped) == named or len(frames) == 19
+    assert len(solution.placed) + len(solution.dropped) == len(frames)
+
+
+def test_a_map_of_other_ground_leaves_the_flight_in_its_own_frame(scene):
+    vehicles, grid, basemap, _ = scene
+
+    class Elsewhere:
+        epsg, native_gsd_m = grid.epsg, basemap.native_gsd_m
+        bounds = basemap.bounds
+
+        def gray(self, bounds, gsd_m):
+            gray, valid = basemap.gray(bounds, gsd_m)
+            rng = np.random.default_rng(int(abs(bounds[0])) % 1000)
+            return rng.uniform(0, 255, gray.shape).astype(np.float32), valid
+
+    frames = vehicles["uav01"]
+    origin = local_origin(grid, frames)
+    state = solo(frames, epsg=grid.epsg, origin=origin, basemap=Elsewhere(), options=Options())
+    assert not state.on_map
+    assert any("not" in w or "no part" in w for w in state.flight.warnings)
