@@ -34,7 +34,7 @@ class FieldSettings:
     block_m: float = 36.0
     step_m: float = 20.0
     search_m: float = 8.0
-    min_peak: float = 0.22
+    min_peak: float = 0.25
     max_second: float = 0.8
     apart_m: float = 2.0
     min_cover: float = 0.6

@@ -54,7 +54,7 @@ def test_other_ground_is_not_matched():
     for other in (shifted(texture(2), 0, 0), np.full(SHAPE, 90, np.float32)):
         field = displacement_field(other, ALL, shifted(texture(1), 0, 0), ALL, SETTINGS)
         assert len(field.matched) == 20
-        assert field.matched.mean() < 0.1
+        assert field.matched.mean() < 0.15
     measured = accuracy(field, completeness(ALL, ALL, 0.5), 40.0)
     assert measured.unmatched_share > 0.9
     assert measured.share_within_1m < 0.1

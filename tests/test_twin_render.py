@@ -133,7 +133,7 @@ def test_water_and_haze_move_and_the_rest_stands_still():
     scene = box_scene(5.0)
     scene.kind[:, : scene.kind.shape[1] // 3] = WATER  # the western third
     haze = np.zeros((30, 30), np.float32)
-    haze[20:, 20:] = 0.6  # the south-eastern corner
+    haze[17:, 17:] = 0.6  # the south-eastern corner
     stage = make_stage(scene, scene.albedo, (0.0, 0.0, 1.0), 1.0, haze)
     lens = Lens(320, 240, 170.0)
     camera = Camera(np.array([500000.0, 5000000.0, 55.0]), rotation_from_angles(0.0, -np.pi / 2, 0.0), lens)

@@ -21,6 +21,7 @@ Floats = NDArray[np.float32]
 NOISE_SIDE = 1024
 HAZE_CELL_M = 4.0
 HAZE_HEIGHT_M = 20.0
+BLOCK = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,58 +201,106 @@ def _veil(haze, noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _highest_below(tiles, rays, rotation, cx, cy, cz, r0, c0, r1, c1, top, floor):  # type: ignore[no-untyped-def]
+    """A height above all that the rays of a small block (corners r0, c0 to r1, c1) can meet.
+
+    What they can meet lies in the box around their paths from `top` to the lowest ground; its highest tile is a lower
+    top, for which the box is smaller.
+    """
+    for _ in range(3):
+        low_x = low_y = 1e18
+        high_x = high_y = -1e18
+        for k in range(4):
+            r, c = (r1 if k & 2 else r0), (c1 if k & 1 else c0)
+            x, y = rays[r, c, 0], rays[r, c, 1]
+            down = -(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2])
+            if down < 0.05:
+                return top
+            bx = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]) / down
+            by = -(rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) / down
+            for z in (top, floor):
+                px, py = cx + bx * (cz - z), cy + by * (cz - z)
+                low_x, high_x, low_y, high_y = min(low_x, px), max(high_x, px), min(low_y, py), max(high_y, py)
+        side = TILE_CELLS * CELL_M
+        first_r, last_r = int(low_y / side) - 1, int(high_y / side) + 1
+        first_c, last_c = int(low_x / side) - 1, int(high_x / side) + 1
+        if first_r < 0 or first_c < 0 or last_r >= tiles.shape[0] or last_c >= tiles.shape[1]:
+            return top
+        highest = floor
+        for i in range(first_r, last_r + 1):
+            for j in range(first_c, last_c + 1):
+                highest = max(highest, tiles[i, j])
+        if highest >= top - 0.5:
+            return top
+        top = highest
+    return top
+
+
+@kernel
 def _shoot(  # type: ignore[no-untyped-def]
     rays, rotation, cx, cy, cz, t0, t1, t2, dsm, tiles, kind, wall, facade, sun, ambient, haze, noise, motion,
-    ca, sa, top, pixel, out,
+    ca, sa, top, floor, pixel, out,
 ):  # fmt: skip
-    """Colours of all rays of one picture: rays float32 (R, C, 2) normalised; averages 2x2 into out (R/2, C/2, 3)."""
+    """Colours of all rays of one picture: rays float32 (R, C, 2) normalised; averages 2x2 into out (R/2, C/2, 3).
+
+    One long body on purpose: a call for each ray with all these arrays costs as much as the ray itself.
+    """
     rows, cols = out.shape[:2]
     rgb = np.empty(3)
-    for r in range(rows):
-        for c in range(cols):
-            s0 = s1 = s2 = 0.0
-            for k in range(4):
-                x, y = rays[2 * r + (k >> 1), 2 * c + (k & 1), 0], rays[2 * r + (k >> 1), 2 * c + (k & 1), 1]
-                dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
-                dy = -(rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2])
-                down = -(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2])
-                rgb[0] = rgb[1] = rgb[2] = 190.0
-                if down > 0.05:
-                    bx, by = dx / down, dy / down
-                    hr, hc, z, side = _march(dsm, tiles, cx / CELL_M, cy / CELL_M, cz, bx / CELL_M, by / CELL_M, top)
-                    if hr < 0:
-                        rgb[0] = rgb[1] = rgb[2] = 120.0
+    ax, ay = cx / CELL_M, cy / CELL_M
+    for block in range(((rows + BLOCK - 1) // BLOCK) * ((cols + BLOCK - 1) // BLOCK)):
+        wide = (cols + BLOCK - 1) // BLOCK
+        first_r, first_c = block // wide * BLOCK, block % wide * BLOCK
+        last_r, last_c = min(first_r + BLOCK, rows), min(first_c + BLOCK, cols)
+        near_top = _highest_below(
+            tiles, rays, rotation, cx, cy, cz, 2 * first_r, 2 * first_c, 2 * last_r - 1, 2 * last_c - 1, top, floor
+        )
+        for ray in range((last_r - first_r) * (last_c - first_c) * 4):
+            k, at = ray & 3, ray >> 2
+            r, c = first_r + at // (last_c - first_c), first_c + at % (last_c - first_c)
+            x, y = rays[2 * r + (k >> 1), 2 * c + (k & 1), 0], rays[2 * r + (k >> 1), 2 * c + (k & 1), 1]
+            dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
+            dy = -(rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2])
+            down = -(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2])
+            rgb[0] = rgb[1] = rgb[2] = 190.0
+            if down > 0.05:
+                bx, by = dx / down, dy / down
+                hr, hc, z, side = _march(dsm, tiles, ax, ay, cz, bx / CELL_M, by / CELL_M, near_top)
+                if hr < 0:
+                    rgb[0] = rgb[1] = rgb[2] = 120.0
+                elif side > 0 and dsm[hr, hc] - z > 0.45:
+                    gx, gy = cx + bx * (cz - z), cy + by * (cz - z)
+                    _wall_color(dsm, wall, facade, hr, hc, side, bx, by, gx, gy, z, sun, ambient, ca, sa, rgb)
+                else:
+                    h = dsm[hr, hc]
+                    sx, sy = _slope(dsm, hr, hc)
+                    # where the ray meets the column's tilted top
+                    px, py = ax + bx * cz / CELL_M - hc - 0.5, ay + by * cz / CELL_M - hr - 0.5
+                    gain = 1.0 + (sx * bx + sy * by) / CELL_M
+                    if gain > 0.3:
+                        z = min(max((h + sx * px + sy * py) / gain, h - 0.6), h + 0.6)
+                    gx, gy = cx + bx * (cz - z), cy + by * (cz - z)
+                    size = pixel * (cz - z) / down
+                    if size < 0.36:
+                        _texture(t0, gx, gy, 4.0, rgb)
+                    elif size < 0.72:
+                        _texture(t1, gx, gy, 2.0, rgb)
                     else:
-                        if side > 0 and dsm[hr, hc] - z > 0.45:
-                            gx, gy = cx + bx * (cz - z), cy + by * (cz - z)
-                            _wall_color(dsm, wall, facade, hr, hc, side, bx, by, gx, gy, z, sun, ambient, ca, sa, rgb)
-                        else:
-                            sx, sy = _slope(dsm, hr, hc)
-                            # where the ray meets the column's tilted top
-                            px = (cx + bx * cz) / CELL_M - hc - 0.5
-                            py = (cy + by * cz) / CELL_M - hr - 0.5
-                            gain = 1.0 + (sx * bx + sy * by) / CELL_M
-                            if gain > 0.3:
-                                zt = (dsm[hr, hc] + sx * px + sy * py) / gain
-                                z = min(max(zt, dsm[hr, hc] - 0.6), dsm[hr, hc] + 0.6)
-                            gx, gy = cx + bx * (cz - z), cy + by * (cz - z)
-                            size = pixel * (cz - z) / down
-                            if size < 0.36:
-                                _texture(t0, gx, gy, 4.0, rgb)
-                            elif size < 0.72:
-                                _texture(t1, gx, gy, 2.0, rgb)
-                            else:
-                                _texture(t2, gx, gy, 1.0, rgb)
-                            tr = min(max(int(gy * 4.0), 0), kind.shape[0] - 1)
-                            tc = min(max(int(gx * 4.0), 0), kind.shape[1] - 1)
-                            if kind[tr, tc] == WATER:
-                                _water_color(noise, gx, gy, motion, rgb)
-                    if haze.shape[0] > 0:
-                        _veil(haze, noise, cx + bx * (cz - HAZE_HEIGHT_M), cy + by * (cz - HAZE_HEIGHT_M), motion, rgb)
-                s0 += rgb[0]
-                s1 += rgb[1]
-                s2 += rgb[2]
-            out[r, c, 0], out[r, c, 1], out[r, c, 2] = 0.25 * s0, 0.25 * s1, 0.25 * s2
+                        _texture(t2, gx, gy, 1.0, rgb)
+                    row, col = (
+                        min(max(int(gy * 4.0), 0), kind.shape[0] - 1),
+                        min(max(int(gx * 4.0), 0), kind.shape[1] - 1),
+                    )
+                    if kind[row, col] == WATER:
+                        _water_color(noise, gx, gy, motion, rgb)
+                if hr >= 0 and haze.shape[0] > 0:
+                    _veil(haze, noise, cx + bx * (cz - HAZE_HEIGHT_M), cy + by * (cz - HAZE_HEIGHT_M), motion, rgb)
+            if k == 0:
+                out[r, c, 0], out[r, c, 1], out[r, c, 2] = 0.25 * rgb[0], 0.25 * rgb[1], 0.25 * rgb[2]
+            else:
+                out[r, c, 0] += 0.25 * rgb[0]
+                out[r, c, 1] += 0.25 * rgb[1]
+                out[r, c, 2] += 0.25 * rgb[2]
 
 
 def lens_rays(lens: Lens) -> Floats:
@@ -278,7 +327,7 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
     _shoot(
         rays, camera.rotation, float(x), float(y), float(camera.position[2]), *stage.levels, s.dsm, stage.tiles, s.kind,
         s.wall, s.facade, np.asarray(stage.sun), stage.ambient, stage.haze, stage.noise, motion,
-        *s.wall_axis, min(float(stage.tiles.max()), float(camera.position[2])),
+        *s.wall_axis, min(float(stage.tiles.max()), float(camera.position[2])), float(s.dsm.min()),
         0.5 / camera.lens.focal_px, out,
     )  # fmt: skip
     return out
