@@ -9,18 +9,23 @@ import sqlite3
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.crew import Crew
-from gcs_plugin.daemon.drawing import Drawer
+from gcs_plugin.daemon.drawing import Drawer, frame_of_row
 from gcs_plugin.daemon.events import Events
+from gcs_plugin.daemon.flock import Flock, completion_rows, note_completion
 from gcs_plugin.daemon.jobs import Job, Jobs
-from gcs_plugin.daemon.journal import Journal, add_frame, packed, unpacked
+from gcs_plugin.daemon.journal import Change, Journal, add_frame, packed, unpacked
 from gcs_plugin.daemon.layers import NAMES, Area, Layer, drawn_bounds
+from gcs_plugin.daemon.plans import Plans
 from gcs_plugin.daemon.pose import PostedPose, frame_of
+from gcs_plugin.daemon.products import FORMATS, ExportTask, facts_of, write_products
 from gcs_plugin.daemon.refinement import Refinement
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.sources import Source
 from gcs_plugin.daemon.store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.tiles import TileServer
 from orthoswarm.basemap import Basemap
@@ -28,6 +33,7 @@ from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.geo import LocalGrid
 from orthoswarm.products import iso_time
 from orthoswarm.workspace import Workspace
+from telemetry.sample import Sample
 
 _LOCK_S: Final = 5.0
 _FREE_MB: Final = 50.0
@@ -78,8 +84,19 @@ class Daemon:
             self.journal, self.store, self.layers, canvases, folder / "solutions", self.crew, self.drawer,
             settings.basemap, self._published,
         )  # fmt: skip
-        self.jobs = Jobs(self.journal, self.events, {"refine": self.refinement.refine}, slots=settings.workers + 1)
+        handlers = {"refine": self.refinement.refine, "export": self._export}
+        self.jobs = Jobs(self.journal, self.events, handlers, slots=settings.workers + 1)
+        self.jobs.on_end(self._after_job)
         self.posted: Counter[str] = Counter()
+        self.plans = Plans(folder / "plans")
+        self.flock: Flock | None = None
+        if settings.links:
+            self.flock = Flock(settings, self.journal, self.events, self.jobs)
+        self.sources = [
+            Source(v.id, v.pictures, self.add_picture, self._pose_at, self._say, folder / "videos")
+            for v in settings.vehicles
+            if v.pictures
+        ]
 
     def start(self) -> None:
         """Begin to draw and to work."""
@@ -88,23 +105,26 @@ class Daemon:
         self.drawer.start()
         self.jobs.start()
         threading.Thread(target=self.crew.warm_up, daemon=True).start()
+        if self.flock is not None:
+            self.flock.start()
+        for source in self.sources:
+            source.start()
 
     def close(self) -> None:
         """Stop; what is under way goes on at the next start."""
-        self.jobs_stopping()
+        for source in self.sources:
+            source.close()
+        if self.flock is not None:
+            self.flock.close()
+        self.jobs.give_up()
+        self.crew.close()
+        self.jobs.close()
         self.drawer.close()
         for layer in self.layers.values():
             layer.close()
         self.journal.remember("clean", True)
         self.journal.close()
         self._lock.close()
-
-    def jobs_stopping(self) -> None:
-        """Take the workers away from running jobs and wait for their threads."""
-        with self.jobs._condition:
-            self.jobs._stop = True
-        self.crew.close()
-        self.jobs.close()
 
     def __enter__(self) -> "Daemon":
         self.start()
@@ -202,7 +222,44 @@ class Daemon:
                 document |= {key: pose.get(key) for key in ("lat_deg", "lon_deg", "height_m")}
                 document |= {"heading_deg": pose.get("yaw_deg"), "last_frame": iso_time(last[row["last"]]["time"])}
             out.append(document)
-        return out
+        linked = {} if self.flock is None else {row["id"]: row for row in self.flock.rows()}
+        documents = {document["id"]: document for document in out}
+        for name, heard in linked.items():
+            documents[name] = documents.get(name, {"sortie": 1, "frames": {}}) | heard
+        for source in self.sources:
+            documents.setdefault(source.vehicle, {"id": source.vehicle, "state": "waiting", "frames": {}, "sortie": 1})
+            documents[source.vehicle]["pictures"] = source.document()
+        return list(documents.values())
+
+    def legs(self) -> dict[str, Any]:
+        """The legs of refined vehicles as GeoJSON lines with state, confidence and sigma."""
+        features = []
+        for row in self.journal.rows("SELECT * FROM solutions"):
+            frames = self.journal.rows(
+                "SELECT pose FROM frames WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
+                (row["vehicle"], row["sortie"]),
+            )
+            for number, leg in enumerate(json.loads(row["detail"])["legs"], start=1):
+                poses = [json.loads(f["pose"]) for f in frames[leg["first"] : leg["last"] + 1]]
+                if len(poses) < 2:
+                    continue
+                line = [[p["lon_deg"], p["lat_deg"]] for p in (poses[0], poses[-1])]
+                about = {"vehicle": unpacked(row["vehicle"]), "sortie": row["sortie"], "leg": number}
+                about |= {key: leg[key] for key in ("state", "confidence", "sigma_m")}
+                geometry = {"type": "LineString", "coordinates": line}
+                features.append({"type": "Feature", "properties": about, "geometry": geometry})
+        return {"type": "FeatureCollection", "features": features}
+
+    def completions(self) -> list[dict[str, Any]]:
+        """When vehicles completed, and what followed."""
+        return completion_rows(self.journal)
+
+    def _pose_at(self, vehicle: str, time_s: float) -> Sample | None:
+        return None if self.flock is None else self.flock.pose_at(vehicle, time_s)
+
+    def _say(self, text: str) -> None:
+        _log.info("%s", text)
+        self.events.publish("note", text=text)
 
     # -- layers ---------------------------------------------------------------------------------------------------
 
@@ -267,6 +324,65 @@ class Daemon:
             if not wanted:
                 raise InputError(f"vehicle {vehicle} has sent no picture; see /api/vehicles")
         return [self.jobs.add("refine", name, sortie) for name, sortie in wanted]
+
+    def _after_job(self, job: Job) -> None:
+        """Note what a completion led to; write the products once nothing is left to refine."""
+        if job.kind != "refine":
+            return
+        if job.state == "done" and job.vehicle is not None:
+            facts = {
+                "refine_started_s": job.detail["refine_started_s"], "refine_ended_s": job.detail["published_s"],
+                "layer": job.detail["layer"], "version_before": job.detail["version_before"],
+                "version": job.detail["version"], "frames": job.detail["frames"],
+            }  # fmt: skip
+            if self.flock is not None:
+                facts["still_flying_after"] = [r["id"] for r in self.flock.rows() if r["mission"]["phase"] == "active"]
+            self.journal.write(note_completion(job.vehicle, job.sortie, facts))
+            self.events.publish("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
+        if not self.jobs.open("refine"):
+            self.jobs.add("export", formats=["cog", "gpkg"])
+
+    # -- export ---------------------------------------------------------------------------------------------------
+
+    def export(self, formats: Sequence[str]) -> Job:
+        """Queue an export.
+
+        Raises:
+            InputError: an unknown format.
+        """
+        unknown = [name for name in formats if name not in FORMATS]
+        if unknown or not formats:
+            raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")
+        return self.jobs.add("export", formats=list(dict.fromkeys(formats)))
+
+    def _export(self, job: Job, tell: Callable[[float, str], None]) -> Change:
+        """The handler of `export`."""
+        tell(0.05, "writing")
+        area = self.drawer.area
+        if area is None:
+            raise InputError("there is no map yet; wait for pictures")
+        rows = self.journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
+        canvases = {}
+        for name, layer in self.layers.items():
+            with layer.reading() as canvas:
+                if canvas is not None:
+                    canvases[name] = canvas.path
+        solutions = self.journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
+        from gcs_plugin.daemon.metrics import resident_mb
+
+        facts = facts_of(
+            [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
+            time.process_time(), resident_mb(),
+        )  # fmt: skip
+        task = ExportTask(
+            self.settings.workspace, tuple(job.detail["formats"]), canvases, area.epsg, area.gsd_m,
+            [frame_of_row(row, self.store) for row in rows],
+            {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
+            [self.settings.workspace / "solutions" / row["path"] for row in solutions], self.settings.basemap,
+            None if self.settings.fov_min_deg is None else math.radians(self.settings.fov_min_deg), facts,
+        )  # fmt: skip
+        job.detail["files"] = self.crew.run(write_products, task)
+        return lambda db: None
 
     # -- health ---------------------------------------------------------------------------------------------------
 

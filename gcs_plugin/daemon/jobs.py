@@ -9,7 +9,7 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -83,7 +83,7 @@ class Jobs:
         slots: how many jobs run at once.
     """
 
-    def __init__(self, journal: Journal, events: Events, handlers: dict[str, Handler], slots: int) -> None:
+    def __init__(self, journal: Journal, events: Events, handlers: Mapping[str, Handler], slots: int) -> None:
         self._journal, self._events, self._handlers = journal, events, handlers
         self._condition = threading.Condition()
         self._running: dict[int, Job] = {}
@@ -103,11 +103,15 @@ class Jobs:
         for thread in self._threads:
             thread.start()
 
-    def close(self) -> None:
-        """Begin nothing more; what runs is given up by its crew and is queued again at the next start."""
+    def give_up(self) -> None:
+        """Begin nothing more; what fails from now on is not a failure but the end."""
         with self._condition:
             self._stop = True
             self._condition.notify_all()
+
+    def close(self) -> None:
+        """Begin nothing more; what runs is given up by its crew and is queued again at the next start."""
+        self.give_up()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(10.0)

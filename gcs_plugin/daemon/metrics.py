@@ -52,11 +52,12 @@ def prometheus(daemon: "Daemon") -> str:
     single("journal_commits_total", "counter", "Commits since the start.", daemon.journal.commits)
     single("problems", "gauge", "Things that are wrong at present.", len(daemon.problems()))
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
-    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", _resident_mb())
+    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())
     return "\n".join(lines) + "\n"
 
 
-def _resident_mb() -> float:
+def resident_mb() -> float:
+    """Memory of this process now, megabytes."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -27,6 +27,8 @@ from orthoswarm.products import finite
 
 _REACH_M: Final = 400.0
 _IDLE_S: Final = 30.0
+_QUIET_S: Final = 0.7
+_LATE_S: Final = 6.0
 Tell = Callable[[float, str], None]
 
 
@@ -79,7 +81,11 @@ class Refinement:
         assert job.vehicle is not None
         began = time.monotonic()
         tell(0.02, "waiting for the last pictures")
+        if job.detail.get("trigger") == "complete":
+            self._wait_quiet(job)
         self.drawer.wait_idle(_IDLE_S)
+        job.detail["refine_started_s"] = time.time()
+        before = {name: layer.version for name, layer in self.layers.items()}
         area, frames = self._area(), self._frames(job)
         tell(0.05, f"refining {len(frames)} pictures")
         target = self.solutions / f"{new_name('solution')}.pickle"
@@ -99,12 +105,28 @@ class Refinement:
             change = self._publish(job, layer, name, target, solved, rejected)
             self.journal.write(change)  # here, so that the next drawing begins from it
             self.layers[layer].replace(Canvas.open(self.folder / name))
-        job.detail["version"] = self.layers[layer].version
-        job.detail["published"] = time.time()
+        job.detail |= {
+            "version_before": before[layer], "version": self.layers[layer].version, "published_s": time.time(),
+        }  # fmt: skip
         self.on_published(layer, job)
         return lambda db: None
 
     # -- the parts ------------------------------------------------------------------------------------------------
+
+    def _wait_quiet(self, job: Job) -> None:
+        """Pictures that were on their way when the vehicle completed still belong to its sortie."""
+        end, last, since = time.monotonic() + _LATE_S, -1, time.monotonic()
+        while time.monotonic() < end:
+            row = self.journal.one(
+                "SELECT COUNT(*) AS n FROM frames WHERE vehicle = ? AND sortie = ?",
+                (packed(str(job.vehicle)), job.sortie),
+            )
+            count = 0 if row is None else int(row["n"])
+            if count != last:
+                last, since = count, time.monotonic()
+            elif time.monotonic() - since > _QUIET_S:
+                return
+            time.sleep(0.1)
 
     def _area(self) -> Area:
         if self.drawer.area is None:

@@ -11,9 +11,11 @@ from typing import Any, Final, TypeVar
 from fastapi import FastAPI, HTTPException, Query, Request, Response, WebSocket, WebSocketDisconnect
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException
+from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
 from gcs_plugin.daemon.core import Daemon
+from gcs_plugin.daemon.flock import Flock
 from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.daemon.pose import PostedPose, parse_pose, parse_time
 from gcs_plugin.daemon.tiles import TileAddress
@@ -66,6 +68,8 @@ class Routes:
         pool = self._tiles if tiles else self._threads
         try:
             return await asyncio.get_running_loop().run_in_executor(pool, function, *values)
+        except TimeoutError:
+            raise HTTPException(504, "the links did not answer in time; try again") from None
         except InputError as error:
             raise HTTPException(422, str(error)) from None
         except OrthoSwarmError as error:
@@ -189,6 +193,76 @@ class Routes:
         jobs = await self.work(self.daemon.refine, vehicle)
         return Ascii([job.document() for job in jobs], status_code=202)
 
+    async def export(self, request: Request) -> Response:
+        """Write {"formats": [...]} (cog, mbtiles, kmz, gpkg, odm) into the workspace. Answers with the job."""
+        body = await self.body(request)
+        formats = body.get("formats", ["cog", "gpkg"])
+        if not isinstance(formats, list) or not all(isinstance(name, str) for name in formats):
+            raise HTTPException(422, 'formats is no list of texts; send for example ["mbtiles", "kmz"]')
+        job = await self.work(self.daemon.export, formats)
+        return Ascii(job.document(), status_code=202)
+
+    async def exported(self, job: int, kind: str) -> Response:
+        """A file that an export job has made; a folder as a ZIP without compression."""
+        path = await self.work(self._exported, job, kind)
+        return FileResponse(path, filename=path.name)
+
+    def _exported(self, number: int, kind: str) -> Path:
+        job = self.daemon.jobs.find(number)
+        name = None if job is None else job.detail.get("files", {}).get(kind)
+        if name is None:
+            raise HTTPException(404, "that job has made no such file; see /api/jobs")
+        path: Path = self.daemon.settings.workspace / name
+        if path.is_dir():
+            import shutil
+
+            zipped = path.with_suffix(".zip")
+            shutil.make_archive(str(path), "zip", path)
+            path = zipped
+        if not path.is_file():
+            raise HTTPException(404, "the file was removed; export again")
+        return path
+
+    async def legs(self) -> Response:
+        """The legs of refined vehicles as GeoJSON, with state (matched, carried, failed)."""
+        return Ascii(await self.work(self.daemon.legs))
+
+    async def completions(self) -> Response:
+        """When vehicles completed their missions, when their refinement began and ended, who was still flying."""
+        return Ascii(await self.work(self.daemon.completions))
+
+    async def plan(self, request: Request) -> Response:
+        """Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}."""
+        body = await self.body(request)
+        return Ascii(await self.work(self.daemon.plans.make, body, self.daemon.crew), status_code=201)
+
+    async def plans(self) -> Response:
+        """The figures of all plans."""
+        return Ascii(await self.work(self.daemon.plans.all))
+
+    async def plan_map(self, number: str) -> Response:
+        """A plan as GeoJSON: area, legs, ways, starts."""
+        return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
+
+    async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
+        """Upload ({"plan": id, "mission": "v1"}), start, pause, resume or rtl. Answers when the vehicle has."""
+        body = await self.body(request)
+        flock = self.daemon.flock
+        if verb not in ("upload", "start", "pause", "resume", "rtl"):
+            raise HTTPException(404, "there is no such command; choose upload, start, pause, resume or rtl")
+        if flock is None:
+            raise HTTPException(409, "the daemon has no links; start it with --link")
+        text = await self.work(self._command, flock, vehicle, verb, body)
+        return Ascii({"vehicle": vehicle, "command": verb, "ok": True, "text": text})
+
+    def _command(self, flock: Flock, vehicle: str, verb: str, body: dict[str, Any]) -> str:
+        system = flock.system_of(vehicle)
+        if verb == "upload":
+            autopilot = flock.fleet.vehicles[system].autopilot
+            mission = self.daemon.plans.mission(body, vehicle, autopilot)
+            return flock.command(lambda fleet: fleet.upload(system, mission))
+        return flock.command(lambda fleet: getattr(fleet, verb)(system))
+
     async def body(self, request: Request) -> dict[str, Any]:
         """The JSON object of a request; an empty one for an empty body."""
         request._receive = bounded(request.receive, _MOST_JSON_BYTES)
@@ -291,6 +365,14 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/layers", routes.layers)
     add("/api/jobs", routes.jobs)
     add("/api/refine", routes.refine, methods=["POST"], status_code=202)
+    add("/api/export", routes.export, methods=["POST"], status_code=202)
+    add("/api/export/{job}/{kind}", routes.exported)
+    add("/api/legs", routes.legs)
+    add("/api/completions", routes.completions)
+    add("/api/plans", routes.plans)
+    add("/api/plans", routes.plan, methods=["POST"], status_code=201)
+    add("/api/plans/{number}/map", routes.plan_map)
+    add("/api/missions/{vehicle}/{verb}", routes.mission, methods=["POST"])
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile)
     app.add_api_websocket_route("/api/events", routes.events)
     if STATIC.is_dir():

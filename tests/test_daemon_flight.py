@@ -1,0 +1,117 @@
+"""Vehicles on links: plan, upload, start over HTTP; completion starts the refinement by itself; a second mission."""
+
+import math
+import queue
+import threading
+import time
+
+import pytest
+
+from gcs_plugin.sim.motion import Airframe
+from gcs_plugin.sim.swarm import SimSwarm, make_swarm
+from tests.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
+from tests.mosaic_scene import EAST, NORTH
+
+
+class Cameras:
+    """Take a picture of the made-up ground at each exposure and post it, with the recorded pose."""
+
+    def __init__(self):
+        self.waiting: queue.SimpleQueue = queue.SimpleQueue()
+        self.served = None
+        self.posted = 0
+        self.count = 0
+        threading.Thread(target=self.run, daemon=True).start()
+
+    def expose(self, vehicle, exposure):
+        self.count += 1
+        self.waiting.put((vehicle.system, exposure.index, exposure.pose, vehicle.utc_s(exposure.time_s)))
+
+    def run(self):
+        while True:
+            system, index, pose, time_s = self.waiting.get()
+            east, north = GRID.to_grid(pose.lat_deg, pose.lon_deg)
+            turn = float(GRID.convergence_rad(pose.lat_deg, pose.lon_deg))
+            camera = camera_at(east - EAST, north - NORTH, pose.height_m, math.degrees(pose.yaw_rad - turn))
+            name = f"{time_s:.0f}-{index}.jpg"
+            answer = self.served.send(Shot(pose_of(camera, name, f"v{system}", time_s), jpeg(camera)))
+            assert answer.status_code == 201
+            self.posted += 1
+
+
+def square(side_m):
+    lat, lon = GRID.to_geographic([EAST, NORTH])
+    dlat, dlon = side_m / 111_000 / 2, side_m / 111_000 / 2 / math.cos(math.radians(lat))
+    ring = [[lon - dlon, lat - dlat], [lon + dlon, lat - dlat], [lon + dlon, lat + dlat], [lon - dlon, lat + dlat]]
+    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+
+
+@pytest.fixture
+def flown(tmp_path):
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))
+    cameras = Cameras()
+    vehicles = make_swarm(2, home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0), on_exposure=cameras.expose)
+    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=6.0) as swarm:
+        links = [text for address in swarm.addresses for text in ("--link", address)]
+        with serving(tmp_path / "w", *links) as served:
+            cameras.served = served
+            yield served, cameras, tmp_path / "w"
+
+
+def fly(served, vehicle, plan, mission=None):
+    body = {"plan": plan, **({"mission": mission} if mission else {})}
+    answer = served.command(f"/api/missions/{vehicle}/upload", body)
+    assert answer.status_code == 200, answer.text
+    answer = served.command(f"/api/missions/{vehicle}/start")
+    assert answer.status_code == 200, answer.text
+
+
+def test_completion_starts_the_refinement_while_the_others_fly(flown):
+    served, cameras, workspace = flown
+    served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
+    body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "end": "hover", "speed_m_s": 8}
+    plan = served.command("/api/plans", body)
+    assert plan.status_code == 201, plan.text
+    number = plan.json()["id"]
+    assert served.get("/api/plans").json()[0]["covered_share"] > 0.99
+    assert served.get(f"/api/plans/{number}/map").json()["type"] == "FeatureCollection"
+    fly(served, "v1", number)
+    time.sleep(1.5)
+    fly(served, "v2", number)
+    jobs = served.until("/api/jobs", lambda rows: any(r["kind"] == "refine" and r["state"] == "done" for r in rows))
+    assert jobs[0]["vehicle"] == "v1"
+    assert jobs[0]["detail"]["trigger"] == "complete"
+    done = served.until("/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows))
+    assert [row["vehicle"] for row in done] == ["v1", "v2"]
+    assert done[0]["still_flying"] == ["v2"]
+    for row in done:
+        assert row["complete_s"] <= row["refine_started_s"] <= row["refine_ended_s"]
+        assert row["version"] > row["version_before"]
+    assert cameras.posted == cameras.count > 10
+    rows = served.get("/api/frames?vehicle=v1").json()
+    assert {row["stage"] for row in rows} <= {"coarse", "rejected"}
+    assert served.get("/api/legs").json()["features"]
+    served.until("/api/jobs", lambda rows: rows[-1]["kind"] == "export" and rows[-1]["state"] == "done")
+    assert (workspace / "orthoimage.tif").exists()
+    second_sortie(served, number)
+
+
+def second_sortie(served, plan):
+    before = len(served.get("/api/jobs").json())
+    fly(served, "v1", plan)
+    served.until("/api/completions", lambda rows: len(rows) == 3 and "version" in rows[-1])
+    row = served.get("/api/completions").json()[-1]
+    assert (row["vehicle"], row["sortie"]) == ("v1", 2)
+    assert {frame["sortie"] for frame in served.get("/api/frames?vehicle=v1").json()} == {1, 2}
+    assert len([job for job in served.get("/api/jobs").json()[before:] if job["kind"] == "refine"]) == 1
+
+
+def test_commands_that_cannot_be_carried_out_say_why(flown):
+    served, _, _ = flown
+    served.until("/api/vehicles", lambda rows: len(rows) == 2)
+    assert "v9" in served.command("/api/missions/v9/start").json()["detail"]
+    assert served.command("/api/missions/v1/explode").status_code == 404
+    assert "plan" in served.command("/api/missions/v1/upload", {"plan": "../../etc"}).json()["detail"]
+    assert "vehicles" in served.command("/api/plans", {"area": square(100)}).json()["detail"]
+    bad = {"area": {"type": "Point"}, "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65}
+    assert served.command("/api/plans", bad).status_code == 422
