@@ -309,16 +309,21 @@ def _second_passes(
     """All vehicles again, on a common level and lean, each with its neighbours held as the solo pass left them."""
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     lean = pooled_lean(states)
-    items = [
-        (state, neighbours_of(state, states), float(correction))
-        for state, correction in zip(states, network.correction_m, strict=True)
-    ]
     task = partial(second_pass, basemap=basemap, origin=origin, lean=lean)
-    out = []
-    for n, state in enumerate(run(task, items)):
-        out.append(state)
+    mapped = [k for k, s in enumerate(states) if s.on_map]
+    items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
+    out = list(states)
+    for done, (k, state) in enumerate(zip(mapped, run(task, items), strict=True)):
+        out[k] = state
         if progress:
-            progress("joint", n + 1, len(states))
+            progress("joint", done + 1, len(states))
+    # Without a map nobody is right: each vehicle is fitted to those before it, so that seams close without a dance.
+    before: list[VehicleState] = []
+    for k in sorted(set(range(len(states))) - set(mapped)):
+        (out[k],) = run(task, [(states[k], neighbours_of(states[k], before), float(network.correction_m[k]))])
+        before.append(out[k])
+        if progress:
+            progress("joint", len(mapped) + len(before), len(states))
     return out
 
 
@@ -395,6 +400,8 @@ def second_pass(
     sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
+    if not state.on_map:
+        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours are no better than oneself
     release(flight)
     if not flight.sparse:
         steady_weak(flight, state.sigma_m)
