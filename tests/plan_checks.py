@@ -84,19 +84,20 @@ def fly(waypoints_text: str) -> Flown:
 
 
 def seen_by(flown: Flown, width: float, height: float):
-    """Union of the pictures on the legs: one at each leg's start, then one every trigger distance."""
-    pictures = []
+    """Union of the pictures on the legs: one at each leg's start, then one every trigger distance.
+
+    Pictures that overlap along the leg make one rectangle.
+    """
+    seen = []
     for leg, distance in zip(flown.legs, flown.distances, strict=True):
+        assert distance <= height
         length = np.hypot(*(leg[1] - leg[0]))
         along = (leg[1] - leg[0]) / length
-        across = np.array([-along[1], along[0]])
-        for d in np.arange(0.0, length + 1e-6, distance):
-            centre = leg[0] + d * along
-            corners = [(1, 1), (1, -1), (-1, -1), (-1, 1)]
-            pictures.append(
-                shapely.Polygon([centre + 0.5 * (a * height * along + b * width * across) for a, b in corners])
-            )
-    return shapely.union_all(pictures)
+        across = 0.5 * width * np.array([-along[1], along[0]])
+        first = leg[0] - 0.5 * height * along
+        last = leg[0] + (np.floor(length / distance + 1e-6) * distance + 0.5 * height) * along
+        seen.append(shapely.Polygon([first + across, last + across, last - across, first - across]))
+    return shapely.union_all(seen)
 
 
 def crossed(flown: Flown, holes) -> float:

@@ -140,13 +140,21 @@ class Crew:
         Raises:
             InputError: the endurance is too short.
         """
-        options, router = self._options, self._router
         if self.starts is not None:
             far = float(np.hypot(*(self.starts - legs[0, 0]).T).max())
             if not far < _FARTHEST_M:
                 raise InputError(f"a start is {far / 1000:.0f} km from the area; check that it is given as LAT,LON")
-        row = cut(legs, router, options.motion, self.vehicles, self._least_leg_m)
-        pieces = share(row, self.vehicles, self.starts, self._returns, router, options.motion, self._limits)
+        by_time = self._shared(legs, reorder, self._options.motion)
+        if by_time.balance <= _FAIR:
+            return by_time
+        # Where turns take most of the time, even times are uneven paths: try even paths, too.
+        by_length = self._shared(legs, reorder, replace(self._options.motion, acceleration_m_s2=math.inf))
+        return by_length if by_length.score < by_time.score else by_time
+
+    def _shared(self, legs: Array, reorder: bool, motion: Motion) -> Work:
+        options, router = self._options, self._router
+        row = cut(legs, router, motion, self.vehicles, self._least_leg_m)
+        pieces = share(row, self.vehicles, self.starts, self._returns, router, motion, self._limits)
         if pieces is None:
             raise self._too_short(row, self.starts)
         homes, work, lengths, times = [], [], [], []

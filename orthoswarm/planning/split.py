@@ -239,14 +239,28 @@ def sorties(
     """
     out = router.distances(start, row.parts[:, 0]) / motion.speed_m_s
     home = router.distances(start, row.parts[:, 1]) / motion.speed_m_s * returns
-    if ((row.end_s - row.begin_s + out + home + limits.fixed_s) > limits.endurance_s).any():
-        return None
-    least = (
-        int(np.ceil((row.end_s[-1] - row.begin_s[0]) / limits.endurance_s)) if np.isfinite(limits.endurance_s) else 1
-    )
-    for count in range(max(1, least), len(row.parts) + 1):
-        ways = (np.repeat(out, count, 0), np.repeat(home, count, 0))
-        cuts = _evenly(row, *ways, motion, limits, own=False, returns=returns, single=True)
+    begin, count = 0, 0
+    while begin < len(row.parts):  # as far as one flight goes, again and again: how many it takes at least
+        ways = out[0, begin] + home[0, begin:] + limits.fixed_s
+        legs = row.leg[begin:] - row.leg[begin] + 1
+        works = row.end_s[begin:] - row.begin_s[begin]
+        reached = np.flatnonzero((works + ways <= limits.endurance_s) & (legs <= limits.most_legs))
+        if not len(reached):
+            return None
+        begin, count = begin + int(reached[-1]) + 1, count + 1
+    if count == 1:
+        return [(0, len(row.parts))]
+    for flights in range(count, min(count + 4, len(row.parts)) + 1):
+        cuts = _evenly(
+            row,
+            np.repeat(out, flights, 0),
+            np.repeat(home, flights, 0),
+            motion,
+            limits,
+            own=False,
+            returns=returns,
+            single=True,
+        )
         if cuts is not None:
             return _pairs(cuts)
     return None
