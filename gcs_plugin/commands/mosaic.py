@@ -26,6 +26,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
+    add(
+        "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
+    )
     add("--json", action="store_true", help="print the report as one JSON document on stdout")
 
 
@@ -36,7 +39,7 @@ def _refiners() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Make the map."""
-    from orthoswarm.workers import single_threaded, workers
+    from orthoswarm.workers import Workers, single_threaded, workers
 
     single_threaded()
     import json
@@ -67,7 +70,14 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out.is_file():
         raise InputError(f"{args.out} is a file; choose a folder for --out")
-    pool = workers(args.workers)
+    pool: Workers
+    if args.cluster:
+        from orthoswarm.cluster import Cluster
+
+        args.out.mkdir(parents=True, exist_ok=True)
+        pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap) if p is not None])
+    else:
+        pool = workers(args.workers)
     try:
         with ProgressBars() as progress:
             report = pipeline.run(load, args.out, options, pool, progress)
