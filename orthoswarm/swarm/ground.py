@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from orthoswarm.placement import Terrain
 from orthoswarm.swarm.adjust import Adjustment, Ground
-from orthoswarm.swarm.terrain import FitSettings, TerrainFit, fit_terrain
+from orthoswarm.swarm.surface import FitSettings
+from orthoswarm.swarm.terrain import TerrainFit, fit_terrain
 
 Array = NDArray[np.float64]
 

@@ -64,7 +64,7 @@ def _refine(gray, wide, q, rounds):  # type: ignore[no-untyped-def]
     smallest = 0.5 * (hxx + hyy - np.sqrt((hxx - hyy) ** 2 + 4 * hxy * hxy))
     if smallest < 2.0 * n or det <= 0:
         return -1.0
-    error = -1.0
+    error = np.float32(-1.0)
     for _ in range(rounds):
         u0, v0 = q[0] - HALF, q[1] - HALF
         ui, vi = int(np.floor(u0)), int(np.floor(v0))
