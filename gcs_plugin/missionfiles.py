@@ -197,13 +197,13 @@ def parse_mission(text: str, name: str = "the file") -> Mission:
         raise InputError(f"{name} is neither a .plan (JSON) nor a .waypoints file ('QGC WPL 110'); check what it holds")
     try:
         document = json.loads(head)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
     if not isinstance(document, dict) or document.get("fileType") != "Plan":
         raise InputError(f"{name} is JSON but no QGroundControl plan (fileType is not 'Plan'); export a .plan file")
     try:
         return _parse_plan(document)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputError(f"{name} is a .plan with a broken item ({error!r}); save it again in QGroundControl") from None
 
 
@@ -222,6 +222,8 @@ def _parse_waypoints(text: str, name: str) -> Mission:
             raise InputError(
                 f"{name}, item {number}: {len(columns)} columns, but each line has twelve numbers; export it again"
             ) from None
+    if not all(math.isfinite(r[2]) and math.isfinite(r[3]) for r in rows):
+        raise InputError(f"{name} has a command or a frame that is not finite; export it again")
     items = [MissionItem(int(r[3]), int(r[2]), (r[4], r[5], r[6], r[7]), r[8], r[9], r[10], r[11] != 0) for r in rows]
     home = (items[0].lat_deg, items[0].lon_deg, items[0].alt_m) if items else None
     for item in items:

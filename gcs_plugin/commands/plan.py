@@ -205,7 +205,7 @@ def _read(path: Path) -> tuple[str, str]:
 def _is_mission(text: str, path: Path) -> bool:
     try:
         document = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no valid JSON ({error}); export it again") from None
     return isinstance(document, dict) and document.get("fileType") == "Plan"
 

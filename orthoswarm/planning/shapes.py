@@ -78,7 +78,7 @@ def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
     """
     try:
         document = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
     if not isinstance(document, dict) or "type" not in document:
         raise InputError(f"{name} is JSON but no GeoJSON (it has no 'type'); export a polygon as GeoJSON")
@@ -96,7 +96,7 @@ def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
             elif kind in ("LineString", "MultiLineString"):
                 for part in [coordinates] if kind == "LineString" else coordinates:
                     lines.append(ring(_lat_lon(part), name, 2))
-    except (TypeError, ValueError, KeyError, IndexError, AttributeError):
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError, OverflowError):
         raise InputError(f"{name} is GeoJSON with a broken geometry; export it again") from None
     return Shapes(tuple(polygons), tuple(lines))
 
