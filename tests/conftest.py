@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from orthoswarm.workers import single_threaded
+
+single_threaded()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
