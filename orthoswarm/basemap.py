@@ -115,7 +115,7 @@ class Basemap:
     def rgb(self, bounds: Bounds, gsd_m: float) -> tuple[Bytes, Mask]:
         """Colours uint8 (rows, columns, 3) and validity of a window; the grid is that of `gray`."""
         data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=False)
-        out = np.ascontiguousarray(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0))
+        out = np.array(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0), order="C")  # never a view
         out[~valid] = 0
         return out, valid
 
