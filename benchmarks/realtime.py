@@ -59,8 +59,8 @@ def main():
         batch = [at_once(folder / f"all{k}", grid, frames) for k in range(options.runs)]
     total, reading = (statistics.median(d[k] for d in drawn) for k in (0, 1))
     best = n / min(d[0] for d in drawn)
-    print(f"frame after frame: {n / total:.0f} frames/s a core (best run {best:.0f}); decoding {1e3 * reading / n:.2f} ms, "
-          f"drawing {1e3 * (total - reading) / n:.2f} ms, {drawn[0][2] / n:.0f} pixels won a frame")  # fmt: skip
+    print(f"frame after frame: {n / total:.0f} frames/s a core (best run {best:.0f}); "
+          f"decoding {1e3 * reading / n:.2f} ms, drawing {1e3 * (total - reading) / n:.2f} ms, {drawn[0][2] / n:.0f} pixels won a frame")  # fmt: skip
     print(f"all at once:       {n / statistics.median(batch):.0f} frames/s a core (best run {n / min(batch):.0f}); "
           f"{1e3 * statistics.median(batch) / n:.2f} ms a frame")  # fmt: skip
 

@@ -24,6 +24,7 @@ from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.geo import GroundGrid
 from orthoswarm.mosaic.overview import FACTORS, Overview, reduce_rgba
 from orthoswarm.mosaic.tiles import Key, Tile, TileStore
+from orthoswarm.mosaic.versions import VersionIndex
 
 Bytes = NDArray[np.uint8]
 Plane = Literal["orthogonality", "frame"]
@@ -79,8 +80,8 @@ class Canvas:
             on_evict=self._evicted if writable else None,
         )
         self._overview = Overview(path, self.tile_rows, self.tile_cols, self.tile_px, writable=writable)
-        self._index = _Index(path / "versions.u64", (self.tile_rows, self.tile_cols), writable=writable)
-        self._reduced = _Index(path / "reduced.u64", (self.tile_rows, self.tile_cols), writable=writable)
+        self._index = VersionIndex(path / "versions.u64", (self.tile_rows, self.tile_cols), writable=writable)
+        self._reduced = VersionIndex(path / "reduced.u64", (self.tile_rows, self.tile_cols), writable=writable)
         if writable and self._index.newest == 0:  # a lost index: what is there counts as changed once
             for key in self._store.existing():
                 self._index.put(key, 1, visible=True)
@@ -424,49 +425,3 @@ class Canvas:
         version = int(self._index.values[key])  # read first: what is drawn meanwhile counts as not yet reduced
         self._overview.put(*key, None if tile is None else tile.rgba)
         self._reduced.put(key, version, visible=True)
-
-
-class _Index:
-    """A version per tile: uint64 (tile rows, tile columns) in memory and in a file (little endian, sparse)."""
-
-    def __init__(self, path: Path, shape: tuple[int, int], *, writable: bool) -> None:
-        self._size = shape[0] * shape[1] * 8
-        self._cols = shape[1]
-        self._file = os.open(path, (os.O_RDWR | os.O_CREAT if writable else os.O_RDONLY) | getattr(os, "O_BINARY", 0))
-        if writable and os.fstat(self._file).st_size != self._size:
-            os.truncate(self._file, self._size)
-        self.values = np.zeros(shape, np.uint64)
-        self.reload()
-
-    @property
-    def newest(self) -> int:
-        return int(self.values.max()) if self.values.size else 0
-
-    def reload(self) -> None:
-        os.lseek(self._file, 0, os.SEEK_SET)
-        data = os.read(self._file, self._size)
-        self.values.ravel()[: len(data) // 8] = np.frombuffer(data[: len(data) // 8 * 8], "<u8")
-
-    def put(self, key: Key, version: int, *, visible: bool) -> None:
-        """Record a version on disk; in memory, too, if visible."""
-        data = version.to_bytes(8, "little")
-        offset = (key[0] * self._cols + key[1]) * 8
-        try:
-            if hasattr(os, "pwrite"):
-                os.pwrite(self._file, data, offset)
-            else:  # Windows
-                os.lseek(self._file, offset, os.SEEK_SET)
-                os.write(self._file, data)
-        except OSError as error:
-            raise OrthoSwarmError(f"the canvas cannot be written ({error.strerror}); free some disk space") from None
-        if visible:
-            self.publish(key, version)
-
-    def publish(self, key: Key, version: int) -> None:
-        self.values[key] = version
-
-    def flush(self) -> None:
-        os.fsync(self._file)
-
-    def close(self) -> None:
-        os.close(self._file)
