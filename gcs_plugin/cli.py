@@ -20,6 +20,8 @@ VERBS = {
     "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
     "twin": "make a set of photos, map and truth of a digital twin city",
     "evaluate": "measure an orthoimage against a reference, and poses against truth",
+    "bench": "measure accuracy and cost on sets with truth, and how cost grows with vehicles and pictures",
+    "weights": "list, import and check the weights of learned matchers",
     "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
 }
 
