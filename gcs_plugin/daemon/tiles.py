@@ -108,8 +108,12 @@ def basemap_tile(basemap: Basemap, tile: TileAddress) -> Bytes | None:
     box, whole = _box(patch), basemap.bounds
     if box is None or box[0] > whole[2] or box[2] < whole[0] or box[1] > whole[3] or box[3] < whole[1]:
         return None
-    box = (max(box[0], whole[0]), max(box[1], whole[1]), min(box[2], whole[2]), min(box[3], whole[3]))
     pixel = max(gsd, basemap.native_gsd_m * 0.999)
+    margin = 2.0 * pixel  # neighbouring tiles meet without a seam
+    box = (
+        max(box[0] - margin, whole[0]), max(box[1] - margin, whole[1]), min(box[2] + margin, whole[2]),
+        min(box[3] + margin, whole[3]),
+    )  # fmt: skip
     rgb, valid = basemap.rgb(box, pixel)
     grid = GroundGrid.around(basemap.epsg, box, pixel)
     return resampled(np.dstack([rgb, valid.astype(np.uint8) * np.uint8(255)]), grid, patch)
