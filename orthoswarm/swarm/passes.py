@@ -146,9 +146,6 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
     )
     state.on_map, state.confidence = True, fit.confidence
     watch.lap("ties and absolute")
-    adj = flight.adjustment
-    state.sigma_m, state.fov_sigma_deg = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), state.ties, 6.0, 0.05)
-    watch.lap("sigma")
 
 
 def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:

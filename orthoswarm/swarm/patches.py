@@ -39,11 +39,14 @@ def gradient_field(gray: Floats) -> Floats:
     """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
     gx = cv2.Scharr(gray, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(gray, cv2.CV_32F, 0, 1)
-    size = np.sqrt(gx * gx + gy * gy)
-    valid = np.isfinite(size)
-    middle = float(np.median(size[valid])) if valid.any() else 1.0
-    scale = np.where(valid, 1.0 / (size + max(middle, 1e-3)), 0.0).astype(np.float32)
-    field = np.stack([gx, gy], axis=-1) * scale[..., None]
+    size = cv2.magnitude(gx, gy)
+    sample = size[::2, ::2]
+    sample = sample[np.isfinite(sample)]
+    middle = float(np.median(sample)) if len(sample) else 1.0
+    size += max(middle, 1e-3)
+    field = np.empty((*gray.shape, 2), np.float32)
+    np.divide(gx, size, out=field[..., 0])
+    np.divide(gy, size, out=field[..., 1])
     return np.nan_to_num(field, copy=False, nan=0.0)
 
 

@@ -68,7 +68,7 @@ class Pictures:
         self._cache.clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cache": OrderedDict()}
+        return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
 
     def _load(self, i: int) -> Gray:
         try:

@@ -173,7 +173,7 @@ def settle(
     surface = replace(surface, lean=voted or (0.0, 0.0))
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    surface, ties, matches = _second_round(flight, ground, surface, 6)
+    surface, ties, matches = _second_round(flight, ground, surface, 3)
     return Settled(surface, ties, matches, roofs, ground_shift, links)
 
 

@@ -9,7 +9,7 @@ from orthoswarm.swarm.rig import WIDTH, F
 
 Array = NDArray[np.float64]
 
-EVERY = 12
+EVERY = 24
 RADIAL = 1.25
 """A frame's ground error has two axes: this times the sigma of one holds about two thirds of the errors."""
 
