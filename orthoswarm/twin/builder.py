@@ -112,6 +112,16 @@ class Builder:
         r, c = min(max(int(y / CELL_M), 0), rows - 1), min(max(int(x / CELL_M), 0), cols - 1)
         return float(self.scene.dtm[r, c])
 
+    def is_free(self, u: float, v: float, reach: float) -> bool:
+        """Whether nothing stands within about `reach` metres of a city position."""
+        x, y, _ = self.local(u, v)
+        rows, cols = self.scene.dsm.shape
+        low = (max(0, int((y - reach) / CELL_M)), max(0, int((x - reach) / CELL_M)))
+        part = np.s_[low[0] : max(0, int((y + reach) / CELL_M)), low[1] : max(0, int((x + reach) / CELL_M))]
+        if low[0] >= rows or low[1] >= cols:
+            return True
+        return not bool((self.scene.dsm[part] > self.scene.dtm[part] + 0.5).any())
+
     def slot(self, u: float, v: float, turn: float) -> None:
         """Remember a place for a car."""
         x, y, angle = self.local(u, v)

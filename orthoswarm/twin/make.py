@@ -32,7 +32,7 @@ from orthoswarm.twin.tags import PhotoTags, with_tags
 Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0
 """Absolute altitude of the takeoff point, so that nobody takes absolute altitudes for heights."""
-GENERATOR = 2
+GENERATOR = 3
 """Raised when the same parameters give other data, so that a set is never continued by another generator."""
 
 

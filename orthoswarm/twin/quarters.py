@@ -82,7 +82,7 @@ def _lot(b: Builder, area: Area, front: float) -> None:
         b.building(
             rng.uniform(u0 + 3, u1 - 3), back + front * 3.5, 2.2, 1.8, 2.4, 0.5, GABLE, pick(rng, ROOFS), windows=False
         )
-    if rng.random() < 0.12:
+    if rng.random() < 0.12 and b.is_free(u, back + front * 9.0, 3.5):  # a pool
         b.polygon(rect(u - 3, back + front * 9 - 2, u + 3, back + front * 9 + 2), (92, 168, 190), kinds.CONCRETE)
     for _ in range(int(rng.integers(0, 4))):
         r = float(rng.uniform(1.2, 3.6))
