@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -225,15 +226,13 @@ class _Batch:
         return refinement
 
     def call_refiner(self, frames: Sequence[Frame], state: _State) -> _Refinement:
-        from orthoswarm.paper import refine_all as refine_paper
-        from orthoswarm.swarm.refine import refine_all as refine_swarm
-
+        # Only the one that is asked for: the other's imports would cost memory in every run.
+        refine: Any = import_module(f"orthoswarm.{self.options.refine}.refine").refine_all
         vehicles: dict[str, list[Frame]] = {}
         for frame in frames:
             vehicles.setdefault(frame.vehicle, []).append(frame)
         basemap = state.basemap if self.options.until == "fine" else None
         run = self.space.remembering("vehicle", self.workers.map)
-        refine: Any = refine_paper if self.options.refine == "paper" else refine_swarm
         refined = refine(vehicles, basemap, state.grid, run=run, progress=self.progress)
         strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
         return _Refinement(strip[0], strip[1], refined.terrain)
