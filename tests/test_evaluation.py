@@ -216,7 +216,9 @@ def test_poses_are_compared_with_a_table_of_true_cameras(tmp_path, capsys):
     picture = write(tmp_path / "a.tif", np.clip(shifted(texture(), 0, 0), 0, 255))
     poses = ["--poses", str(tmp_path / "frames.jsonl"), "--truth", str(tmp_path / "truth.csv")]
     assert main(["evaluate", str(picture), "--reference", str(picture), "--json", *poses]) == 0
-    figures = json.loads(capsys.readouterr().out)["poses"]
+    everything = json.loads(capsys.readouterr().out)
+    figures = everything["poses"]
+    assert 0.05 < everything["seen_share"] < 0.9  # the cameras see far beyond the small raster
     assert figures["frames_compared"] == 5
     assert figures["camera_horizontal_median_m"] == pytest.approx(0.5, abs=1e-3)
     assert figures["center_ground_median_m"] == pytest.approx(0.5, abs=1e-3)

@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     figures["mask"] = None if mask is None else mask.name
     if args.poses is not None:
         figures["poses"] = evaluate_poses(args.poses, args.truth).figures()
+        figures["seen_share"] = seen_share(args.ortho, [camera for _, _, camera in read_truth(args.truth).values()])
     if args.field is not None:
         _write_field(args.field, result)
     if args.json:
@@ -314,6 +315,29 @@ def evaluate_poses(poses: Path, truth: Path) -> "PoseErrors":
     report = poses.with_name("report.json")
     plane = float(json.loads(report.read_text()).get("ground_z_m") or 0.0) if report.exists() else 0.0
     return pose_errors(placed, cameras, plane, _ground_level(truth.with_name("dtm.tif"), cameras))
+
+
+def seen_share(ortho: Path, cameras: "list[Camera]") -> float:
+    """Share of the ground that any true camera sees (on level ground) that an orthoimage covers."""
+    import cv2
+    import numpy as np
+    import rasterio
+
+    with rasterio.open(ortho) as file:
+        thin = max(1, round(1.2 / file.transform.a))
+        shape = (file.height // thin, file.width // thin)
+        covered = file.read_masks(1, out_shape=shape) > 0
+        place = file.transform * file.transform.scale(file.width / shape[1], file.height / shape[0])
+    # ground beyond the raster counts as not covered: look at a canvas with a rim of 400 m
+    rim = round(400.0 / place.a)
+    seen = np.zeros((shape[0] + 2 * rim, shape[1] + 2 * rim), np.uint8)
+    for camera in cameras:
+        corners = camera.corners()
+        pixels = np.stack([(corners[:, 0] - place.c) / place.a, (corners[:, 1] - place.f) / place.e], -1) + rim
+        if np.isfinite(pixels).all():
+            cv2.fillConvexPoly(seen, np.round(pixels).astype(np.int32), 1)
+    inner = seen[rim : rim + shape[0], rim : rim + shape[1]] > 0
+    return float((inner & covered).sum()) / max(1.0, float(seen.sum()))
 
 
 def _match(image: str, names: dict[str, Any]) -> str | None:
