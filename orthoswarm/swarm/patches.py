@@ -39,7 +39,7 @@ def gradient_field(gray: Floats) -> Floats:
     """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
     gx = cv2.Scharr(gray, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(gray, cv2.CV_32F, 0, 1)
-    size = cv2.magnitude(gx, gy)
+    size = np.sqrt(gx * gx + gy * gy)  # not cv2.magnitude: its last bit depends on where the array lies in memory
     sample = size[::2, ::2]
     sample = sample[np.isfinite(sample)]
     middle = float(np.median(sample)) if len(sample) else 1.0
