@@ -134,18 +134,35 @@ def strip_mosaic(
     return out, np.isfinite(best), float(west), float(north)
 
 
-def register(
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """A mosaic of consecutive pictures and the part of the map where it may lie.
+
+    Attributes:
+        gray, valid: the mosaic, float32 and bool (rows, columns).
+        ground, known: the map, `reach` pixels wider on every side. reach: in pixels. gsd_m: of both.
+    """
+
+    gray: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    ground: NDArray[np.float32]
+    known: NDArray[np.bool_]
+    reach: int
+    gsd_m: float
+
+
+def strip_and_map(
     rig: Rig,
     index: NDArray[np.integer],
-    small: Callable[[int], Gray],
+    picture: Callable[[int], Gray],
     basemap: MapWindow,
     origin: Array,
     ground_z: float,
-    reach_m: float = 60.0,
-    gsd_m: float = 2.0,
-) -> Match | None:
-    """Find the mosaic of some consecutive pictures on the map; None where either has nothing to show."""
-    mosaic = strip_mosaic(rig, index, small, ground_z, gsd_m)
+    reach_m: float,
+    gsd_m: float,
+) -> Strip | None:
+    """Mosaic some consecutive pictures and read the map around them; None where either has nothing to show."""
+    mosaic = strip_mosaic(rig, index, picture, ground_z, gsd_m)
     if mosaic is None:
         return None
     gray, valid, west, north = mosaic
@@ -161,9 +178,48 @@ def register(
     ground, known = ground[: rows + 2 * reach, : cols + 2 * reach], known[: rows + 2 * reach, : cols + 2 * reach]
     if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < 0.1:
         return None
-    moving = orientation_field(cv2.GaussianBlur(gray, (0, 0), 0.7), valid)
-    fixed = orientation_field(cv2.GaussianBlur(ground, (0, 0), 0.7), known)
+    return Strip(gray, valid, ground, known, reach, gsd_m)
+
+
+def register(
+    rig: Rig,
+    index: NDArray[np.integer],
+    small: Callable[[int], Gray],
+    basemap: MapWindow,
+    origin: Array,
+    ground_z: float,
+    reach_m: float = 60.0,
+    gsd_m: float = 2.0,
+) -> Match | None:
+    """Find the mosaic of some consecutive pictures on the map by its edges; None where there is nothing to find."""
+    strip = strip_and_map(rig, index, small, basemap, origin, ground_z, reach_m, gsd_m)
+    if strip is None:
+        return None
+    moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), 0.7), strip.valid)
+    fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), 0.7), strip.known)
     if np.count_nonzero(moving) < 400:
         return None
-    dc, dr, peak, ratio = correlate(moving, fixed, reach)
+    dc, dr, peak, ratio = correlate(moving, fixed, strip.reach)
     return Match(int(index[0]), int(index[-1]), (dc * gsd_m, -dr * gsd_m), peak, ratio)
+
+
+def register_learned(
+    rig: Rig,
+    index: NDArray[np.integer],
+    picture: Callable[[int], Gray],
+    basemap: MapWindow,
+    origin: Array,
+    ground_z: float,
+    reach_m: float,
+    gsd_m: float,
+) -> Match | None:
+    """The same by learned matching, some seconds a strip: the second opinion where edges find no agreement."""
+    from orthoswarm.matchers.opinion import second_opinion
+
+    strip = strip_and_map(rig, index, picture, basemap, origin, ground_z, reach_m, gsd_m)
+    if strip is None:
+        return None
+    shift = second_opinion(strip.gray, strip.valid, strip.ground, strip.known, strip.reach)
+    if shift is None:
+        return None
+    return Match(int(index[0]), int(index[-1]), (float(shift[0]) * gsd_m, -float(shift[1]) * gsd_m), 1.0, 0.0)

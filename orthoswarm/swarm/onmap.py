@@ -7,13 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.placement import MapWindow
-from orthoswarm.swarm.coarse import Match, register
+from orthoswarm.swarm.coarse import Match, register, register_learned
 from orthoswarm.swarm.flight import Flight
 
 Array = NDArray[np.float64]
 
 WINDOW = 25
 SPARSE_WINDOW = 3
+SECOND_LOOK_PICTURES = 16
+SECOND_LOOKS = 5
 ACROSS_PX = 150
 """A picture's width in pixels of the small mosaics."""
 CONSENSUS_M = 6.0
@@ -54,6 +56,26 @@ def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float
     if len(matches) == 1 and matches[0].ratio > 0.7:
         return None
     return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.mean()))
+
+
+def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 30.0) -> CoarseFit | None:
+    """Learned matching of a few strips where edges found no consensus; None if it finds none either."""
+    rig = flight.rig()
+    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    gsd = float(np.clip(width / (2 * ACROSS_PX), 0.2, 0.6))
+    windows = _windows(flight.leg, SECOND_LOOK_PICTURES)
+    chosen = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SECOND_LOOKS).round().astype(int))]
+    matches = [
+        m
+        for index in chosen
+        if (m := register_learned(rig, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd)) is not None
+    ]
+    if len(matches) < 2:
+        return None
+    inlier = _consensus(matches)
+    if inlier.sum() < max(2, len(matches) // 2 + 1):
+        return None
+    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.sum()) / len(chosen))
 
 
 def shift_cameras(flight: Flight, correction: Array) -> None:

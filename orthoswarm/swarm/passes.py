@@ -18,7 +18,7 @@ from orthoswarm.swarm.flight import Flight, free_strong_lens, open_flight, weigh
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
-from orthoswarm.swarm.onmap import coarse_fit, shift_cameras
+from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
@@ -132,6 +132,8 @@ def _relative(flight: Flight) -> GroundModel:
 def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
     flight = state.flight
     fit = coarse_fit(flight, basemap, origin) or coarse_fit(flight, basemap, origin, 150.0)
+    if fit is None:
+        fit = second_look(flight, basemap, origin)
     watch.lap("coarse registration")
     if fit is None:
         flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
