@@ -6,6 +6,8 @@ On a CPU one match at 560 pixels takes about a minute; on a GPU half a second.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -27,13 +29,26 @@ def load(state: dict[str, Any], backbone: dict[str, Any], coarse_px: int = 560, 
         from romatch import roma_outdoor
     except ImportError as error:
         raise UnavailableError(f"the package romatch is missing ({error.name}); pip install orthoswarm[roma]") from None
+    except RuntimeError as error:  # a torchvision built for another torch
+        raise UnavailableError(
+            f"torchvision does not fit torch ({error}); install the pair that belongs together"
+        ) from None
+    import torch
+
+    on_gpu = device().type == "cuda"
+    options = {
+        "coarse_res": coarse_px,
+        "upsample_res": upsample_px,
+        "amp_dtype": torch.float16 if on_gpu else torch.float32,
+        "use_custom_corr": on_gpu and find_spec("local_corr") is not None,  # a CUDA extension of its own
+    }
+    known = signature(roma_outdoor).parameters  # older releases have fewer
     try:
         return roma_outdoor(
             device=device(),
             weights=state,
             dinov2_weights=backbone,
-            coarse_res=coarse_px,
-            upsample_res=upsample_px,
+            **{k: v for k, v in options.items() if k in known},
         )
     except (RuntimeError, KeyError) as error:
         first = str(error).splitlines()[0]

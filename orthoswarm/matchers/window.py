@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.matchers import weights
-from orthoswarm.matchers.base import Array, Floats, Mask, Matches
-from orthoswarm.matchers.learned import extractor, padded_tensor
+from orthoswarm.matchers.base import Array, Floats, Gray, Mask, Matches
+from orthoswarm.matchers.learned import device, extractor, padded_tensor
 
 CELL_PX = 8
 _STRIDE = 32
 _NEIGHBOURS = 5
 _LEAST_CONTRAST = 4.0
+_PART, _MARGIN = 96, 12
+"""Cells that the network describes at once, and those around them that it sees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +107,30 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     import torch
 
     filled = np.where(valid, gray, float(gray[valid].mean()) if valid.any() else 127.0)
-    image = padded_tensor(np.clip(filled, 0, 255).astype(np.uint8), _STRIDE)
-    with torch.inference_mode():
-        dense = torch.nn.functional.normalize(extractor("xfeat").net(image)[0], dim=1)[0]
+    image = np.clip(filled, 0, 255).astype(np.uint8)
     rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
+    dense = torch.zeros((64, rows, cols), device=device())
+    with torch.inference_mode():
+        for r in range(0, rows, _PART):
+            for c in range(0, cols, _PART):
+                part = _part(image, r, c)
+                dense[:, r : r + _PART, c : c + _PART] = part[:, : rows - r, : cols - c]
     share = cv2.resize(
         valid[: rows * CELL_PX, : cols * CELL_PX].astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA
     )
     return dense[:, :rows, :cols], share > 0.8
+
+
+def _part(image: Gray, row: int, column: int) -> Any:
+    """Unit descriptors (64, <= _PART, <= _PART) of some cells: the network's memory grows with what it sees at once."""
+    import torch
+
+    r0, c0 = max(0, row - _MARGIN), max(0, column - _MARGIN)
+    r1, c1 = row + _PART + _MARGIN, column + _PART + _MARGIN
+    cut = image[r0 * CELL_PX : r1 * CELL_PX, c0 * CELL_PX : c1 * CELL_PX]
+    found = extractor("xfeat").net(padded_tensor(cut, _STRIDE))[0]
+    found = found[0, :, row - r0 : row - r0 + _PART, column - c0 : column - c0 + _PART]
+    return torch.nn.functional.normalize(found, dim=0)
 
 
 def _vertices(left: Floats, middle: Floats, right: Floats) -> Array:
