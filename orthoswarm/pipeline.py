@@ -96,6 +96,7 @@ class _State:
     still: set[str] = field(default_factory=set)
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
+    equation_5: dict[str, float] | None = None
 
 
 def run(load: Load, out: Path, options: Options, workers: Workers, progress: Progress) -> dict[str, Any]:
@@ -234,6 +235,8 @@ class _Batch:
         basemap = state.basemap if self.options.until == "fine" else None
         run = self.space.remembering("vehicle", self.workers.map)
         refined = refine(vehicles, basemap, state.grid, run=run, progress=self.progress)
+        if self.options.refine == "paper":
+            state.equation_5 = refined.equation_5()
         strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
         return _Refinement(strip[0], strip[1], refined.terrain)
 
@@ -389,6 +392,7 @@ class _Batch:
             "basemap": str(self.options.basemap) if self.options.basemap else None,
             "until": self.options.until,
             "root": image_root(state.ingest.frames),
+            **({"equation_5": state.equation_5} if state.equation_5 else {}),
         }
 
 
