@@ -16,6 +16,7 @@ VERBS = {
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
     "sim": "run simulated vehicles that speak MAVLink",
+    "demo": "a simulated swarm, end to end, no files and no autopilot needed",
     "serve": "run the daemon: the map grows in the browser while vehicles fly, and is refined as they complete",
     "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
     "twin": "make a set of photos, map and truth of a digital twin city",

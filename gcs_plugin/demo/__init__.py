@@ -1,0 +1,1 @@
+"""The demonstration: a swarm, its cameras and a city, all simulated, around the real daemon."""

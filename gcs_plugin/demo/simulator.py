@@ -1,0 +1,75 @@
+"""The simulated part of the demonstration, in a process of its own: vehicles on TCP links, cameras on TCP streams."""
+
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+from gcs_plugin.demo.stage import Setting
+
+_MOST_WAITING: Final = 4
+_SLOW: Final = 0.15
+_BEHIND_S: Final = 0.05
+
+
+class PacedClock:
+    """A clock that runs slower while the cameras are behind, so that a slow machine flies slower and loses nothing."""
+
+    def __init__(self) -> None:
+        self._real, self._now, self.slow = time.monotonic(), 0.0, False
+        self._lock = threading.Lock()
+
+    def __call__(self) -> float:
+        """Seconds."""
+        with self._lock:
+            real = time.monotonic()
+            self._now += (real - self._real) * (_SLOW if self.slow else 1.0)
+            self._real = real
+            return self._now
+
+
+def simulate(setting: Setting, pipe: Connection) -> None:
+    """Run until the other end says stop or is gone.
+
+    Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.
+    """
+    from orthoswarm.workers import single_threaded
+
+    single_threaded()
+    from gcs_plugin.demo.camera import Studio, TwinCamera, VideoServer
+    from gcs_plugin.demo.stage import build_stage
+    from gcs_plugin.sim.motion import Airframe
+    from gcs_plugin.sim.swarm import SimSwarm, make_swarm
+
+    stage, site = build_stage(setting)
+    systems = range(1, setting.vehicles + 1)
+    studio = Studio(
+        {s: TwinCamera(stage, site, setting, s) for s in systems},
+        {s: VideoServer() for s in systems},
+    )
+    airframe = Airframe(climb_m_s=8.0, sink_m_s=6.0, gps_sigma_m=0.8)
+    vehicles = make_swarm(
+        setting.vehicles, home=setting.home(), airframe=airframe, seed=setting.seed, on_exposure=studio.expose
+    )
+    clock = PacedClock()
+    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=setting.speed, clock=clock) as swarm:
+        streams = [studio.servers[s].url for s in systems]
+        pipe.send({"links": swarm.addresses, "streams": streams})
+        while not _told_to_stop(pipe):
+            clock.slow = studio.backlog > _MOST_WAITING
+    studio.close()
+    _tell(pipe, {"taken": studio.taken, "problem": studio.problem})
+
+
+def _told_to_stop(pipe: Connection) -> bool:
+    try:
+        return pipe.poll(_BEHIND_S) and pipe.recv() == "stop"
+    except (EOFError, OSError):
+        return True
+
+
+def _tell(pipe: Connection, what: dict[str, Any]) -> None:
+    try:
+        pipe.send(what)
+    except OSError:  # nobody listens any more
+        return
