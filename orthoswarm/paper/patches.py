@@ -19,6 +19,7 @@ from orthoswarm.swarm.rig import WIDTH, F, Rig
 
 TRUSTED_SHARE = 0.35
 _GSD_RANGE = (0.3, 1.0)
+_FARTHEST_PX = 240
 _LARGEST_PX = 3_000_000
 _HEIGHT_TOLERANCE_M = 3.0
 _LEVER = 0.15
@@ -99,7 +100,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
         patch, valid, west, north = strip
         own = GroundGrid(basemap.epsg, west, north, gsd, patch.shape[1], patch.shape[0])
         for reach_m in options.reach_m:
-            reach = int(np.ceil(reach_m / gsd))
+            reach = min(int(np.ceil(reach_m / gsd)), _FARTHEST_PX)
             window, known, there = map_window(basemap, origin, own, reach)
             if not known.any():
                 break
