@@ -16,6 +16,7 @@ from telemetry.sample import Sample
 
 _POLL_S: Final = 0.5
 _QUIET_S: Final = 1.0
+_SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
 _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://", "http://", "https://")
 _HIDDEN_SUFFIXES: Final = (".part", ".tmp", ".crdownload")
 _log = logging.getLogger(__name__)
@@ -87,7 +88,7 @@ class Source:
             self.state = text.split(":")[0]
             self._tell(f"the pictures of {self.vehicle}: {self.state}")
 
-        for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=5.0):
+        for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
             if picture.damaged:
                 continue
             name = f"live-{picture.time_s:.3f}.jpg"

@@ -165,7 +165,15 @@ class VideoServer:
 
 
 def _sent(connection: socket.socket, data: bytes) -> bool:
+    """Send, unless the reader has hung up: what is sent to nobody would be lost without an error."""
     try:
+        connection.settimeout(0.0)
+        try:
+            if connection.recv(1) == b"":
+                return False
+        except BlockingIOError:
+            pass
+        connection.settimeout(30.0)
         connection.sendall(data)
     except OSError:
         return False
