@@ -47,8 +47,9 @@ def draw(plan: Plan, area: Area | None) -> bytes:
         for sortie, path in zip(vehicle.sorties, paths[vehicle.number], strict=True):
             _flight(axes, sortie, path - corner, colour, thick)
         if len(plan.vehicles) <= _LABELS:
-            at = paths[vehicle.number][0][0] - corner
-            axes.annotate(vehicle.id, at, xytext=(4, 4), textcoords="offset points", fontsize=8, weight="bold")
+            at = _middle(vehicle.sorties[0], paths[vehicle.number][0]) - corner
+            box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": colour, "linewidth": 0.8}
+            axes.annotate(vehicle.id, at, fontsize=8, weight="bold", ha="center", va="center", bbox=box)
     for gap in plan.gaps:
         axes.plot(*(grid.to_grid(gap.lat_deg, gap.lon_deg) - corner), "x", color="red", markersize=5)
     axes.set_xlabel("metres east")
@@ -73,6 +74,13 @@ def _path(sortie: Sortie, grid: LocalGrid) -> Any:
     lat = [sortie.home_lat_deg, *(w.lat_deg for w in sortie.waypoints)]
     lon = [sortie.home_lon_deg, *(w.lon_deg for w in sortie.waypoints)]
     return grid.to_grid(lat, lon)
+
+
+def _middle(sortie: Sortie, path: Any) -> Any:
+    """The middle of the longest leg."""
+    ends = [k for k, point in enumerate(sortie.waypoints, start=1) if point.camera is False]
+    longest = max(ends, key=lambda k: float(np.hypot(*(path[k] - path[k - 1]))))
+    return 0.5 * (path[longest] + path[longest - 1])
 
 
 def _flight(axes: Any, sortie: Sortie, path: Any, colour: Any, thick: float) -> None:

@@ -59,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     safety = parser.add_argument_group("safety")
     safety.add_argument("--no-fly", type=Path, action="append", default=[], metavar="FILE", help="further no-fly zones")
     safety.add_argument(
-        "--clearance", type=float, default=2.0, metavar="M", help="distance to no-fly zones (default 2)"
+        "--clearance", type=float, default=1.0, metavar="M", help="distance to no-fly zones (default 1)"
     )
     safety.add_argument("--separation", type=float, default=10.0, metavar="M", help="between vehicles (default 10)")
     safety.add_argument("--height-step", type=float, default=5.0, metavar="M", help="between heights (default 5)")
@@ -87,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(figures))
     else:
         _print(plan, args.out)
+        if not args.start:
+            print("no --start was given: each vehicle is meant to take off where its first line begins")
     return 0
 
 

@@ -17,6 +17,7 @@ COMPLETE = 0.999
 _TARGET = 0.9996
 _ROUNDS = 5
 _CRUMB_M2 = 0.5
+_PLACES = 8
 
 
 def bands(legs: Array, width_m: float, reach_m: float) -> Geometry:
@@ -77,6 +78,7 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
         angle_rad: the sweep's direction, one of those tried for further legs.
     """
     hopeless: list[Geometry] = []
+    ways = router.each(legs[:-1, 1], legs[1:, 0])
     for _ in range(_ROUNDS):
         left = missed(field.ground, legs, foot.width_m, reach_m)
         if left.area <= (1.0 - _TARGET) * field.ground.area:
@@ -90,7 +92,9 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
                 hopeless.append(gap)
                 continue
             excess -= gained
-            legs, added = insert(legs, more, router), True
+            added = True
+            for leg in more:
+                legs, ways = insert(legs, ways, leg, router)
         if not added:
             break
     return legs
@@ -98,6 +102,8 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
 
 def _legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float, angle: float) -> tuple[Array, float]:
     """The legs that see most of a gap for their length, and what they see in square metres."""
+    around = gap.buffer(2.0 * foot.width_m)
+    obstacles = shapely.MultiPolygon([p for p in shapely.get_parts(obstacles) if p.intersects(around)])
     near = obstacles.intersection(gap.buffer(foot.width_m))
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(gap))
     edges = [np.diff(shapely.get_coordinates(r), axis=0) for p in pieces(near) for r in shapely.get_rings(p)]
@@ -132,21 +138,34 @@ def _legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: floa
     return best[1], best[2]
 
 
-def insert(legs: Array, more: Array, router: Router) -> Array:
-    """Put each further leg, in its better direction, where the row grows least."""
-    for leg in more:
-        if not len(legs):
-            legs = leg[None]
-            continue
-        to_start, to_end = router.distances(legs[:, 1], leg).T
-        from_start, from_end = router.distances(leg, legs[:, 0])
-        now = router.each(legs[:-1, 1], legs[1:, 0])
-        n = len(legs)
-        growth = np.full((2, n + 1), np.inf)
-        growth[0, 0], growth[1, 0] = from_end[0], from_start[0]
-        growth[0, n], growth[1, n] = to_start[-1], to_end[-1]
-        growth[0, 1:n] = to_start[:-1] + from_end[1:] - now
-        growth[1, 1:n] = to_end[:-1] + from_start[1:] - now
-        turned, place = np.unravel_index(np.argmin(growth), growth.shape)
-        legs = np.insert(legs, int(place), leg[::-1] if turned else leg, axis=0)
-    return legs
+def insert(legs: Array, ways: Array, leg: Array, router: Router) -> tuple[Array, Array]:
+    """Put a further leg, in its better direction, where the row grows least.
+
+    Args:
+        legs: float64 (n, 2, 2) in flying order, at least one.
+        ways: float64 (n - 1,), lengths of the ways between them.
+        leg: float64 (2, 2).
+        router: measures ways around obstacles.
+
+    Returns:
+        Legs and ways with the new one.
+    """
+    n = len(legs)
+    # Straight distances never exceed the ways around: they tell the few places that are worth measuring.
+    to = np.hypot(*(legs[:, 1, None] - leg[None]).transpose(2, 0, 1))
+    away = np.hypot(*(leg[None] - legs[:, 0, None]).transpose(2, 0, 1))
+    straight = np.full((n + 1, 2), 0.0)
+    straight[1:] += to
+    straight[:-1] += away[:, ::-1]
+    straight[1:n] -= ways[:, None]
+    best, place, turned = np.inf, 0, 0
+    for k, t in sorted(np.ndindex(n + 1, 2), key=lambda kt: float(straight[kt]))[:_PLACES]:
+        growth = float(router.distances(legs[k - 1, 1], leg[t])[0, 0]) if k > 0 else 0.0
+        growth += float(router.distances(leg[1 - t], legs[k, 0])[0, 0]) if k < n else 0.0
+        growth -= float(ways[k - 1]) if 0 < k < n else 0.0
+        if growth < best:
+            best, place, turned = growth, k, t
+    new = np.insert(legs, place, leg[::-1] if turned else leg, axis=0)
+    near = slice(max(0, place - 1), min(n, place + 1))
+    fresh = router.each(new[:-1, 1][near], new[1:, 0][near])
+    return new, np.concatenate([ways[: max(0, place - 1)], fresh, ways[place:]])

@@ -47,7 +47,7 @@ class Options:
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     endurance_s: float = float("inf")
-    clearance_m: float = 2.0
+    clearance_m: float = 1.0
     separation: Separation = field(default_factory=Separation)
     most_items: int = 650
 

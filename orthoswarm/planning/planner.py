@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _FAIR_ENOUGH = 1.25
+_QUICKEST_S = 0.5
 _WORTH = 0.99  # a later candidate must be better by this: the first ones are in the method's own, tidier order
 
 
@@ -67,7 +68,7 @@ def plan_area(
     left = coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
     gaps = tuple(_gap(p, area.grid) for p in coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
-    warnings = _warnings(slots, best, options)
+    warnings = _warnings(slots, best, foot, options)
     if seen < coverage.COMPLETE:
         warnings.append(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
@@ -147,12 +148,18 @@ def plan_lines(
     work = crew.share(legs, reorder=False)
     progress("separation")
     slots = crew.schedule(work)
-    warnings = _warnings(slots, work, options)
+    warnings = _warnings(slots, work, foot, options)
     return _plan("lines", slots, altitude_m, foot, grid, options, warnings, (None, None, ()))
 
 
-def _warnings(slots: list[list[Slot]], work: Work, options: Options) -> list[str]:
+def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Options) -> list[str]:
     result = []
+    every_s = foot.trigger_m / options.motion.speed_m_s
+    if every_s < _QUICKEST_S:
+        result.append(
+            f"a picture every {every_s:.2f} s is more than most cameras take; fly slower or higher, or with less "
+            "forward overlap"
+        )
     if work.balance > _FAIR_ENOUGH:
         result.append(
             f"the longest path is {work.balance:.2f} times the mean: few lines, or long ways out and home, "

@@ -135,8 +135,10 @@ class Router:
         """Lengths of the shortest free paths, float64 (n,), from start[i] to end[i], both (n, 2), metres."""
         p, q = np.asarray(start, np.float64).reshape(-1, 2), np.asarray(end, np.float64).reshape(-1, 2)
         result: Array = np.hypot(*(q - p).T)
-        for i in np.flatnonzero(self.blocked(p, q)):
-            result[i] = self.distances(p[i], q[i])[0, 0]
+        hidden = np.flatnonzero(self.blocked(p, q))
+        if len(hidden):
+            to_corner = _min_plus(self._sight(p[hidden], self._corners), np.ascontiguousarray(self._hops.T))
+            result[hidden] = (to_corner + self._sight(q[hidden], self._corners)).min(1)
         return result
 
     def path(self, start: ArrayLike, end: ArrayLike) -> Array:
