@@ -202,7 +202,7 @@ def test_a_flight_comes_onto_the_map(flight):
     assert fine.fov_deg == pytest.approx(FOV, abs=2.5)
     assert ("legs on the map", 3, 3) in seen
     time = refined.equation_5()
-    assert 0 < time["sequential_s"] and time["predicted_s"] < time["measured_s"]
+    assert time["sequential_s"] > 0 and time["predicted_s"] < time["measured_s"]
     assert len(refined.tasks_s["legs (III.D)"]) == 3
     sigma = np.array([p.sigma_m for p in fine.placed])
     assert (errors(fine, flight) < 3 * sigma).mean() > 0.9

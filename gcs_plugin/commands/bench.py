@@ -158,8 +158,8 @@ def accuracy_table(result: dict[str, Any]) -> str:
     lines = [
         f"Machine: {result['machine']}.",
         "",
-        "| set | method | map median m | map 95 % m | not found | picture centres median / 95 % m | worst FoV error deg "
-        "| CPU s | wall s | memory MB |",
+        "| set | method | map median m | map 95 % m | not found | picture centres median / 95 % m "
+        "| worst FoV error deg | CPU s | wall s | memory MB |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in result["rows"]:
