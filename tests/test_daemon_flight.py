@@ -1,5 +1,6 @@
 """Vehicles on links: plan, upload, start over HTTP; completion starts the refinement by itself; a second mission."""
 
+import json
 import math
 import queue
 import threading
@@ -93,7 +94,28 @@ def test_completion_starts_the_refinement_while_the_others_fly(flown):
     assert served.get("/api/legs").json()["features"]
     served.until("/api/jobs", lambda rows: rows[-1]["kind"] == "export" and rows[-1]["state"] == "done")
     assert (workspace / "orthoimage.tif").exists()
+    products_are_written(served, workspace)
     second_sortie(served, number)
+
+
+def products_are_written(served, workspace):
+    job = served.command("/api/export", {"formats": ["cog", "mbtiles", "kmz", "gpkg", "odm"]}).json()
+    served.until("/api/jobs", lambda rows: all(r["state"] in ("done", "failed") for r in rows))
+    done = next(r for r in served.get("/api/jobs").json() if r["id"] == job["id"])
+    assert done["state"] == "done", done["message"]
+    assert set(done["detail"]["files"]) == {"cog", "mbtiles", "kmz", "gpkg", "odm"}
+    for kind in done["detail"]["files"]:
+        answer = served.get(f"/api/export/{job['id']}/{kind}")
+        assert answer.status_code == 200
+        assert len(answer.content) > 1000
+    report = json.loads((workspace / "report.json").read_text())
+    assert report["frames"]["used"] > 10
+    assert [row["vehicle"] for row in report["completions"]] == ["v1", "v2"]
+    assert any("no basemap" in text for text in report["warnings"])
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl", "footprints.gpkg", "report.html"):
+        assert (workspace / name).stat().st_size > 1000
+    assert served.command("/api/export", {"formats": ["exe"]}).status_code == 422
+    assert served.get("/api/export/9999/cog").status_code == 404
 
 
 def second_sortie(served, plan):

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.work import load_solution
+from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError
 from orthoswarm.frame import Frame, Rejection
 from orthoswarm.geo import LocalGrid
@@ -52,16 +53,20 @@ def write_products(task: ExportTask) -> dict[str, str]:
         OrthoSwarmError: the disk is full.
     """
     from orthoswarm.products import write_frames, write_json
+    from orthoswarm.report.page import write_page
 
     out = task.workspace
-    made = _pictures(task)
+    made, area_ha = _pictures(task)
     if not made:
         raise InputError("there is no map yet; wait for pictures")
     solutions = [load_solution(path) for path in task.solutions]
     placed, rejected = _placements(task, solutions)
     level = _level(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
-    write_json(out / "report.json", _report(task, solutions, placed, rejected, level))
+    report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
+    basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
+    write_page(out, report, placed, rejected, basemap)
+    write_json(out / "report.json", report)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
     others = [name for name in task.formats if name not in files]
     if others:
@@ -69,28 +74,42 @@ def write_products(task: ExportTask) -> dict[str, str]:
     return files
 
 
-def _pictures(task: ExportTask) -> list[str]:
-    """A COG for each layer, the best one last; orthoimage.tif is there as soon as anything was refined."""
+def _pictures(task: ExportTask) -> tuple[list[str], float]:
+    """A COG for each layer, the best one last, and the ground that the first shows, hectares.
+
+    orthoimage.tif is there as soon as anything was refined.
+    """
     import shutil
 
     from orthoswarm.export.cog import write_cog
     from orthoswarm.export.partial import written_whole
     from orthoswarm.extent import drawn_window
 
-    made = []
+    made: list[str] = []
+    area_ha = 0.0
     for name, file in _FILES.items():
         if name not in task.canvases:
             continue
         with Canvas.open(task.canvases[name], writable=False) as canvas:
             if canvas.drawn[1] == 0:
                 continue
+            area_ha = area_ha or _drawn_ha(canvas)
             write_cog(_WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1)
         made.append(file)
     if made and made[-1] == "coarse.tif":  # without a map the orthoimage is the coarse product
         with written_whole(task.workspace / "orthoimage.tif") as part:
             shutil.copyfile(task.workspace / "coarse.tif", part)
         made.append("orthoimage.tif")
-    return made
+    return made, area_ha
+
+
+def _drawn_ha(canvas: Canvas) -> float:
+    """Ground that a canvas shows, hectares."""
+    row0, row1, col0, col1 = canvas.drawn
+    drawn = 0
+    for top in range(row0, row1, canvas.tile_px):
+        drawn += int(np.count_nonzero(canvas.read(top, min(row1, top + canvas.tile_px), col0, col1)[..., 3]))
+    return drawn * canvas.grid.gsd_m**2 / 1e4
 
 
 class _WithOverviews:

@@ -85,7 +85,6 @@ class Refinement:
             self._wait_quiet(job)
         self.drawer.wait_idle(_IDLE_S)
         job.detail["refine_started_s"] = time.time()
-        before = {name: layer.version for name, layer in self.layers.items()}
         area, frames = self._area(), self._frames(job)
         tell(0.05, f"refining {len(frames)} pictures")
         target = self.solutions / f"{new_name('solution')}.pickle"
@@ -102,11 +101,12 @@ class Refinement:
                 "layer": layer, "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3),
                 "solve_s": round(solved.wall_s, 3), "seconds": round(time.monotonic() - began, 3),
             }  # fmt: skip
+            version_before = self.layers[layer].version
             change = self._publish(job, layer, name, target, solved, rejected)
             self.journal.write(change)  # here, so that the next drawing begins from it
             self.layers[layer].replace(Canvas.open(self.folder / name))
         job.detail |= {
-            "version_before": before[layer], "version": self.layers[layer].version, "published_s": time.time(),
+            "version_before": version_before, "version": self.layers[layer].version, "published_s": time.time(),
         }  # fmt: skip
         self.on_published(layer, job)
         return lambda db: None

@@ -1,0 +1,100 @@
+"""The web page in headless Chromium against the real daemon."""
+
+import io
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.daemon_kit import line, serving
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+if CHROMIUM is None:
+    pytest.skip("no Chromium is installed", allow_module_level=True)
+
+FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
+FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"]
+LIMIT_MS = 120_000
+
+
+@pytest.fixture
+def page(tmp_path):
+    with serving(tmp_path / "w") as served, playwright.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(LIMIT_MS)
+        page.foreign, page.errors = [], []
+        page.on(
+            "request",
+            lambda r: None if r.url.startswith((served.url, "blob:", "data:")) else page.foreign.append(r.url),
+        )
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        page.goto(f"{served.url}/#token={served.token}")
+        page.wait_for_selector("#link.on")
+        yield served, page
+        assert page.errors == []
+        assert page.foreign == []  # it works without the internet
+        browser.close()
+
+
+def colours(page) -> float:
+    """Share of the map that is colourful."""
+    shot = np.asarray(Image.open(io.BytesIO(page.locator("#map").screenshot())).convert("RGB"), float)
+    return float((shot[:, :900].std(axis=2) > 20).mean())
+
+
+def test_the_map_appears_as_pictures_come(page):
+    served, page = page
+    assert "None yet" in page.inner_text("#vehicles")
+    before = colours(page)
+    for shot in line(6, "falcon <b>"):
+        served.send(shot)
+    page.wait_for_selector(".card:has-text('falcon <b>')")  # a name is a text, not a piece of the page
+    page.wait_for_function("document.querySelector('[data-layer=realtime]:not(.off)')")
+    for _ in range(60):
+        if colours(page) > before + 0.01:
+            break
+        page.wait_for_timeout(500)
+    assert colours(page) > before + 0.01
+    shown = colours(page)
+    page.locator("[data-layer=realtime] input[type=checkbox]").uncheck()
+    page.wait_for_timeout(1500)
+    assert colours(page) < shown - 0.01
+    page.click("text=refine now")
+    page.click("#confirm >> text=Yes")
+    page.wait_for_selector("#jobs .bar.done")
+
+
+def test_an_area_is_drawn_and_planned(page):
+    _, page = page
+    page.evaluate("orthoswarm.map.jumpTo({center: [103.2, 30.57], zoom: 16})")
+    page.click("#draw")
+    for x, y in ((300, 250), (600, 250), (600, 550), (300, 550)):
+        page.mouse.click(x, y)
+        page.wait_for_timeout(400)
+    page.fill("[name=vehicles]", "2")
+    page.click("#make")
+    page.wait_for_selector("#plan-result >> text=covered in")
+    assert page.locator("#plan-result .card").count() == 2
+    page.click("text=Start all")
+    page.wait_for_selector("#confirm[open]")
+    page.click("#confirm >> text=Cancel")
+    page.click("text=Upload all")
+    page.click("#confirm >> text=Yes")
+    page.wait_for_selector("#problem:not([hidden])")
+    assert "links" in page.inner_text("#problem")
+
+
+def test_the_page_fits_a_tablet_held_upright(page):
+    _, page = page
+    page.set_viewport_size({"width": 600, "height": 900})
+    panel, chart = page.locator("#panel").bounding_box(), page.locator("#map").bounding_box()
+    assert panel["width"] == 600
+    assert panel["y"] > 350
+    assert chart["height"] == 900
+    for button in page.locator("button:visible").all()[:6]:
+        box = button.bounding_box()
+        if box and box["y"] > panel["y"]:
+            assert box["height"] >= 40
