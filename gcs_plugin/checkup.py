@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import io
+import json
 import os
 import platform
 import shutil
@@ -206,7 +207,7 @@ def _is_warm(module: str, source: Path) -> bool:
 
 
 def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels that maps need by making two tiny ones of made-up pictures; gives the seconds it took."""
+    """Compile the kernels by making two tiny maps of made-up pictures and two plans; gives the seconds it took."""
     import tempfile
 
     started = time.perf_counter()
@@ -221,4 +222,11 @@ def warm_kernels(say: Callable[[str], None]) -> float:
         cli.main(["mosaic", str(twin / "photos"), *common, "--out", str(out)])
         # Photos with little overlap go another way.
         cli.main(["mosaic", *map(str, photos[::3]), *common, "--out", str(out)])
+        ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]
+        hole = [[9.004, 47.002], [9.004, 47.004], [9.006, 47.004], [9.006, 47.002], [9.004, 47.002]]
+        area = Path(folder, "area.geojson")
+        area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring, hole]}), encoding="utf-8")
+        flags = ["--vehicles", "3", "--altitude", "60", "--fov-min", "60", "--start", "46.999,9.0", "--endurance", "12"]
+        for method in ("bcd", "tmstc"):
+            cli.main(["plan", str(area), *flags, "--method", method, "--out", str(Path(folder, method))])
     return time.perf_counter() - started

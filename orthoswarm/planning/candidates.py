@@ -24,6 +24,7 @@ _TRIES: dict[str, int] = {"columns": 6, "bcd": 6, "tmstc": 8}
 _TRIES_IF_FEW = 12  # few lines are cheap to lay and hard to share
 _MANY_LEGS = 400
 _DENSER = 1.25
+_HOPELESS = 1.08  # a direction dearer than the best by this is not worth mending
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def candidates(
     if method == "tmstc":  # a grid looks the same after a right angle
         quarter = [a % (0.5 * np.pi) for a in angles]
         angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < 0.02 for b in quarter[:k])]
-    few = False
+    few, least = False, np.inf
     for number, angle in enumerate(angles):
         if number >= (_TRIES_IF_FEW if few else _TRIES[method]):
             return
@@ -66,6 +67,10 @@ def candidates(
             continue
         count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
         few = few or count < 4 * vehicles
+        rough = _rough_cost(legs, turn_m)
+        least = min(least, rough)
+        if not few and rough > _HOPELESS * least:
+            continue
         yield from _finished(field, legs, count, angle, foot, method, router, reach_m)
         if len(legs) > _MANY_LEGS:  # directions hardly differ then, and each takes its time
             return
@@ -73,6 +78,12 @@ def candidates(
             denser = _lay(field, angle, foot, method, router, vehicles)
             if len(legs) < len(denser) <= _DENSER * len(legs):
                 yield from _finished(field, denser, count, angle, foot, method, router, reach_m)
+
+
+def _rough_cost(legs: Array, turn_m: float) -> float:
+    """Metres to fly a row of legs, turns counted as metres, no-fly zones between legs left out."""
+    ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()
+    return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + turn_m * len(legs))
 
 
 def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Router, multiple: int) -> Array:
