@@ -50,7 +50,7 @@ class Cluster:
 
     Raises:
         InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
-            does not see a shared path.
+            does not see a shared path or that uses several threads for sums.
     """
 
     def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float = _PATIENCE_S) -> None:
@@ -148,7 +148,12 @@ class Cluster:
         if not self._workers():
             raise InputError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
         for worker, found in self._client.run(_inspect, [str(p) for p in shared]).items():
-            version, missing, process, cpu_s = found
+            version, missing, process, cpu_s, alone = found
+            if not alone:  # sums over several threads differ in their last digits, and threads fight over the cores
+                raise InputError(
+                    f"the worker {worker} uses several threads for sums; start it without --no-nanny, or with "
+                    "OMP_NUM_THREADS=1 in its environment"
+                )
             if version != __version__:
                 raise InputError(
                     f"the worker {worker} has OrthoSwarm {version} and not {__version__}; install the same everywhere"
@@ -191,9 +196,10 @@ def _work(payload: bytes) -> _Outcome:
     return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())
 
 
-def _inspect(shared: list[str]) -> tuple[str, list[str], str, float]:
-    """Runs on a worker: its version, which paths it does not see, who it is, CPU seconds so far."""
-    return __version__, [p for p in shared if not os.path.exists(p)], _process(), time.process_time()
+def _inspect(shared: list[str]) -> tuple[str, list[str], str, float, bool]:
+    """Runs on a worker: version, unseen paths, who it is, CPU seconds so far, whether sums keep to one thread."""
+    missing = [p for p in shared if not os.path.exists(p)]
+    return __version__, missing, _process(), time.process_time(), os.environ.get("OMP_NUM_THREADS") == "1"
 
 
 def _process() -> str:

@@ -151,6 +151,14 @@ def test_a_wrong_address_is_one_sentence(monkeypatch):
         Cluster("nonsense:::")
 
 
+def test_a_worker_that_would_sum_differently_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(SMALL, "OMP_NUM_THREADS", "2")
+    with Loopback(tmp_path) as one:
+        one.begin(1)
+        with pytest.raises(InputError, match="several threads"):
+            Cluster(one.address)
+
+
 def test_the_same_map_as_with_local_workers(loopback, tmp_path):
     from orthoswarm.pipeline import Options, run
     from telemetry import LoadOptions, load
