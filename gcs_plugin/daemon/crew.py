@@ -70,9 +70,9 @@ class Crew:
         if pool is None:
             return
         processes = list((getattr(pool, "_processes", None) or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
         for process in processes:
             process.join(5.0)
 

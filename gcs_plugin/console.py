@@ -1,0 +1,154 @@
+"""Commands to a running daemon, words in and lines out, for consoles such as MAVProxy's."""
+
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+_USAGE: Final = "usage: orthoswarm status|vehicles|plan|upload|start|pause|rtl|refine|layers|export|web|connect"
+_TIMEOUT_S: Final = 240.0
+
+
+class Client:
+    """Talks to the daemon.
+
+    Attributes:
+        url: its address without a slash at the end. token: what commands need.
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8650", token: str = "") -> None:
+        self.url, self.token = url.rstrip("/"), token
+
+    def ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
+        """The JSON answer of a route; a POST if there is a body.
+
+        Raises:
+            RuntimeError: the daemon refused, or is not there, with a sentence for the user.
+        """
+        request = urllib.request.Request(self.url + path, method="GET" if body is None else "POST")
+        request.add_header("Authorization", f"Bearer {self.token}")
+        data = None
+        if body is not None:
+            request.add_header("Content-Type", "application/json")
+            data = json.dumps(body).encode()
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        try:
+            with opener.open(request, data, timeout=_TIMEOUT_S) as answer:
+                return json.loads(answer.read())
+        except urllib.error.HTTPError as error:
+            raise RuntimeError(_detail(error)) from None
+        except (OSError, ValueError) as error:
+            raise RuntimeError(
+                f"the daemon at {self.url} does not answer ({error}); start it, or say connect"
+            ) from None
+
+
+def _detail(error: urllib.error.HTTPError) -> str:
+    try:
+        return str(json.loads(error.read())["detail"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return f"the daemon answered {error.code}"
+
+
+class Commands:
+    """The module's commands: words in, lines for the console out.
+
+    Args:
+        client: the daemon.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self._plan = ""
+        self._verbs: dict[str, Callable[[list[str]], list[str]]] = {
+            "status": self.status, "vehicles": self.vehicles, "plan": self.plan, "upload": self.upload,
+            "start": self.command("start"), "pause": self.command("pause"), "rtl": self.command("rtl"),
+            "refine": self.refine, "layers": self.layers, "export": self.export, "web": self.web,
+            "connect": self.connect,
+        }  # fmt: skip
+
+    def run(self, words: list[str]) -> list[str]:
+        """Do what was typed."""
+        if not words or words[0] not in self._verbs:
+            return [_USAGE]
+        try:
+            return self._verbs[words[0]](words[1:])
+        except (RuntimeError, ValueError, OSError) as error:
+            return [f"orthoswarm: {error}"]
+
+    def connect(self, words: list[str]) -> list[str]:
+        """`connect URL TOKEN`, or `connect WORKSPACE` with the token in its file."""
+        if len(words) == 1 and Path(words[0]).is_dir():
+            self.client.token = (Path(words[0]) / "token").read_text().strip()
+        elif len(words) == 2:
+            self.client.url, self.client.token = words[0].rstrip("/"), words[1]
+        else:
+            return ["usage: orthoswarm connect URL TOKEN, or orthoswarm connect WORKSPACE"]
+        return self.status([])
+
+    def status(self, _: list[str]) -> list[str]:
+        """Health, frames and jobs."""
+        health, jobs = self.client.ask("/healthz"), self.client.ask("/api/jobs")
+        rows = self.client.ask("/api/vehicles")
+        frames = sum(row.get("frames", {}).get("frames", 0) for row in rows)
+        under_way = [
+            f"{j['kind']} {j['vehicle'] or ''} {100 * j['progress']:.0f} %" for j in jobs if j["state"] == "running"
+        ]
+        lines = [f"daemon {health['version']} at {self.client.url}: {len(rows)} vehicles, {frames} pictures"]
+        return [*lines, *under_way, *health["problems"]]
+
+    def vehicles(self, _: list[str]) -> list[str]:
+        """A line a vehicle."""
+        return [
+            f"{row['id']}: {row.get('mode') or row['state']}, sortie {row.get('sortie')}, {row.get('frames')}"
+            for row in self.client.ask("/api/vehicles")
+        ]
+
+    def layers(self, _: list[str]) -> list[str]:
+        """A line a layer."""
+        return [f"{r['name']}: {'empty' if r['empty'] else r['version']}" for r in self.client.ask("/api/layers")]
+
+    def plan(self, words: list[str]) -> list[str]:
+        """`plan AREA.geojson VEHICLES HEIGHT FOV_MIN`."""
+        if len(words) != 4:
+            return ["usage: orthoswarm plan AREA.geojson VEHICLES HEIGHT_M FOV_MIN_DEG"]
+        body = {
+            "area": json.loads(Path(words[0]).read_text()), "vehicles": int(words[1]), "altitude_m": float(words[2]),
+            "fov_min_deg": float(words[3]),
+        }  # fmt: skip
+        figures = self.client.ask("/api/plans", body)
+        self._plan = figures["id"]
+        return [f"{self._plan}: {100 * figures['covered_share']:.1f} % covered in {figures['makespan_s'] / 60:.1f} min"]
+
+    def upload(self, words: list[str]) -> list[str]:
+        """`upload VEHICLE [PLAN]`."""
+        if not words or not (self._plan or len(words) > 1):
+            return ["usage: orthoswarm upload VEHICLE [PLAN]; plan first"]
+        plan = words[1] if len(words) > 1 else self._plan
+        return [self.client.ask(f"/api/missions/{words[0]}/upload", {"plan": plan})["text"]]
+
+    def command(self, verb: str) -> Callable[[list[str]], list[str]]:
+        """A command to a vehicle."""
+
+        def run(words: list[str]) -> list[str]:
+            if len(words) != 1:
+                return [f"usage: orthoswarm {verb} VEHICLE"]
+            return [self.client.ask(f"/api/missions/{words[0]}/{verb}", {})["text"]]
+
+        return run
+
+    def refine(self, words: list[str]) -> list[str]:
+        """`refine [VEHICLE]`."""
+        jobs = self.client.ask("/api/refine", {"vehicle": words[0]} if words else {})
+        return [f"refining {job['vehicle']}, sortie {job['sortie']} (job {job['id']})" for job in jobs]
+
+    def export(self, words: list[str]) -> list[str]:
+        """`export [FORMAT ...]`."""
+        job = self.client.ask("/api/export", {"formats": words} if words else {})
+        return [f"exporting {', '.join(job['detail']['formats'])} (job {job['id']})"]
+
+    def web(self, _: list[str]) -> list[str]:
+        """Where the page is."""
+        return [f"{self.client.url}/"]

@@ -1,0 +1,67 @@
+"""The console's commands against a real daemon, and the MAVProxy module where MAVProxy is installed."""
+
+import json
+import types
+
+import pytest
+
+from gcs_plugin.console import Client, Commands
+from tests.daemon_kit import line, serving
+from tests.test_daemon_flight import square
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("w")) as served:
+        for shot in line(8):
+            served.send(shot)
+        served.until("/api/frames", lambda rows: all(row["on_map"] for row in rows))
+        yield served
+
+
+@pytest.fixture
+def commands(served):
+    return Commands(Client(served.url, served.token))
+
+
+def test_state_is_told_in_lines(commands):
+    assert "1 vehicles, 8 pictures" in commands.run(["status"])[0]
+    assert commands.run(["vehicles"])[0].startswith("v1:")
+    assert any(text.startswith("realtime: ") and "empty" not in text for text in commands.run(["layers"]))
+    assert commands.run(["web"])[0].startswith("http://127.0.0.1:")
+
+
+def test_the_workspace_gives_the_token(served):
+    workspace = served.process.args[served.process.args.index("--workspace") + 1]
+    commands = Commands(Client(served.url))
+    assert "token" in commands.run(["refine"])[0]
+    assert "pictures" in commands.run(["connect", workspace])[0]
+    assert "refining v1" in commands.run(["refine", "v1"])[0]
+    served.until("/api/jobs", lambda rows: all(row["state"] in ("done", "failed") for row in rows))
+
+
+def test_plans_are_made_and_wrong_words_explained(commands, tmp_path):
+    area = tmp_path / "area.geojson"
+    area.write_text(json.dumps(square(150)))
+    assert "% covered" in commands.run(["plan", str(area), "2", "60", "65"])[0]
+    assert "links" in commands.run(["upload", "v1"])[0]
+    assert "usage" in commands.run(["plan"])[0]
+    assert "usage" in commands.run([])[0]
+    assert "no picture" in commands.run(["refine", "nobody"])[0]
+
+
+def test_a_daemon_that_is_not_there_is_told(tmp_path):
+    assert "does not answer" in Commands(Client("http://127.0.0.1:9")).run(["status"])[0]
+
+
+def test_the_mavproxy_module_loads():
+    pytest.importorskip("MAVProxy")
+    from gcs_plugin import mavproxy
+
+    state = types.SimpleNamespace(
+        command_map={}, completions={}, completion_functions={}, public_modules={}, map_functions={}, multi_instance={},
+        instance_count={}, modules=[], aliases={},
+    )  # fmt: skip
+    module = mavproxy.init(state)
+    assert "orthoswarm" in state.command_map
+    module.typed([])
