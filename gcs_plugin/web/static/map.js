@@ -86,7 +86,7 @@ export const setOpacity = (name, share) => {
 export function fit(bounds) {
   const [west, south, east, north] = bounds;
   const right = window.innerWidth > 760 ? 360 : 30;
-  map.fitBounds([[west, south], [east, north]], { padding: { top: 30, bottom: window.innerWidth > 760 ? 50 : window.innerHeight * 0.52, left: 30, right }, duration: 0, maxZoom: 20 });
+  map.fitBounds([[west, south], [east, north]], { padding: { top: 30, bottom: 50, left: 30, right }, duration: 0, maxZoom: 20 });
 }
 
 // -- vehicles --------------------------------------------------------------------------------------------------------
