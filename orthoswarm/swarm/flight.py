@@ -105,6 +105,11 @@ def weigh_records(flight: Flight) -> None:
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
 
+def strong_lens(flight: Flight) -> bool:
+    """True if the lens distorts so much that two parameters do not describe it."""
+    return bool(np.abs(flight.adjustment.rig.lens[:, K1]).max() >= STRONG_K1)
+
+
 def free_strong_lens(flight: Flight) -> bool:
     """Give a strongly distorting lens all its parameters; a weak one keeps two, which is better held.
 
@@ -112,7 +117,7 @@ def free_strong_lens(flight: Flight) -> bool:
         True if more parameters are free now (some more steps are due).
     """
     adj = flight.adjustment
-    if float(np.abs(adj.rig.lens[:, K1]).max()) < STRONG_K1:
+    if not strong_lens(flight):
         return False
     width = flight.pictures.size[0]
     sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.rig.lens), 1))

@@ -14,7 +14,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Ties
-from orthoswarm.swarm.flight import Flight, free_strong_lens, open_flight, weigh_records
+from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
@@ -79,7 +79,12 @@ def followed(
     start = float(np.median(hints)) if hints else options.fov_start_rad
     flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
     watch.lap("tracks")
-    return None if flight is None else _from_flight(flight, _relative(flight), origin, basemap, watch)
+    if flight is None:
+        return None
+    surface = _relative(flight)
+    if len(frames) < FEW and strong_lens(flight):
+        return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
+    return _from_flight(flight, surface, origin, basemap, watch)
 
 
 def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None) -> VehicleState:
