@@ -261,6 +261,8 @@ class _Batch:
         still = [p for p in state.recorded.placed if p.frame.vehicle in state.still]
         coarse = [p for s in refinement.coarse for p in s.placed] + still
         fine = [p for s in refinement.fine for p in s.placed] + still
+        if self.options.gsd_m is None and _heights_assumed(state.recorded.placed):
+            state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):
                 state.gains = estimate_gains(fine, state.thumbnails, terrain or Terrain.flat())
@@ -404,6 +406,11 @@ def _append(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
     for p in carried:
         own = next((i for i, s in enumerate(solutions) if s.vehicle == p.frame.vehicle), 0)
         solutions[own] = replace(solutions[own], placed=[*solutions[own].placed, p])
+
+
+def _heights_assumed(recorded: Sequence[PlacedFrame]) -> bool:
+    """True if most pictures told no height, so that the ground pixel of the real-time picture was a guess."""
+    return sum(p.frame.fix.height_m is None for p in recorded) > 0.5 * len(recorded)
 
 
 def _coarse_terrain(solutions: Sequence[Solution]) -> Terrain | None:

@@ -219,6 +219,7 @@ def test_positions_only(scene, basemap, tmp_path, mosaic):
     code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
     assert code == 0 and report["frames"]["used"] >= 22
     assert any("height" in w for w in report["warnings"])
+    assert 0.3 < report["gsd_m"] < 0.6  # 80 m over 184 px, not what the real-time picture assumed
     assert np.median(errors(scene, rows, shots)) < 5.0
 
 
