@@ -114,6 +114,13 @@ class Served:
             time.sleep(0.1)
 
 
+def _end_with_us() -> None:
+    """A test run that is killed leaves no daemon behind."""
+    import ctypes
+
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
 def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 120.0) -> Served:
     """Start `orthoswarm serve` and wait until it answers."""
     process = subprocess.Popen(
@@ -132,6 +139,7 @@ def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 120.
         stderr=subprocess.STDOUT,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
+        preexec_fn=_end_with_us if sys.platform == "linux" else None,
     )
     said: list[str] = []
     lines: queue.SimpleQueue = queue.SimpleQueue()
