@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 THETA_HAT_RAD = np.radians(70.0)
 """The field of view that is assumed where nothing is known: below that of most drones' cameras."""
 DEFAULT_HEIGHT_M = 80.0
-_HEIGHTS_M = (20.0, 150.0)
+_HEIGHTS_M = (50.0, 150.0)
 _USUAL_OVERLAP = 0.75
 _GPS_SIGMA_M = 3.0
 _TILT_SIGMA = {True: 0.03, False: 0.1}
