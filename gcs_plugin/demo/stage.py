@@ -8,7 +8,7 @@ import numpy as np
 
 from orthoswarm.twin.flight import FlightPlan
 from orthoswarm.twin.presets import TwinSpec, spec
-from orthoswarm.twin.site import Site, disaster_zone
+from orthoswarm.twin.site import Site, disaster_zones
 
 if TYPE_CHECKING:
     from orthoswarm.twin.render import Stage
@@ -90,7 +90,7 @@ def build_stage(setting: Setting) -> tuple["Stage", Site]:
     twin = setting.twin
     site = Site.of(twin)
     scene, slots = site.build(twin)
-    return after_disaster(twin, scene, slots, disaster_zone(twin, site)), site
+    return after_disaster(twin, scene, slots, disaster_zones(twin, site)), site
 
 
 def write_world(setting: Setting, folder: Path) -> None:

@@ -26,7 +26,7 @@ from orthoswarm.twin.products import (
 from orthoswarm.twin.record import Record, record
 from orthoswarm.twin.render import Stage, lens_rays, render
 from orthoswarm.twin.sensor import Sensor
-from orthoswarm.twin.site import Site, disaster_zone
+from orthoswarm.twin.site import Site, disaster_zones
 from orthoswarm.twin.tags import PhotoTags, with_tags
 
 Progress = Callable[[str, int, int], None]
@@ -79,13 +79,13 @@ def make_twin(
     flights = [fly(spec.plan, spec.motion, site.center, v, spec.seed, spec.lens_k) for v in range(spec.plan.vehicles)]
     records = [record(flight, spec.noise, v, spec.seed) for v, flight in enumerate(flights)]
     scene, slots = site.build(spec)
-    zone = disaster_zone(spec, site)
+    zones = disaster_zones(spec, site)
     if not (folder / "basemap.tif").exists():
         tell("basemap", 0, 1)
         write_basemap(spec, scene, slots, folder / "basemap.tif", truth)
     tell("disaster", 0, 1)
-    stage = after_disaster(spec, scene, slots, zone)
-    write_truth(spec, stage, zone, truth)
+    stage = after_disaster(spec, scene, slots, zones)
+    write_truth(spec, stage, zones, truth)
     write_plan(spec, site, folder / "plan.geojson")
     write_frames(spec, site, flights, truth / "frames.csv")
     total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))

@@ -26,7 +26,7 @@ class TwinSpec:
     Attributes:
         preset: name of the preset that it began with.
         seed: of everything that is drawn.
-        disaster: none, debris, water or haze.
+        disaster: none, debris, water, haze, or all three.
         noise_name: kind of noise; noise: its values.
         plan: the flight. motion: how calmly it is flown.
         relief_m: ground relief, +- metres (procedural city only).
@@ -78,7 +78,7 @@ PRESETS: dict[str, TwinSpec] = {
     "clear": TwinSpec(preset="clear", disaster="none"),
     # 96 x 339 pictures over 6.35 square kilometres, as in the paper's scaling experiment
     "full": TwinSpec(
-        preset="full", disaster="debris",
+        preset="full", disaster="all",
         plan=FlightPlan(columns=12, rows=8, photos=339, legs=4, spacing_m=4.5, leg_spacing_m=48.0, speed_m_s=9.0),
     ),
 }  # fmt: skip

@@ -75,22 +75,22 @@ def write_basemap(spec: TwinSpec, scene: Scene, slots: list[Slot], path: Path, t
     write_whole(truth / "basemap.json", json.dumps({"lean_east": lean[0], "lean_north": lean[1]}).encode())
 
 
-def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zone: Zone | None) -> Stage:
+def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zones: dict[str, Zone]) -> Stage:
     """The scene at the time of the flight; changes the scene in place."""
     place_cars(scene, slots, spec.seed * 2 + 2, spec.cars)
     haze = np.zeros((0, 0), np.float32)
-    if zone is not None and spec.disaster == "debris":
-        debris_flow(scene, zone, spec.seed)
-    elif zone is not None and spec.disaster == "water":
-        flood(scene, zone, spec.seed)
-    elif zone is not None:
-        haze = haze_opacity(scene, zone, spec.seed)
+    if "debris" in zones:
+        debris_flow(scene, zones["debris"], spec.seed)
+    if "water" in zones:
+        flood(scene, zones["water"], spec.seed)
+    if "haze" in zones:
+        haze = haze_opacity(scene, zones["haze"], spec.seed)
     sun = light_of(spec, 1)
     lit = lit_texture(scene, sun)
     return make_stage(scene, lit, sun.direction(), sun.ambient, haze)
 
 
-def write_truth(spec: TwinSpec, stage: Stage, zone: Zone | None, truth: Path) -> None:
+def write_truth(spec: TwinSpec, stage: Stage, zones: dict[str, Zone], truth: Path) -> None:
     """True orthoimage after the disaster, surface, bare ground, and masks: moving, disaster, level ground."""
     import cv2
 
@@ -105,8 +105,8 @@ def write_truth(spec: TwinSpec, stage: Stage, zone: Zone | None, truth: Path) ->
     write_geotiff(truth / "dtm.tif", s.dtm, s.cells)
     moving = (s.kind[::2, ::2] == WATER).astype(np.uint8) * 255
     write_geotiff(truth / "moving_mask.tif", moving, s.cells)
-    if zone is not None:
-        inside = zone_mask(s, zone, spec.disaster, spec.seed)
+    if zones:
+        inside = np.logical_or.reduce([zone_mask(s, zone, name, spec.seed) for name, zone in zones.items()])
         write_geotiff(truth / "disaster_mask.tif", inside.astype(np.uint8) * 255, s.cells)
     tall = (s.above_ground() > 2.0).astype(np.uint8)
     still = cv2.dilate(tall, np.ones((5, 5), np.uint8)) == 0

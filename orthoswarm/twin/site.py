@@ -46,21 +46,35 @@ class Site:
         return build_city(scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m)
 
 
-def disaster_zone(spec: TwinSpec, site: Site) -> Zone | None:
-    """Where the disaster strikes: near the middle of the area, its long side along the area's."""
+def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, Zone]:
+    """Where disasters strike, by name: one near the middle of the area, or with `all` one in each third of it.
+
+    Raises:
+        InputError: for a disaster that does not exist.
+    """
     if spec.disaster == "none":
-        return None
+        return {}
+    if spec.disaster == "all":
+        thirds = zip(SIZES_M, (0.3, 0.0, -0.3), strict=True)
+        return {name: _zone(spec, site, name, place) for name, place in thirds}
     if spec.disaster not in SIZES_M:
-        raise InputError(f"there is no disaster '{spec.disaster}'; choose none, {', '.join(SIZES_M)}")
-    rng = np.random.default_rng([spec.seed, 53])
-    across, along = SIZES_M[spec.disaster]
+        raise InputError(f"there is no disaster '{spec.disaster}'; choose none, all, {', '.join(SIZES_M)}")
+    return {spec.disaster: _zone(spec, site, spec.disaster, 0.0)}
+
+
+def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> Zone:
+    """A disaster's zone, its middle `place` extents along the area's long side, its long side along the area's."""
+    alone = spec.disaster != "all"
+    rng = np.random.default_rng([spec.seed, 53] if alone else [spec.seed, 53, list(SIZES_M).index(disaster)])
+    across, along = SIZES_M[disaster]
     extent = np.array(spec.plan.extent_m)
     # the long side of the zone lies along the long side of the area; small areas get a smaller zone
     shrink = min(1.0, 0.8 * extent.max() / max(across, along), 0.8 * extent.min() / min(across, along))
     lengthwise = spec.plan.heading_rad + (np.pi / 2 if extent[0] >= extent[1] else 0.0)
     if across > along:
         lengthwise += np.pi / 2
-    offset = rng.uniform(-0.12, 0.12, 2) * extent
+    offset = rng.uniform(-0.12, 0.12, 2) * extent * (1.0 if alone else 0.3)
+    offset[int(extent.argmax())] += place * extent.max()
     east, north = spec.plan.to_grid(offset, site.center)
     angle = np.pi / 2 - lengthwise + rng.uniform(-0.25, 0.25)
     return Zone(float(east), float(north), across * shrink, along * shrink, float(angle))
