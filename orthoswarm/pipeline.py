@@ -393,6 +393,7 @@ class _Batch:
             "covered_share": state.drawn[1],
             "basemap": str(self.options.basemap) if self.options.basemap else None,
             "until": self.options.until,
+            "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],
             "root": image_root(state.ingest.frames),
             **({"equation_5": state.equation_5} if state.equation_5 else {}),
         }

@@ -15,7 +15,7 @@ from tests.swarm_block import make_block
 
 def level(points, sigma=1.0):
     zero = np.zeros(points)
-    return Ground(zero, sigma, 20.0, zero, c=9.0)
+    return Ground(zero, sigma, 20.0, c=9.0)
 
 
 def solved(block, free=None, ties=None, schedule=(1e4, 1e4, 100.0, 100.0, 9.0, 9.0, 9.0)):

@@ -23,7 +23,9 @@ _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 @dataclass(frozen=True, slots=True)
 class Ties:
-    """Points of which the map says where they lie: X + lean (Z - surface) = xy.
+    """Points of which the map says where they lie.
+
+    What was compared is ground, which a map shows where it is, however much its roofs lean.
 
     Attributes:
         point: int32 (Q,), at most one tie a point. xy: float64 (Q, 2). sigma_m: float64 (Q,).
@@ -45,15 +47,12 @@ class Ground:
 
     Attributes:
         height: float64 (P,) expected Z. sigma: robust sigma; soft_sigma: a weak one that is not robust, metres.
-        surface: float64 (P,) ground height under each point, for the map's lean. lean: (2,) metres per metre.
         c: robust scale of `sigma`.
     """
 
     height: Array
     sigma: float
     soft_sigma: float
-    surface: Array
-    lean: tuple[float, float] = (0.0, 0.0)
     c: float = 4.0
 
 
@@ -191,8 +190,6 @@ class Adjustment:
             ties.xy,
             1.0 / ties.sigma_m**2,
             tie_c,
-            np.asarray(ground.lean, float),
-            ground.surface,
             system.band,
             lens_side,
             lens_corner,

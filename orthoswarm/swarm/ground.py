@@ -21,13 +21,11 @@ class GroundModel:
         fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`).
         level_m: height that the middle of the ground should have (0: the takeoff level).
         lift_m: ground between the points over the fitted surface (corners sit on raised things, so it is negative).
-        lean: metres of shift in the map per metre of height over the ground.
     """
 
     fit: TerrainFit | None = None
     level_m: float = 0.0
     lift_m: float = 0.0
-    lean: tuple[float, float] = (0.0, 0.0)
 
     def height(self, xy: Array) -> Array:
         """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""
@@ -36,7 +34,7 @@ class GroundModel:
         return np.asarray(self.terrain().height(xy))
 
     def terrain(self) -> Terrain:
-        """The ground for rectifying pictures and for the map's lean."""
+        """The ground for rectifying pictures."""
         return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.lift_m)
 
     def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> Ground:
@@ -45,7 +43,7 @@ class GroundModel:
             expected = np.full(len(points), self.level_m)
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
-        return Ground(expected, sigma_m, 20.0, self.height(points[:, :2]), c=c)
+        return Ground(expected, sigma_m, 20.0, c)
 
 
 def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:
@@ -78,4 +76,4 @@ def fit_surface(
     low, high = position.min(0) - reach, position.max(0) + reach
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     fit = fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings)
-    return GroundModel(fit, before.level_m, before.lift_m, before.lean)
+    return GroundModel(fit, before.level_m, before.lift_m)

@@ -1,8 +1,8 @@
 """The ground under the corners: how far a surface through corner points lies above the ground around them.
 
 Corners sit at the edges of raised things, and a surface through them is a little too high, although every point
-lies on it: the height that the map's lean acts on is then wrong everywhere by the same amount. Small patches at
-free positions, not at corners, tell the level of the ground itself.
+lies on it: the height on which pictures are rectified and compared with the map is then wrong everywhere by the same
+amount. Small patches at free positions, not at corners, tell the level of the ground itself.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The second pass of a vehicle: on the common level, with the common lean, tied to neighbours that are held."""
+"""The second pass of a vehicle: on the common level, tied to neighbours that are held."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

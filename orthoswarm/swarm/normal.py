@@ -103,8 +103,6 @@ def build(  # type: ignore[no-untyped-def]
     tie_xy,
     tie_weight,
     tie_c,
-    lean,
-    surface,
     band,
     side,
     corner,
@@ -125,7 +123,7 @@ def build(  # type: ignore[no-untyped-def]
         c: robust scale of reprojection. height, height_weight: (P,) prior on Z, robust with height_c, plus a
             constant weight height_soft that is not robust.
         tie_point: (P,) row of the tie of a point or -1; tie_xy (Q, 2), tie_weight (Q,), tie_c: map ties
-            X + lean (Z - surface) = tie_xy. surface: (P,) ground height under each point.
+            (X, Y) = tie_xy, whatever the height.
         band: (6 (bandwidth + 1), 6 n) lower band, side: (6 n, 6 L), corner: (6 L, 6 L), rhs: (6 n,), rhs_lens: (6 L,).
         w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): kept for back substitution.
         obs_weight: (M,) robust weight times 1 (0 where invisible). tie_residual: (Q, 2).
@@ -184,20 +182,14 @@ def build(  # type: ignore[no-untyped-def]
         b[2] += hw * e
         t = tie_point[p]
         if t >= 0:
-            ex = tie_xy[t, 0] - (x + lean[0] * (z - surface[p]))
-            ey = tie_xy[t, 1] - (y + lean[1] * (z - surface[p]))
+            ex = tie_xy[t, 0] - x
+            ey = tie_xy[t, 1] - y
             tie_residual[t, 0], tie_residual[t, 1] = ex, ey
             tw = tie_weight[t] * robust_weight((ex * ex + ey * ey) * tie_weight[t], tie_c)
             v[0, 0] += tw
             v[1, 1] += tw
-            v[0, 2] += tw * lean[0]
-            v[2, 0] += tw * lean[0]
-            v[1, 2] += tw * lean[1]
-            v[2, 1] += tw * lean[1]
-            v[2, 2] += tw * (lean[0] * lean[0] + lean[1] * lean[1])
             b[0] += tw * ex
             b[1] += tw * ey
-            b[2] += tw * (lean[0] * ex + lean[1] * ey)
         for a in range(3):
             v[a, a] += 1e-9
             b_point[p, a] = b[a]

@@ -144,7 +144,7 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
         flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
         return
     shift_cameras(flight, fit.correction)
-    settled = settle(flight, basemap, origin, state.surface, None)
+    settled = settle(flight, basemap, origin, state.surface)
     state.surface, state.ties, state.matches, state.roofs = (
         settled.surface,
         settled.ties,
@@ -174,14 +174,13 @@ def second_pass(
     *,
     basemap: MapWindow | None,
     origin: Array,
-    lean: tuple[float, float],
 ) -> VehicleState:
-    """One vehicle again: common level and lean, links into held neighbours, fresh ties; then denser ground."""
+    """One vehicle again: common level, links into held neighbours, fresh ties; then denser ground."""
     state, others, correction = item
     state = deepcopy(state)  # neighbours see this vehicle as its solo pass left it, in whatever order they are run
     watch = Stopwatch()
     flight = state.flight
-    state.surface = replace(state.surface, lean=lean, level_m=state.surface.level_m + correction)
+    state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
     held = held_cameras(state, others)
     if held is not None:
         link_to_held(flight, held, working_gsd(flight))

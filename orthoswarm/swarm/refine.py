@@ -1,6 +1,7 @@
 """The default refiner: one vehicle is the unit, a batch is a loop over it (DESIGN.md section 4, RECIPE.md).
 
-Solo pass of each vehicle -> lean voted over all of them -> second pass with neighbours held -> one terrain.
+Solo pass of each vehicle -> second pass on a common level with neighbours held -> one terrain.
+The map's lean is voted over the roofs of all vehicles for the report; ties are ground, which does not lean.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -75,13 +76,13 @@ class SwarmRefiner:
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
-        lean = pooled_lean(everyone)
         done = []
         for state, correction in zip(own, network.correction_m, strict=False):
             item = (state, neighbours_of(state, everyone), float(correction) - anchor)
-            done.append(second_pass(item, basemap=basemap, origin=self.origin, lean=lean))
+            done.append(second_pass(item, basemap=basemap, origin=self.origin))
         terrain = _shifted(common_terrain([*done, *others]), self.origin)
-        return merge_units([to_solution(s, self.origin, terrain) for s in done])[0]
+        lean = pooled_lean(everyone)
+        return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
 
 
 def states_of(solution: Solution) -> list[VehicleState]:
@@ -115,7 +116,8 @@ def refine_all(
     states = _second_passes(states, basemap, origin, run, progress)
     _level(states)
     terrain = _shifted(common_terrain(states), origin)
-    fine = [to_solution(s, origin, terrain) for s in states]
+    lean = pooled_lean(states)
+    fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
     return Refined(merge_units(coarse), merge_units(fine), terrain)
 
 
@@ -153,10 +155,9 @@ def _second_passes(
     run: Run,
     progress: Callable[[str, int, int], None] | None,
 ) -> list[VehicleState]:
-    """All vehicles again, on a common level and lean, each with its neighbours held as the solo pass left them."""
+    """All vehicles again, on a common level, each with its neighbours held as the solo pass left them."""
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
-    lean = pooled_lean(states)
-    task = partial(second_pass, basemap=basemap, origin=origin, lean=lean)
+    task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]
     items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
     out = list(states)

@@ -1,4 +1,4 @@
-"""Settling one vehicle on the map: ties, lean, links, and the absolute adjustment (RECIPE.md steps 5 to 8)."""
+"""Settling one vehicle on the map: ties, roofs, links, and the absolute adjustment (RECIPE.md steps 5 to 8)."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.onmap import shift_cameras
 from orthoswarm.swarm.rig import Tracks
 from orthoswarm.swarm.sights import one_per_cell
-from orthoswarm.swarm.ties import MapMatches, link_legs, match_points, vote_lean
+from orthoswarm.swarm.ties import MapMatches, link_legs, match_points
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class Settled:
     """What settling found, besides the cameras in the flight's adjustment.
 
     Attributes:
-        surface: the ground, with the map's lean. ties: the last round's. matches: the matches they come from.
+        surface: the ground. ties: the last round's. matches: the matches they come from.
         roofs: matches of raised points and their heights, for a vote over several vehicles.
         ground_shift: (2,) what ground points were off by when the roofs were matched.
         links: observations added between legs.
@@ -88,7 +88,7 @@ def mode_shift(shift: Array) -> Array:
 def as_ties(matches: MapMatches, points: Array) -> Ties:
     """Ties for the adjustment: where the map shows the ground that each point's surroundings lie on.
 
-    What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map by its lean.
+    What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map.
     """
     return Ties(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
 
@@ -147,16 +147,13 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
     flight.adjustment = new
 
 
-def settle(
-    flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel, lean: tuple[float, float] | None
-) -> Settled:
+def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel) -> Settled:
     """Two rounds of ties and links; the flight must lie within some metres of the map already.
 
     Args:
         flight: after the coarse registration.
         basemap: the map. origin: (2,) of the local frame.
         surface: ground after the relative adjustment.
-        lean: the map's lean where it is known from other vehicles, None to vote.
     """
     ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
     matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
@@ -169,8 +166,6 @@ def settle(
             surface = refit(flight, surface)
     roofs = roof_round(flight, surface, ground)
     ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
-    voted = vote_lean(roofs[0], roofs[1], ground_shift) if lean is None else lean
-    surface = replace(surface, lean=voted or (0.0, 0.0))
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
     surface, ties, matches = _second_round(flight, ground, surface, 3)
@@ -180,7 +175,7 @@ def settle(
 def resettle(
     flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel, ties: Ties
 ) -> tuple[GroundModel, Ties, MapMatches]:
-    """Fresh ties and four iterations, for a flight that lies on the map already (level or lean may have moved)."""
+    """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved)."""
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
     return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)

@@ -78,7 +78,7 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True, schedule: Sequen
 def plane(adjustment: Adjustment) -> Ground:
     """Belief that all points lie near height 0."""
     zero = np.zeros(len(adjustment.points))
-    return Ground(zero, _PLANE_SIGMA_M, 20.0, zero, c=1e3)
+    return Ground(zero, _PLANE_SIGMA_M, 20.0, c=1e3)
 
 
 def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_SIGMA_M) -> Ground:
@@ -89,7 +89,7 @@ def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_
     z = adjustment.points[:, 2]
     middle = float(np.median(z)) if len(z) else 0.0
     soft = sigma_m * float(np.sqrt(max(len(z), 1)))
-    return Ground(z - middle + level_m, 1e6, soft, np.full(len(z), level_m))
+    return Ground(z - middle + level_m, 1e6, soft)
 
 
 def _priors(start: SparseStart) -> Priors:

@@ -68,7 +68,14 @@ class Stopwatch:
         self._last = now
 
 
-def to_solution(state: VehicleState, origin: Array, terrain: Terrain | None, *, coarse: bool = False) -> Solution:
+def to_solution(
+    state: VehicleState,
+    origin: Array,
+    terrain: Terrain | None,
+    *,
+    coarse: bool = False,
+    map_lean: tuple[float, float] = (0.0, 0.0),
+) -> Solution:
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
     rig = state.coarse if coarse else flight.adjustment.rig
@@ -92,7 +99,7 @@ def to_solution(state: VehicleState, origin: Array, terrain: Terrain | None, *, 
         state.fov_sigma_deg,
         terrain,
         0.0,
-        state.surface.lean,
+        map_lean,
         state,
         list(flight.warnings),
         dict(state.timings),
