@@ -1,4 +1,4 @@
-"""`orthoswarm twin make`: sets of photos, map and truth of a digital twin."""
+"""`orthoswarm twin make`: sets of photos, map and truth of a digital twin; `twin camera`: a camera that sees it."""
 
 import argparse
 from dataclasses import replace
@@ -8,14 +8,23 @@ from typing import Any
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
+    from gcs_plugin.commands import twin_camera
+
     parser.epilog = "example:\n  orthoswarm twin make tiny --out twin-tiny --seed 1 --noise paper"
-    actions = parser.add_subparsers(dest="action", required=True, metavar="make")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="make|camera")
     make = actions.add_parser(
         "make",
         help="make a set of photos, basemap and truth",
         epilog="example:\n  orthoswarm twin make debris --out debris-hard --seed 3 --noise hard --lens=-0.05,0.01",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    camera = actions.add_parser(
+        "camera",
+        help="follow a real autopilot with a camera that sees the city",
+        epilog=twin_camera.EXAMPLE,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    twin_camera.configure(camera)
     add = make.add_argument
     add("preset", metavar="PRESET", help="tiny (40 photos), debris, water, haze, clear (1,017 each), full (32,544)")
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the set; an interrupted run goes on there")
@@ -40,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--lat", type=float, metavar="DEG", help="where the city lies")
     add("--lon", type=float, metavar="DEG", help="where the city lies")
     add("--map-gsd", type=float, metavar="M", help="pixel of the basemap (default 0.4)")
+    add("--rays", type=int, metavar="N", help="rays along the side of a pixel (default 2; 1 for full: faster)")
     add("--quality", type=int, metavar="Q", help="JPEG quality (default 92)")
     plan = make.add_argument_group("flight")
     for flag, kind, text in (
@@ -80,7 +90,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the set."""
+    """Make the set, or follow a vehicle."""
+    if args.action == "camera":
+        from gcs_plugin.commands import twin_camera
+
+        return twin_camera.run(args)
     import json
     import sys
 
@@ -132,7 +146,7 @@ def _spec(args: argparse.Namespace) -> Any:
     given = {
         "disaster": args.disaster, "lens_k": _pair(args.lens, "--lens"), "relief_m": args.relief, "every": args.every,
         "lean": args.lean, "lean_deg": args.lean_deg, "lat_deg": args.lat, "lon_deg": args.lon,
-        "map_gsd_m": args.map_gsd, "quality": args.quality,
+        "map_gsd_m": args.map_gsd, "quality": args.quality, "rays": args.rays,
     }  # fmt: skip
     if args.ground is not None:
         if args.surface is None:

@@ -129,7 +129,7 @@ def _render_all(
     import cv2
 
     cv2.setNumThreads(1)
-    rays = {shot.vehicle: lens_rays(shot.flight.lens) for shot in {s.vehicle: s for s in shots}.values()}
+    rays = {shot.vehicle: lens_rays(shot.flight.lens, spec.rays) for shot in {s.vehicle: s for s in shots}.values()}
     sensor = Sensor(spec.plan.width, spec.plan.height, spec.seed)
     tell("photos", 0, len(shots))
 

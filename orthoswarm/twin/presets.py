@@ -35,6 +35,7 @@ class TwinSpec:
         map_gsd_m: pixel of the basemap. reference_gsd_m: of the reference.
         lat_deg: where the procedural city lies; lon_deg.
         quality: of the JPEGs.
+        rays: rays along the side of a pixel; 2 smooth edges, 1 is four times faster.
         every: render only every n-th picture of each vehicle (records and truth stay those of the full flight).
         ground: orthoimage and surface model of a real place instead of the city, None for the city.
         margin_m: ground beyond the outermost legs.
@@ -57,6 +58,7 @@ class TwinSpec:
     lat_deg: float = 30.57
     lon_deg: float = 103.2
     quality: int = 92
+    rays: int = 2
     every: int = 1
     ground: tuple[str, str, str] | None = None
     margin_m: float = 290.0
@@ -78,7 +80,7 @@ PRESETS: dict[str, TwinSpec] = {
     "clear": TwinSpec(preset="clear", disaster="none"),
     # 96 x 339 pictures over 6.35 square kilometres, as in the paper's scaling experiment
     "full": TwinSpec(
-        preset="full", disaster="all",
+        preset="full", disaster="all", rays=1,
         plan=FlightPlan(columns=12, rows=8, photos=339, legs=4, spacing_m=4.5, leg_spacing_m=48.0, speed_m_s=9.0),
     ),
 }  # fmt: skip

@@ -239,13 +239,15 @@ def _highest_below(tiles, rays, rotation, cx, cy, cz, r0, c0, r1, c1, top, floor
 @kernel
 def _shoot(  # type: ignore[no-untyped-def]
     rays, rotation, cx, cy, cz, t0, t1, t2, dsm, tiles, kind, wall, facade, sun, ambient, haze, noise, motion,
-    ca, sa, top, floor, pixel, out,
+    ca, sa, top, floor, pixel, side_rays, out,
 ):  # fmt: skip
-    """Colours of all rays of one picture: rays float32 (R, C, 2) normalised; averages 2x2 into out (R/2, C/2, 3).
+    """Colours of all rays of one picture: rays float32 (n R, n C, 2) normalised; averages n x n into out (R, C, 3).
 
     One long body on purpose: a call for each ray with all these arrays costs as much as the ray itself.
     """
     rows, cols = out.shape[:2]
+    n = side_rays
+    share = 1.0 / (n * n)
     rgb = np.empty(3)
     ax, ay = cx / CELL_M, cy / CELL_M
     for block in range(((rows + BLOCK - 1) // BLOCK) * ((cols + BLOCK - 1) // BLOCK)):
@@ -253,12 +255,12 @@ def _shoot(  # type: ignore[no-untyped-def]
         first_r, first_c = block // wide * BLOCK, block % wide * BLOCK
         last_r, last_c = min(first_r + BLOCK, rows), min(first_c + BLOCK, cols)
         near_top = _highest_below(
-            tiles, rays, rotation, cx, cy, cz, 2 * first_r, 2 * first_c, 2 * last_r - 1, 2 * last_c - 1, top, floor
+            tiles, rays, rotation, cx, cy, cz, n * first_r, n * first_c, n * last_r - 1, n * last_c - 1, top, floor
         )
-        for ray in range((last_r - first_r) * (last_c - first_c) * 4):
-            k, at = ray & 3, ray >> 2
+        for ray in range((last_r - first_r) * (last_c - first_c) * n * n):
+            k, at = ray % (n * n), ray // (n * n)
             r, c = first_r + at // (last_c - first_c), first_c + at % (last_c - first_c)
-            x, y = rays[2 * r + (k >> 1), 2 * c + (k & 1), 0], rays[2 * r + (k >> 1), 2 * c + (k & 1), 1]
+            x, y = rays[n * r + k // n, n * c + k % n, 0], rays[n * r + k // n, n * c + k % n, 1]
             dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
             dy = -(rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2])
             down = -(rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2])
@@ -296,18 +298,18 @@ def _shoot(  # type: ignore[no-untyped-def]
                 if hr >= 0 and haze.shape[0] > 0:
                     _veil(haze, noise, cx + bx * (cz - HAZE_HEIGHT_M), cy + by * (cz - HAZE_HEIGHT_M), motion, rgb)
             if k == 0:
-                out[r, c, 0], out[r, c, 1], out[r, c, 2] = 0.25 * rgb[0], 0.25 * rgb[1], 0.25 * rgb[2]
+                out[r, c, 0], out[r, c, 1], out[r, c, 2] = share * rgb[0], share * rgb[1], share * rgb[2]
             else:
-                out[r, c, 0] += 0.25 * rgb[0]
-                out[r, c, 1] += 0.25 * rgb[1]
-                out[r, c, 2] += 0.25 * rgb[2]
+                out[r, c, 0] += share * rgb[0]
+                out[r, c, 1] += share * rgb[1]
+                out[r, c, 2] += share * rgb[2]
 
 
-def lens_rays(lens: Lens) -> Floats:
-    """Normalised undistorted coordinates of four sub-pixels a pixel, float32 (2 rows, 2 columns, 2)."""
+def lens_rays(lens: Lens, side: int = 2) -> Floats:
+    """Normalised undistorted coordinates of side x side rays a pixel, float32 (side rows, side columns, 2)."""
     u, v = lens.principal_point
-    cols = (np.arange(2 * lens.width) - 0.5) / 2.0 - u
-    rows = (np.arange(2 * lens.height) - 0.5) / 2.0 - v
+    cols = (np.arange(side * lens.width) - 0.5 * (side - 1)) / side - u
+    rows = (np.arange(side * lens.height) - 0.5 * (side - 1)) / side - v
     xy = np.stack(np.meshgrid(cols, rows), -1) / lens.focal_px
     return np.ascontiguousarray(lens.undistort(xy) if not lens.is_pinhole else xy, np.float32)
 
@@ -323,12 +325,13 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
     """
     s = stage.scene
     out = np.empty((camera.lens.height, camera.lens.width, 3), np.float32)
+    side = rays.shape[0] // camera.lens.height
     x, y = camera.position[0] - s.grid.west, s.grid.north - camera.position[1]
     _shoot(
         rays, camera.rotation, float(x), float(y), float(camera.position[2]), *stage.levels, s.dsm, stage.tiles, s.kind,
         s.wall, s.facade, np.asarray(stage.sun), stage.ambient, stage.haze, stage.noise, motion,
         *s.wall_axis, min(float(stage.tiles.max()), float(camera.position[2])), float(s.dsm.min()),
-        0.5 / camera.lens.focal_px, out,
+        1.0 / (side * camera.lens.focal_px), side, out,
     )  # fmt: skip
     return out
 
