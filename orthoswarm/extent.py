@@ -1,6 +1,7 @@
 """Where pictures and their ground lie: bounds, the drawn part of a canvas, the ground's level, cover by a map."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from orthoswarm.mosaic.footprint import footprint_boxes
 from orthoswarm.placement import MapWindow, PlacedFrame, Terrain
 
 Bounds = tuple[float, float, float, float]
+
+RAISED_M = 2.0
+"""Corners lie no higher than this over the ground around them (rubble, bushes, cars)."""
 
 
 def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:
@@ -32,6 +36,25 @@ def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> floa
     if terrain is None or not placed:
         return 0.0
     return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+
+
+def from_takeoff(placed: Sequence[PlacedFrame], level: float) -> tuple[Sequence[PlacedFrame], float]:
+    """Cameras and ground raised together until the ground lies on the takeoff level, where nothing else is known.
+
+    The refiner holds the level of CORNERS, which sit on raised things, at the takeoff level, so that the ground comes
+    out some decimetres below it and every camera with it. No homography changes by this, only what it is stated on.
+
+    Args:
+        placed: placed frames.
+        level: ground level below them, metres.
+
+    Returns:
+        The frames, and their ground level: 0, or as it was where it is farther off than things on the ground are high.
+    """
+    if not 0.0 < abs(level) <= RAISED_M:
+        return placed, level
+    up = np.array([0.0, 0.0, -level])
+    return [replace(p, camera=replace(p.camera, position=p.camera.position + up)) for p in placed], 0.0
 
 
 def drawn_window(canvas: Canvas) -> tuple[int, int, int, int]:

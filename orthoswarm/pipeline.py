@@ -21,7 +21,7 @@ from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.partial import disk_error, written_whole
-from orthoswarm.extent import drawn_window, ground_level, partial_cover, placed_bounds
+from orthoswarm.extent import drawn_window, from_takeoff, ground_level, partial_cover, placed_bounds
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
@@ -352,10 +352,10 @@ class _Batch:
             if name not in self.made(refinement):
                 (self.out / name).unlink(missing_ok=True)
         with self.clock.stage("final: report", len(placed)) as stage:
-            z = ground_level(placed, state.terrain)
-            write_frames(self.out, placed, list(state.rejected.values()), state.grid, z)
+            stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
+            write_frames(self.out, stated, list(state.rejected.values()), state.grid, z)
             report = self.report(state, placed, refinement.fine if refinement else [], z)
-            write_page(self.out, report, placed, list(state.rejected.values()), state.basemap)
+            write_page(self.out, report, stated, list(state.rejected.values()), state.basemap)
         wall, cpu, memory = self.clock.totals()
         report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
         report["stages"].append(stage_row(stage))

@@ -61,7 +61,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
         raise InputError("there is no map yet; wait for pictures")
     solutions = [load_solution(path) for path in task.solutions]
     placed, rejected = _placements(task, solutions)
-    level = _level(placed, solutions)
+    placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
     report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
@@ -158,11 +158,13 @@ def _writable(frame: Frame) -> Frame:
     return replace(frame, image=image, vehicle=vehicle)
 
 
-def _level(placed: list[PlacedFrame], solutions: list[Solution]) -> float:
-    from orthoswarm.extent import ground_level
+def _stated(placed: list[PlacedFrame], solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
+    """The frames and the level of the ground below them as they are written."""
+    from orthoswarm.extent import from_takeoff, ground_level
 
     terrain = next((s.terrain for s in solutions if s.terrain is not None), None)
-    return ground_level(placed, terrain)
+    frames, level = from_takeoff(placed, ground_level(placed, terrain))
+    return list(frames), level
 
 
 def _report(
