@@ -43,22 +43,30 @@ def resample(
 
 @kernel
 def _area_means(data, valid, left, top, sx, sy, out, share):  # type: ignore[no-untyped-def]
+    """Sum rows first, then columns: the inner loops run along the data, without branches."""
     bands, rows, cols = data.shape
-    sums = np.zeros(bands)
+    weight = np.empty(cols, np.float32)
+    sums = np.empty((bands, cols), np.float32)
     for r in range(out.shape[1]):
         y0, y1 = top + r * sy, top + (r + 1) * sy
+        weight[:] = 0.0
+        sums[:] = 0.0
+        for i in range(max(int(np.floor(y0)), 0), min(int(np.ceil(y1)), rows)):
+            high = np.float32(min(y1, i + 1.0) - max(y0, float(i)))
+            for j in range(cols):
+                weight[j] += high * np.float32(valid[i, j])
+            for b in range(bands):
+                for j in range(cols):
+                    sums[b, j] += high * np.float32(valid[i, j]) * np.float32(data[b, i, j])
         for c in range(out.shape[2]):
             x0, x1 = left + c * sx, left + (c + 1) * sx
-            sums[:] = 0.0
-            total = 0.0
-            for i in range(max(int(np.floor(y0)), 0), min(int(np.ceil(y1)), rows)):
-                high = min(y1, i + 1.0) - max(y0, float(i))
-                for j in range(max(int(np.floor(x0)), 0), min(int(np.ceil(x1)), cols)):
-                    if valid[i, j]:
-                        w = high * (min(x1, j + 1.0) - max(x0, float(j)))
-                        total += w
-                        for b in range(bands):
-                            sums[b] += w * data[b, i, j]
+            first, last = max(int(np.floor(x0)), 0), min(int(np.ceil(x1)), cols)
+            total = np.float32(0.0)
+            for j in range(first, last):
+                total += np.float32(min(x1, j + 1.0) - max(x0, float(j))) * weight[j]
             share[r, c] = total / (sx * sy)
             for b in range(bands):
-                out[b, r, c] = np.uint8(sums[b] / total + 0.5) if total > 1e-9 else np.uint8(0)
+                value = np.float32(0.0)
+                for j in range(first, last):
+                    value += np.float32(min(x1, j + 1.0) - max(x0, float(j))) * sums[b, j]
+                out[b, r, c] = np.uint8(value / total + np.float32(0.5)) if total > 1e-6 else np.uint8(0)
