@@ -4,8 +4,8 @@ import contextlib
 import queue
 import socket
 import threading
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _POSITION_M: Final = 0.8
 _JITTER_RAD: Final = float(np.radians(0.2))
 _CLOCK: Final = 90_000
+_MOST_WAITING: Final = 512
 _NEXT: Final = b"\0\0\0\1\x09\xf0"
 """The next picture's delimiter, sent behind each picture, so that a reader knows at once that the picture is whole."""
 
@@ -46,50 +47,61 @@ class TwinCamera:
         self._seed = setting.seed
 
     def take(self, exposure: "Exposure", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
-        """The picture, uint8 (480, 640, 3), and what is recorded about it."""
-        pose, errors, grid = exposure.pose, self._errors, self._site.grid
-        rng = np.random.default_rng([self._seed, 223, self._system, exposure.index, round(time_s)])
-        east, north = grid.to_grid(pose.lat_deg, pose.lon_deg)
-        turn = float(grid.convergence_rad(pose.lat_deg, pose.lon_deg))
+        """The picture, uint8 (480, 640, 3), and what is recorded about it; a gimbal holds the camera level."""
+        pose = exposure.pose
+        true = Sample(
+            time_s=time_s, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg, height_m=pose.height_m,
+            yaw_deg=float(np.degrees(pose.yaw_rad)), pitch_deg=-90.0, roll_deg=0.0,
+        )  # fmt: skip
+        return self.shoot(true, exposure.index, seen=(exposure.lat_deg, exposure.lon_deg))
+
+    def shoot(
+        self, true: Sample, index: int, *, seen: tuple[float, float] | None = None
+    ) -> tuple[NDArray[np.uint8], Sample]:
+        """The picture at a pose, uint8 (480, 640, 3), and what is recorded about it.
+
+        Args:
+            true: where the camera is (with position, height and angles), and when.
+            index: number of the picture; equal arguments give equal pictures.
+            seen: latitude and longitude as the receiver has them, before its own noise; the true ones unless said.
+        """
+        errors, grid = self._errors, self._site.grid
+        lat, lon, height, time_s = (float(v or 0.0) for v in (true.lat_deg, true.lon_deg, true.height_m, true.time_s))
+        yaw, pitch, roll = np.radians([true.yaw_deg or 0.0, true.pitch_deg or 0.0, true.roll_deg or 0.0])
+        rng = np.random.default_rng([self._seed, 223, self._system, index, round(time_s)])
+        east, north = grid.to_grid(lat, lon)
+        turn = float(grid.convergence_rad(lat, lon))
         wobble = rng.normal(0.0, _JITTER_RAD, 3)
-        # the gimbal holds the camera level but for its own fixed errors, of which the record knows nothing
-        yaw, pitch, roll = pose.yaw_rad + errors.yaw_rad, -np.pi / 2 + errors.pitch_rad, errors.roll_rad
-        rotation = rotation_from_angles(yaw - turn + wobble[0], pitch + wobble[1], roll + wobble[2])
-        camera = Camera(np.array([east, north, pose.height_m]), rotation, self._lens)
+        # the mount has fixed errors of its own, of which the record knows nothing
+        angles = np.array([yaw + errors.yaw_rad - turn, pitch + errors.pitch_rad, roll + errors.roll_rad]) + wobble
+        camera = Camera(np.array([east, north, height]), rotation_from_angles(*angles), self._lens)
         motion = rng.uniform(0.0, 1024.0, 8)
         image = self._sensor.expose(render(self._stage, camera, self._rays, motion), rng)
         off = rng.uniform(-_POSITION_M, _POSITION_M, 2)
-        seen = grid.to_grid(exposure.lat_deg, exposure.lon_deg) + off
-        lat, lon = (float(v) for v in grid.to_geographic(seen))
-        sample = Sample(
-            time_s=time_s, lat_deg=lat, lon_deg=lon, height_m=pose.height_m, yaw_deg=float(np.degrees(pose.yaw_rad)),
-            pitch_deg=-90.0, roll_deg=0.0, vehicle=f"v{self._system}",
-        )  # fmt: skip
-        return image, sample
+        lat, lon = (float(v) for v in grid.to_geographic(grid.to_grid(*(seen or (lat, lon))) + off))
+        return image, replace(true, lat_deg=lat, lon_deg=lon, vehicle=f"v{self._system}")
 
 
-class VideoServer:
-    """Serves one live stream over TCP on the loopback: every picture a key picture with its pose as SEI.
+class Sink(Protocol):
+    """Takes bytes, as a file does."""
 
-    Attributes:
-        url: where it is.
+    def write(self, data: bytes) -> int:
+        """Take bytes; gives how many."""
+
+
+class VideoStream:
+    """Encodes pictures to H.264 in MPEG-TS, every picture a key picture with its pose as SEI.
+
+    Args:
+        sink: takes the stream's bytes, whole transport packets of 188 bytes each time.
     """
 
-    def __init__(self) -> None:
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._bytes: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    def __init__(self, sink: "Sink") -> None:
+        self._sink = sink
         self._container: Any = None
         self._stream: Any = None
         self._form: Any = None
         self._first_s = 0.0
-        self._thread = threading.Thread(target=self._serve, name="video", daemon=True)
-        self._thread.start()
-
-    def write(self, data: bytes) -> int:
-        """Take bytes of the muxer (it writes to this object as to a file)."""
-        self._bytes.put(bytes(data))
-        return len(data)
 
     def send(self, image: NDArray[np.uint8], sample: Sample) -> None:
         """Encode and send a picture, uint8 (rows, columns, 3)."""
@@ -111,6 +123,12 @@ class VideoServer:
             marked.is_keyframe, marked.stream = packet.is_keyframe, self._stream
             self._container.mux(marked)
 
+    def close(self) -> None:
+        """End the stream."""
+        if self._container is not None:
+            with contextlib.suppress(OSError):
+                self._container.close()
+
     def _open(self, time_s: float) -> None:
         from fractions import Fraction
 
@@ -119,7 +137,7 @@ class VideoServer:
         self._first_s = time_s
         # A PES packet that states its length is whole for the reader at once, not when the next one begins.
         options = {"omit_video_pes_length": "0", "flush_packets": "1"}
-        self._container = av.open(self, "w", format="mpegts", options=options)
+        self._container = av.open(self._sink, "w", format="mpegts", options=options)
         stream = self._container.add_stream("libx264", rate=10)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.codec_context.time_base = Fraction(1, _CLOCK)
@@ -128,11 +146,42 @@ class VideoServer:
         stream.options = {"preset": "veryfast", "tune": "zerolatency", "crf": "17", "x264-params": x264}
         self._stream = stream
 
+
+class VideoServer(VideoStream):
+    """Serves one live stream over TCP.
+
+    Args:
+        host: address to serve on; port: 0 takes any free one.
+        live: True keeps the newest hundred pictures or so for a reader who comes late, however late; False keeps all
+            for half a minute.
+
+    Attributes:
+        url: where it is.
+
+    Raises:
+        OSError: the port is taken.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, *, live: bool = False) -> None:
+        super().__init__(self)
+        self._live = live
+        self._listener = socket.create_server((host, port))
+        self.url = f"tcp://{host}:{self._listener.getsockname()[1]}"
+        self._bytes: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._serve, name="video", daemon=True)
+        self._thread.start()
+
+    def write(self, data: bytes) -> int:
+        """Take bytes of the muxer (it writes to this object as to a file)."""
+        if self._live and self._bytes.qsize() >= _MOST_WAITING:
+            with contextlib.suppress(queue.Empty):
+                self._bytes.get_nowait()
+        self._bytes.put(bytes(data))
+        return len(data)
+
     def close(self) -> None:
         """End the stream."""
-        if self._container is not None:
-            with contextlib.suppress(OSError):
-                self._container.close()
+        super().close()
         self._bytes.put(None)
         self._thread.join(5.0)
         self._listener.close()
@@ -144,10 +193,14 @@ class VideoServer:
             if data is None:
                 break
             while connection is None or not _sent(connection, data):
+                connection = None
                 self._listener.settimeout(30.0)
                 try:
                     connection = self._newest()
-                except OSError:  # nobody watches any more
+                except TimeoutError:
+                    if not self._live:  # nobody watches any more
+                        return
+                except OSError:  # closed
                     return
         if connection is not None:
             connection.close()
@@ -178,6 +231,34 @@ def _sent(connection: socket.socket, data: bytes) -> bool:
     except OSError:
         return False
     return True
+
+
+class VideoSender(VideoStream):
+    """Sends one live stream by UDP, whether anybody listens or not.
+
+    Args:
+        host: to whom; port: where.
+    """
+
+    _DATAGRAM: Final = 7 * 188  # what fits an Ethernet frame
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(self)
+        self.url = f"udp://{host}:{port}"
+        self._to = (host, port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def write(self, data: bytes) -> int:
+        """Take bytes of the muxer."""
+        for at in range(0, len(data), self._DATAGRAM):
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data[at : at + self._DATAGRAM], self._to)
+        return len(data)
+
+    def close(self) -> None:
+        """End the stream."""
+        super().close()
+        self._socket.close()
 
 
 @dataclass(slots=True)

@@ -1,0 +1,84 @@
+"""A way through for a ground station: the autopilot's one link serves the camera and, behind it, the daemon.
+
+As a companion computer's router does: packets of the vehicles go on to the ground untouched, signatures included;
+packets of the ground go to the vehicle that they name, or to all.
+"""
+
+import threading
+from typing import TYPE_CHECKING, Final
+
+from gcs_plugin.hub import Hub, Side
+from gcs_plugin.links import Link, Peer
+from gcs_plugin.mission.exchange import Address
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet import Fleet
+    from gcs_plugin.packets import Packet
+
+_WAIT_S: Final = 0.5
+
+
+class Relay:
+    """Passes packets between a fleet's vehicles and a ground station.
+
+    Args:
+        fleet: whose vehicles; it must be polled elsewhere.
+        ground: the ground station's link, for example tcpin:127.0.0.1:5790.
+        own: the address that greets the ground station.
+
+    Attributes:
+        down: packets passed to the ground; up: packets passed to vehicles.
+    """
+
+    def __init__(self, fleet: "Fleet", ground: Link | str, own: Address) -> None:
+        self._fleet = fleet
+        self._hub = Hub([ground], own, self._from_ground)
+        self.down = self.up = 0
+        fleet.tap(self._from_vehicle)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="relay", daemon=True)
+
+    def start(self) -> None:
+        """Begin to pass on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; the fleet is closed by whoever opened it."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._hub.post(lambda: None)
+            self._thread.join(5.0)
+        self._hub.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._hub.poll(_WAIT_S)
+
+    # -- in the fleet's thread ------------------------------------------------------------------------------------
+
+    def _from_vehicle(self, packet: "Packet", utc: float) -> None:
+        del utc
+        if packet.system not in self._fleet.vehicles or self._stop.is_set():
+            return  # another ground station's words on the vehicle's link
+        raw = packet.raw
+
+        def send() -> None:
+            side = self._hub.sides[0]
+            for peer in {*side.link.greet(), *side.peers}:
+                side.link.send(peer, raw)
+            self.down += 1
+
+        self._hub.post(send)
+
+    def _to_vehicles(self, packet: "Packet") -> None:
+        wanted = int(getattr(packet.message, "target_system", 0))
+        for system, vehicle in self._fleet.vehicles.items():
+            if wanted in (0, system) and vehicle.route is not None:
+                vehicle.route.side.link.send(vehicle.route.peer, packet.raw)
+        self.up += 1
+
+    # -- in the relay's thread ------------------------------------------------------------------------------------
+
+    def _from_ground(self, side: Side, peer: Peer, packet: "Packet", now: float, utc: float) -> None:
+        del side, peer, now, utc
+        self._fleet.hub.post(lambda: self._to_vehicles(packet))
