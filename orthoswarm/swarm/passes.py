@@ -66,7 +66,7 @@ def solo(
         watch = Stopwatch()
         flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
         watch.lap("tracks")
-        state = _from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, watch)
+        state = from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, watch)
     return state
 
 
@@ -81,18 +81,18 @@ def followed(
     watch.lap("tracks")
     if flight is None:
         return None
-    surface = _relative(flight)
+    surface = relative(flight)
     if len(frames) < FEW and strong_lens(flight):
         return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
-    return _from_flight(flight, surface, origin, basemap, watch)
+    return from_flight(flight, surface, origin, basemap, watch)
 
 
 def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None) -> VehicleState:
     """Refine one vehicle whose photos were matched and adjusted together with those of others."""
-    return _from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, Stopwatch())
+    return from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, Stopwatch())
 
 
-def _from_flight(
+def from_flight(
     flight: Flight, surface: GroundModel, origin: Array, basemap: MapWindow | None, watch: Stopwatch
 ) -> VehicleState:
     """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
@@ -116,7 +116,7 @@ def _from_flight(
     return state
 
 
-def _relative(flight: Flight) -> GroundModel:
+def relative(flight: Flight) -> GroundModel:
     """The adjustment without a map, its ground fitted as soon as the points allow."""
     surface = GroundModel()
     schedule = [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]
@@ -144,6 +144,7 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
         flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
         return
     shift_cameras(flight, fit.correction)
+    state.map_shift = fit.correction
     settled = settle(flight, basemap, origin, state.surface)
     state.surface, state.ties, state.matches, state.roofs = (
         settled.surface,

@@ -30,6 +30,7 @@ class VehicleState:
         surface: its ground. ties, matches: of the last round (empty without a map).
         roofs: raised points on the map and their heights;
             ground_shift: float64 (2,) what ground points were off by then.
+        map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,).
         on_map: True if it lies on the map; had_map: if there was one.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
@@ -52,6 +53,7 @@ class VehicleState:
     timings: dict[str, float] = field(default_factory=dict)
     ground_shift: Array = field(default_factory=lambda: np.zeros(2))
     had_map: bool = False
+    map_shift: Array = field(default_factory=lambda: np.zeros(2))
 
 
 class Stopwatch:
