@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.parabola import vertex
+
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -130,14 +132,9 @@ def _peak(score: Array, s: FieldSettings) -> tuple[float, float, float] | None:
     rest[max(0, r - reach) : r + reach + 1, max(0, c - reach) : c + reach + 1] = -1.0
     if rest.max() > s.max_second * top:
         return None
-    dr = _vertex(float(score[r - 1, c]), top, float(score[r + 1, c]))
-    dc = _vertex(float(score[r, c - 1]), top, float(score[r, c + 1]))
+    dr = vertex(float(score[r - 1, c]), top, float(score[r + 1, c]))
+    dc = vertex(float(score[r, c - 1]), top, float(score[r, c + 1]))
     return float(r) + dr, float(c) + dc, top
-
-
-def _vertex(before: float, at: float, after: float) -> float:
-    bend = before - 2.0 * at + after
-    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < -1e-12 else 0.0
 
 
 def block_centers(shape: tuple[int, int], s: FieldSettings) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_deg
 from orthoswarm.camera import Camera, Lens, angles_from_rotation
 
 Array = NDArray[np.float64]
@@ -140,7 +141,7 @@ def pose_errors(
         position[i] = camera.position - true.position
         position[i, 2] += true_ground_z_m - ground_z_m
         turn = np.array(angles_from_rotation(camera.rotation)) - np.array(angles_from_rotation(true.rotation))
-        angle[i] = (np.degrees(turn) + 180.0) % 360.0 - 180.0
+        angle[i] = wrap_deg(np.degrees(turn))
     return PoseErrors(
         [p.image for p in placed], [p.vehicle for p in placed], position, angle, fov, center, nadir, sigma
     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 
+from orthoswarm.angles import wrap_deg
 from orthoswarm.errors import InputError
 
 Array = NDArray[np.float64]
@@ -38,8 +39,8 @@ def area_epsg(lat_deg: ArrayLike, lon_deg: ArrayLike) -> int:
     if lat.size == 0:
         raise InputError("no position was given, so no UTM zone can be chosen")
     mean = np.angle(np.exp(1j * np.radians(lon)).sum(), deg=True)
-    offset = (lon - mean + 180.0) % 360.0 - 180.0
-    median = (mean + float(np.median(offset)) + 180.0) % 360.0 - 180.0
+    offset = wrap_deg(lon - mean)
+    median = wrap_deg(float(mean) + float(np.median(offset)))
     return utm_epsg(float(np.median(lat)), float(median))
 
 
@@ -77,7 +78,7 @@ class LocalGrid:
         """Meridian convergence in radians: grid azimuth = true azimuth - convergence."""
         lat = np.radians(np.asarray(lat_deg, float))
         central = (self.epsg % 100) * 6.0 - 183.0
-        dlon = (np.asarray(lon_deg, float) - central + 180.0) % 360.0 - 180.0
+        dlon = wrap_deg(np.asarray(lon_deg, float) - central)
         return np.asarray(np.arctan(np.tan(np.radians(dlon)) * np.sin(lat)), dtype=np.float64)
 
 

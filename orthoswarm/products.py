@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_deg
 from orthoswarm.camera import Camera, Lens, angles_from_rotation
 from orthoswarm.export.footprints import write_footprints
 from orthoswarm.export.partial import written_whole
@@ -46,7 +47,7 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
     }
     if not simple.is_pinhole or lens.cx or lens.cy:
         row |= {"k1": simple.k1, "k2": simple.k2}
-    if lens.cx or lens.cy or lens.k3:
+    if max(abs(lens.cx), abs(lens.cy)) > 1e-6 or abs(lens.k3) > 1e-9:  # held at zero they come back as 1e-19
         row |= {"cx": lens.cx, "cy": lens.cy, "k3": lens.k3}
     row["fov_deg"] = math.degrees(lens.fov_rad)
     row["sigma_m"] = placed.sigma_m
@@ -64,7 +65,7 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
         "lat_deg": lat,
         "lon_deg": lon,
         "height_m": float(camera.position[2]),
-        "yaw_deg": (true + 180.0) % 360.0 - 180.0,
+        "yaw_deg": wrap_deg(true),
         "pitch_deg": math.degrees(float(pitch)),
         "roll_deg": math.degrees(float(roll)),
     }

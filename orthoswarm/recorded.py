@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import LocalGrid, area_epsg
@@ -146,14 +147,10 @@ def course(ground: Array) -> Array:
     after = np.searchsorted(moved, np.arange(n))  # the first step that begins here or later
     into, out = azimuth[np.maximum(after - 1, 0)], azimuth[np.minimum(after, len(moved) - 1)]
     before = azimuth[np.maximum(after - 2, 0)]
-    corner = np.abs(_wrap(out - into)) > _TURN_RAD
-    straight_in = np.abs(_wrap(into - before)) < _TURN_RAD
-    middle = into + 0.5 * _wrap(out - into)
+    corner = np.abs(wrap_rad(out - into)) > _TURN_RAD
+    straight_in = np.abs(wrap_rad(into - before)) < _TURN_RAD
+    middle = into + 0.5 * wrap_rad(out - into)
     return np.asarray(np.where(corner, np.where(straight_in, into, out), middle))
-
-
-def _wrap(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _sigma(frame: Frame, camera: Camera) -> float:

@@ -11,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.course import Straight, wrap_deg
+from orthoswarm.angles import wrap_deg
+from telemetry.course import Straight
 from telemetry.findings import Finding, plural
 from telemetry.photos import Angles, PhotoTags
 
@@ -169,9 +170,9 @@ def check_legs(yaw_deg: Array, legs: Sequence[Straight], vehicle: str) -> list[F
     means = [_circular_mean_deg(yaw_deg[leg.first : leg.last + 1]) for leg in legs]
     turned = stayed = 0
     for (a, yaw_a), (b, yaw_b) in pairwise(zip(legs, means, strict=True)):
-        if abs(float(wrap_deg(np.asarray(b.course_deg - a.course_deg)))) < 150.0:
+        if abs(wrap_deg(b.course_deg - a.course_deg)) < 150.0:
             continue
-        change = abs(float(wrap_deg(np.asarray(yaw_b - yaw_a))))
+        change = abs(wrap_deg(float(yaw_b - yaw_a)))
         turned += change > 140.0
         stayed += change < 40.0
     if turned and stayed:

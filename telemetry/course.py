@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_deg, wrap_rad
+
 Array = NDArray[np.float64]
 
 EARTH_RADIUS_M = 6_371_008.8
@@ -17,13 +19,8 @@ def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Ar
     lon = np.radians(np.asarray(lon_deg, float))
     if lat.size == 0:
         return np.zeros((0, 2))
-    dlon = (lon - lon[0] + np.pi) % (2 * np.pi) - np.pi
+    dlon = wrap_rad(lon - lon[0])
     return EARTH_RADIUS_M * np.stack([dlon * np.cos(np.median(lat)), lat - lat[0]], axis=-1)
-
-
-def wrap_deg(angle: Array) -> Array:
-    """Angles brought to [-180, 180) degrees."""
-    return np.asarray((np.asarray(angle, float) + 180.0) % 360.0 - 180.0)
 
 
 def courses_deg(east_north: Array, *, least_step_m: float = 1.0, bend_deg: float = 40.0) -> Array:
@@ -76,7 +73,7 @@ def straight_legs(
         run = east_north[i] - east_north[first]
         if np.hypot(*run) < 0.2 * usual:
             continue
-        bend = wrap_deg(np.asarray(np.degrees(np.arctan2(step[i, 0], step[i, 1]) - np.arctan2(run[0], run[1]))))
+        bend = wrap_deg(float(np.degrees(np.arctan2(step[i, 0], step[i, 1]) - np.arctan2(run[0], run[1]))))
         if abs(float(bend)) > bend_deg:
             _close(legs, east_north, first, i, least_frames, least_length_m)
             first = i if i - first < least_frames - 1 else i + 1

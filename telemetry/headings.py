@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_deg
 from orthoswarm.frame import Frame
 from orthoswarm.picture import PictureError, read_gray
 from telemetry.checks import track_of
-from telemetry.course import Straight, straight_legs, wrap_deg
+from telemetry.course import Straight, straight_legs
 from telemetry.findings import Finding, plural
 
 Array = NDArray[np.float64]
@@ -85,7 +86,7 @@ def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
     # In the second picture the first one's centre lies where the camera came from; up is against the rows.
     to_the_right_of_up = np.degrees(np.arctan2(-shift[0], shift[1]))
     course = np.degrees(np.arctan2(moved[0], moved[1]))
-    return float(wrap_deg(np.asarray(course - to_the_right_of_up))), count
+    return wrap_deg(float(course - to_the_right_of_up)), count
 
 
 def _features(path: Path) -> tuple[Array, NDArray[np.float32], float] | None:

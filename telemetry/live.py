@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from orthoswarm.angles import wrap_deg
 from telemetry.mavposes import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.sample import Sample
 
@@ -74,8 +75,8 @@ def _between(name: str, a: float | None, b: float | None, share: float) -> float
         return a if share < 0.5 else b
     step = b - a
     if name in _TURNS:
-        step = (step + 180.0) % 360.0 - 180.0
-        return (a + share * step + 180.0) % 360.0 - 180.0
+        step = wrap_deg(step)
+        return wrap_deg(a + share * step)
     return a + share * step
 
 

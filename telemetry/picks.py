@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.angles import wrap_deg
 from telemetry.course import EARTH_RADIUS_M
 from telemetry.sample import Sample
 
@@ -99,7 +100,7 @@ def _distance_m(a: Sample | None, b: Sample | None) -> float | None:
     if a is None or b is None or a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
         return None
     north = np.radians(a.lat_deg - b.lat_deg)
-    east = np.radians((a.lon_deg - b.lon_deg + 180.0) % 360.0 - 180.0) * np.cos(np.radians(a.lat_deg))
+    east = np.radians(wrap_deg(a.lon_deg - b.lon_deg)) * np.cos(np.radians(a.lat_deg))
     return float(EARTH_RADIUS_M * np.hypot(north, east))
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthoswarm.angles import wrap_deg
 from telemetry.sample import Sample
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ class Timeline:
         held = (bridged & (t >= moments[0]) & (t <= moments[-1])) | (moments[right] == t)
         result = np.where(held, result, np.nan)
         if name in _WRAPPED:
-            result = (result + 180.0) % 360.0 - 180.0
+            result = wrap_deg(result)
         return np.asarray(result)
 
     def at(self, time_s: float) -> Sample:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import fov_rad
 from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.picture import PictureError, read_gray
 from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.findings import runs
-from orthoswarm.swarm.heading import wrap
 from orthoswarm.swarm.matching import serial
 from orthoswarm.swarm.rig import HEIGHT, WIDTH, F
 from orthoswarm.swarm.sparse import SparseStart, assemble, read_records, sparse_start
@@ -183,7 +183,7 @@ def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
     adjustment = solve_sparse(one)
     step = np.diff(adjustment.rig.position[:, 1])
     assert np.median(step) == pytest.approx(20.0, abs=1.5)
-    assert np.abs(wrap(one.plane.yaw)).max() < np.radians(5.0)
+    assert np.abs(wrap_rad(one.plane.yaw)).max() < np.radians(5.0)
 
 
 def test_vehicles_come_apart_as_they_were_found_together():
@@ -269,7 +269,7 @@ def test_brighton_flips_are_found_and_the_flight_is_ready_for_the_later_steps(re
     assert flight.sparse
     assert flight.leg.tolist() == [0] * 6 + [1] * 6 + [2] * 6
     up = -adjustment.rig.rotation[:, :2, 1]
-    assert np.abs(wrap(np.arctan2(up[:, 0], up[:, 1]) - np.radians(45.0))).max() < np.radians(12.0)
+    assert np.abs(wrap_rad(np.arctan2(up[:, 0], up[:, 1]) - np.radians(45.0))).max() < np.radians(12.0)
     assert adjustment.rig.lens[0, WIDTH] == flight.pictures.size[0]
     assert np.nanmedian(np.hypot(*adjustment.residuals().T)) < 0.5
 

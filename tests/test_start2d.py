@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import fov_rad, rotation_from_angles
-from orthoswarm.swarm.heading import circular_mode, wrap
+from orthoswarm.swarm.heading import circular_mode
 from orthoswarm.swarm.plane import level_from_nadir, rotation_of
 from orthoswarm.swarm.segments import photo_legs, split_segments
 from orthoswarm.swarm.sparse import read_records
@@ -29,7 +30,7 @@ def begin(world: World, frames=None) -> Start2D:
 def yaw_error_deg(start: Start2D, world: World) -> float:
     axis_up = -world.rig.rotation[:, :, 1]
     true = np.arctan2(axis_up[:, 0], axis_up[:, 1])
-    return float(np.degrees(np.median(np.abs(wrap(start.yaw - true)))))
+    return float(np.degrees(np.median(np.abs(wrap_rad(start.yaw - true)))))
 
 
 def tilt_deg(start: Start2D) -> float:
@@ -159,8 +160,8 @@ def test_level_and_yaw_compose_to_the_recorded_attitude(yaw, pitch, roll):
 @settings(max_examples=30)
 def test_circular_mode_finds_the_majority_across_the_wrap(angle, seed):
     rng = np.random.default_rng(seed)
-    angles = wrap(np.concatenate([angle + rng.normal(0, 0.02, 20), rng.uniform(-np.pi, np.pi, 9)]))
-    assert abs(wrap(np.array(circular_mode(angles, np.ones(29)) - angle))) < 0.1
+    angles = wrap_rad(np.concatenate([angle + rng.normal(0, 0.02, 20), rng.uniform(-np.pi, np.pi, 9)]))
+    assert abs(wrap_rad(circular_mode(angles, np.ones(29)) - angle)) < 0.1
 
 
 def test_segments_end_at_pauses_climbs_and_gimbal_turns_but_not_at_one_wrong_tag():

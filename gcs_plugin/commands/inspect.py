@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthoswarm.angles import wrap_deg
+
 if TYPE_CHECKING:
     from telemetry.ingest import Survey
 
@@ -155,7 +157,7 @@ def _areas(tracks: dict[str, list[Row]], apart_deg: float = 0.2) -> list[dict[st
     for vehicle, rows in tracks.items():
         for area in areas:
             lat, lon, _ = next(iter(area.values()))[0]
-            if abs(rows[0][0] - lat) < apart_deg and abs((rows[0][1] - lon + 180) % 360 - 180) < apart_deg:
+            if abs(rows[0][0] - lat) < apart_deg and abs(wrap_deg(rows[0][1] - lon)) < apart_deg:
                 area[vehicle] = rows
                 break
         else:

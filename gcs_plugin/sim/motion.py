@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
+from orthoswarm.angles import wrap_rad
+
 _GRAVITY: Final = 9.80665
 _SEMI_MAJOR_M: Final = 6378137.0
 _ECCENTRICITY2: Final = 6.69437999014e-3
@@ -181,7 +183,7 @@ class Motion:
         before, after = track[index - 1], track[index]
         share = (time_s - before[0]) / (after[0] - before[0])
         values = [a + share * (b - a) for a, b in zip(before[1:], after[1:])]
-        values[3] = before[4] + share * _turn(after[4] - before[4])
+        values[3] = before[4] + share * wrap_rad(after[4] - before[4])
         return self._pose(time_s, tuple(values))
 
     def _pose(self, time_s: float, values: tuple[float, ...]) -> Pose:
@@ -224,8 +226,8 @@ class Motion:
         self.east += dt * self.ve
         self.up += dt * self.vu
         if distance > 3.0:
-            turn = _turn(math.atan2(de, dn) - self.yaw)
-            self.yaw = _turn(self.yaw + max(-frame.yaw_rate * dt, min(frame.yaw_rate * dt, turn)))
+            turn = wrap_rad(math.atan2(de, dn) - self.yaw)
+            self.yaw = wrap_rad(self.yaw + max(-frame.yaw_rate * dt, min(frame.yaw_rate * dt, turn)))
         self._lean()
 
     def _carrot(self, target: tuple[float, float, float], north: float, east: float) -> tuple[float, float]:
@@ -244,8 +246,3 @@ class Motion:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         self.pitch = -math.atan2(north * cos + east * sin, _GRAVITY)
         self.roll = math.atan2(east * cos - north * sin, _GRAVITY)
-
-
-def _turn(angle: float) -> float:
-    """An angle within half a turn."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi

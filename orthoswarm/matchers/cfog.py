@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.matchers.base import Array, Floats, Mask, Matches
+from orthoswarm.parabola import vertex
 
 DIRECTIONS = 6
 TILE_PX = 64
@@ -74,12 +75,6 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
     dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
     return Peak(c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, peak, ratio)
-
-
-def vertex(left: float, middle: float, right: float) -> float:
-    """Where a parabola through three neighbours has its top, -0.5 to 0.5 from the middle one."""
-    bend = left - 2.0 * middle + right
-    return 0.0 if bend >= -1e-12 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
 
 
 def match_tiles(

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.matchers import weights
-from orthoswarm.matchers.base import Array, Floats, Gray, Mask, Matches
+from orthoswarm.matchers.base import Floats, Gray, Mask, Matches
 from orthoswarm.matchers.learned import device, extractor, padded_tensor
+from orthoswarm.parabola import vertices
 
 CELL_PX = 8
 _STRIDE = 32
@@ -92,8 +93,8 @@ class XFeatWindow:
             return Matches.none()
         r, c = at_r[rr, cc], at_c[rr, cc]
         middle = score[r, c, rr, cc]
-        dr = _vertices(score[r - 1, c, rr, cc], middle, score[r + 1, c, rr, cc])
-        dc = _vertices(score[r, c - 1, rr, cc], middle, score[r, c + 1, rr, cc])
+        dr = vertices(score[r - 1, c, rr, cc], middle, score[r + 1, c, rr, cc])
+        dc = vertices(score[r, c - 1, rr, cc], middle, score[r, c + 1, rr, cc])
         centre = 0.5 * (CELL_PX - 1)
         a = (np.column_stack([cc, rr]) * float(CELL_PX) + centre).astype(np.float64)
         b = a + spare + CELL_PX * np.column_stack([c + dc, r + dr])
@@ -131,9 +132,3 @@ def _part(image: Gray, row: int, column: int) -> Any:
     found = extractor("xfeat").net(padded_tensor(cut, _STRIDE))[0]
     found = found[0, :, row - r0 : row - r0 + _PART, column - c0 : column - c0 + _PART]
     return torch.nn.functional.normalize(found, dim=0)
-
-
-def _vertices(left: Floats, middle: Floats, right: Floats) -> Array:
-    bend = left - 2.0 * middle + right
-    offset = np.where(bend < -1e-9, 0.5 * (left - right) / np.where(bend < -1e-9, bend, 1.0), 0.0)
-    return np.asarray(np.clip(offset, -0.5, 0.5), np.float64)

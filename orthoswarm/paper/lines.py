@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.swarm.legs import split_legs
-from orthoswarm.swarm.records import Array, Records, wrap
+from orthoswarm.swarm.records import Array, Records
 from orthoswarm.swarm.rig import Ints
 
 HEADING_RAD = np.radians(20.0)
@@ -80,7 +81,7 @@ def _grown(leg: Ints, records: Records) -> Ints:
             while 0 <= i < len(out) and out[i] < 0:
                 offset = records.position[i, :2] - line.project(records.position[i, None, :2])[0]
                 along = line.along(records.position[i, None, :2])[0]
-                turned = abs(float(wrap(np.asarray(records.yaw[i] - mean)))) > HEADING_RAD
+                turned = abs(wrap_rad(float(records.yaw[i] - mean))) > HEADING_RAD
                 if turned or np.hypot(*offset) > reach or (along - last) * step <= 0:
                     break
                 out[i], last = k, along
@@ -94,7 +95,7 @@ def _one_heading(members: Ints, yaw: Array) -> list[Ints]:
     for i in members.tolist():
         if runs:
             mean = np.angle(np.exp(1j * yaw[runs[-1]]).mean())
-            if abs(float(wrap(np.asarray(yaw[i] - mean)))) <= HEADING_RAD:
+            if abs(wrap_rad(float(yaw[i] - mean))) <= HEADING_RAD:
                 runs[-1].append(i)
                 continue
         runs.append([i])

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
+
 Array = NDArray[np.float64]
 
 _TURN_RAD = np.radians(10.0)
@@ -59,7 +61,7 @@ def angles(points: Array) -> Array:
     step = np.diff(points[:, :2], axis=0)
     step = step[np.hypot(*step.T) > 0.01]
     heading = np.arctan2(step[:, 1], step[:, 0])
-    return np.asarray(np.abs((np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi))
+    return np.asarray(np.abs(wrap_rad(np.diff(heading))))
 
 
 def turns(points: Array) -> int:

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import fov_rad
-from orthoswarm.swarm.records import Records, wrap
+from orthoswarm.swarm.records import Records
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -102,7 +103,7 @@ def _heading(
         last = 0.0
         if len(mine) >= 3:
             turn = float(np.angle(np.median(np.cos(mine)) + 1j * np.median(np.sin(mine))))
-            spread = float(np.median(np.abs(wrap(mine - turn))))
+            spread = float(np.median(np.abs(wrap_rad(mine - turn))))
             if not records.has_yaw.any() and spread < np.radians(20.0):
                 last = turn
             elif abs(turn) > np.radians(40.0) and spread < np.radians(8.0):

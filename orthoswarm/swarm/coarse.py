@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from orthoswarm.geo import GroundGrid
+from orthoswarm.parabola import vertex
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.rig import Rig
 
@@ -71,14 +73,9 @@ def correlate(moving: Complex, fixed: Complex, reach: int, blur: float = 0.0) ->
     ratio = float(rest.max()) / max(peak, 1e-9)
     dc, dr = 0.0, 0.0
     if 0 < r < n - 1 and 0 < c < n - 1:
-        dc = _vertex(score[r, c - 1], peak, score[r, c + 1])
-        dr = _vertex(score[r - 1, c], peak, score[r + 1, c])
+        dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
+        dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
     return c + dc - reach, r + dr - reach, peak, ratio
-
-
-def _vertex(left: float, middle: float, right: float) -> float:
-    bend = left - 2.0 * middle + right
-    return 0.0 if bend >= -1e-9 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))
 
 
 def strip_mosaic(
@@ -141,6 +138,7 @@ class Strip:
     Attributes:
         gray, valid: the mosaic, float32 and bool (rows, columns).
         ground, known: the map, `reach` pixels wider on every side. reach: in pixels. gsd_m: of both.
+        offset: (2,) east, north: where the map's pixels lie from those of the mosaic, less than a pixel, metres.
     """
 
     gray: NDArray[np.float32]
@@ -149,6 +147,7 @@ class Strip:
     known: NDArray[np.bool_]
     reach: int
     gsd_m: float
+    offset: tuple[float, float]
 
 
 def strip_and_map(
@@ -178,7 +177,8 @@ def strip_and_map(
     ground, known = ground[: rows + 2 * reach, : cols + 2 * reach], known[: rows + 2 * reach, : cols + 2 * reach]
     if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < 0.1:
         return None
-    return Strip(gray, valid, ground, known, reach, gsd_m)
+    grid = GroundGrid.around(basemap.epsg, bounds, gsd_m)
+    return Strip(gray, valid, ground, known, reach, gsd_m, (grid.west - bounds[0], grid.north - bounds[3]))
 
 
 def register(
@@ -200,7 +200,11 @@ def register(
     if np.count_nonzero(moving) < 400:
         return None
     dc, dr, peak, ratio = correlate(moving, fixed, strip.reach)
-    return Match(int(index[0]), int(index[-1]), (dc * gsd_m, -dr * gsd_m), peak, ratio)
+    return Match(int(index[0]), int(index[-1]), _metres(strip, dc, dr), peak, ratio)
+
+
+def _metres(strip: Strip, columns: float, rows: float) -> tuple[float, float]:
+    return strip.offset[0] + columns * strip.gsd_m, strip.offset[1] - rows * strip.gsd_m
 
 
 def register_learned(
@@ -222,4 +226,4 @@ def register_learned(
     shift = second_opinion(strip.gray, strip.valid, strip.ground, strip.known, strip.reach)
     if shift is None:
         return None
-    return Match(int(index[0]), int(index[-1]), (float(shift[0]) * gsd_m, -float(shift[1]) * gsd_m), 1.0, 0.0)
+    return Match(int(index[0]), int(index[-1]), _metres(strip, float(shift[0]), float(shift[1])), 1.0, 0.0)

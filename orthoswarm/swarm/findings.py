@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.frame import Frame
-from orthoswarm.swarm.heading import tag_yaw, wrap
+from orthoswarm.swarm.heading import tag_yaw
 from orthoswarm.swarm.plane import Array, Flags, Records
 from orthoswarm.swarm.start2d import Start2D
 
@@ -27,7 +28,7 @@ def flipped_yaw(records: Records, start: Start2D) -> Flags:
     for v, tag in enumerate(start.tags):
         if tag.source:
             rows = (records.vehicle == v) & start.yaw_known
-            off = np.abs(wrap(start.yaw - tag_yaw(records, tag.source) - tag.offset))
+            off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
             flipped |= rows & (np.nan_to_num(off) > _FLIP)
     return flipped
 

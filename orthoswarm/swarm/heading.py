@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.swarm.plane import Array, Complex, Flags, Ints, PairGraph, Records
 
 _COURSE_SIGMA = float(np.radians(2.0))
@@ -32,11 +33,6 @@ class TagHeading:
     source: str
     offset: float
     agree: float
-
-
-def wrap(angle: Array) -> Array:
-    """Angles in -pi ... pi."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def components(graph: PairGraph, count: int) -> Ints:
@@ -68,7 +64,7 @@ def chain_headings(graph: PairGraph, count: int) -> Array:
         for k in order[1:].tolist():
             p = int(before[k])
             yaw[k] = yaw[p] + (turn[p, k] if (p, k) in turn else -turn[k, p])
-    return wrap(yaw)
+    return wrap_rad(yaw)
 
 
 def course_headings(
@@ -96,7 +92,7 @@ def course_headings(
     tilt = np.abs(1.0 - ratio * back) * offset_sigma_px[i] * metres[i] / length
     sigma = np.sqrt(_COURSE_SIGMA**2 + (blur / length) ** 2 + tilt**2)
     sigma[(sigma > 1.0) | (np.abs(shift) * metres[i] < 0.3 * length)] = np.inf
-    return wrap(np.angle(shift) - np.angle(way)), sigma
+    return wrap_rad(np.angle(shift) - np.angle(way)), sigma
 
 
 def solve_headings(
@@ -120,22 +116,22 @@ def solve_headings(
     useful = np.isfinite(course_sigma)
     for part in np.unique(part_of_pair[useful]):
         rows = np.flatnonzero(useful & (part_of_pair == part))
-        turn = circular_mode(wrap(course[rows] - yaw[graph.first[rows]]), course_sigma[rows] ** -2)
+        turn = circular_mode(wrap_rad(course[rows] - yaw[graph.first[rows]]), course_sigma[rows] ** -2)
         yaw[component == part] += turn
         known[component == part] = True
     for c in _C_SCHEDULE:
         yaw = yaw + _heading_step(graph, yaw, course, course_sigma, c)
-    return wrap(yaw), known
+    return wrap_rad(yaw), known
 
 
 def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Array, c: float) -> Array:
     count, pairs = len(yaw), len(graph)
     i, j = graph.first, graph.second
     turn_sigma = graph.turn_sigma
-    relative = wrap(np.angle(graph.factor) - (yaw[j] - yaw[i])) / turn_sigma
+    relative = wrap_rad(np.angle(graph.factor) - (yaw[j] - yaw[i])) / turn_sigma
     finite = np.isfinite(course_sigma)
     sigma = np.where(finite, course_sigma, 1.0)
-    absolute = np.where(finite, wrap(course - yaw[i]) / sigma, 0.0)
+    absolute = np.where(finite, wrap_rad(course - yaw[i]) / sigma, 0.0)
     w = np.concatenate([1.0 / (1.0 + relative**2 / c), finite / (1.0 + absolute**2 / c)])
     row = np.arange(pairs)
     pull = w[:pairs] / turn_sigma
@@ -154,13 +150,13 @@ def _identity(count: int) -> csr_matrix:
 def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
     """The angle that the most weight supports: the densest window, then the mean of what lies near it."""
     tried = angle[:: max(1, len(angle) // _CANDIDATES)]
-    support = (weight[None, :] * (np.abs(wrap(angle[None, :] - tried[:, None])) < width)).sum(1)
+    support = (weight[None, :] * (np.abs(wrap_rad(angle[None, :] - tried[:, None])) < width)).sum(1)
     mode = float(tried[int(support.argmax())])
     for _ in range(5):
-        r = wrap(angle - mode)
+        r = wrap_rad(angle - mode)
         w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2
         mode += float((w * r).sum() / w.sum())
-    return float(wrap(np.array(mode)))
+    return wrap_rad(mode)
 
 
 def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
@@ -177,9 +173,9 @@ def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHead
         finite = np.isfinite(tag)
         if finite.sum() < 3:
             continue
-        difference = wrap(yaw[rows] - tag)[finite]
+        difference = wrap_rad(yaw[rows] - tag)[finite]
         offset = circular_mode(difference, np.ones(len(difference)))
-        agree = float((np.abs(wrap(difference - offset)) < _AGREE).mean())
+        agree = float((np.abs(wrap_rad(difference - offset)) < _AGREE).mean())
         if agree > best.agree + 0.1:
             best = TagHeading(source, offset, agree)
     return best if best.agree >= 0.5 else TagHeading("", 0.0, best.agree)

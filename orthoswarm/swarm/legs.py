@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -51,7 +53,7 @@ def _bend(position: Array) -> Array:
     ahead = position[np.minimum(i + REACH, n - 1), :2] - position[:, :2]
     behind = position[:, :2] - position[np.maximum(i - REACH, 0), :2]
     moving = (np.hypot(*ahead.T) > 1e-6) & (np.hypot(*behind.T) > 1e-6)
-    turn = _wrap(np.arctan2(ahead[:, 0], ahead[:, 1]) - np.arctan2(behind[:, 0], behind[:, 1]))
+    turn = wrap_rad(np.arctan2(ahead[:, 0], ahead[:, 1]) - np.arctan2(behind[:, 0], behind[:, 1]))
     return np.where(moving, np.abs(turn), 0.0)
 
 
@@ -65,7 +67,3 @@ def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
     if time_s is not None and np.isfinite(time_s).all():
         out[1:] |= np.diff(time_s) > 60.0
     return out
-
-
-def _wrap(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

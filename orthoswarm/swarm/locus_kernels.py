@@ -6,6 +6,7 @@ Cameras come as the arrays of a Rig; `plane` is float64 (C, 3): terrain height a
 import numpy as np
 
 from orthoswarm.kernels import kernel
+from orthoswarm.parabola import vertex
 from orthoswarm.swarm.rig import project_point
 
 
@@ -233,9 +234,8 @@ def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyp
                 ambiguous = True
             if abs(heights[h] - heights[at]) > rival_m and curve[c, h] > rival_share * best:
                 ambiguous = True
-        bend = left - 2.0 * best + right
-        if not ambiguous and bend < 0.0:
-            found[c, 0] = heights[at] + step * min(max(0.5 * (left - right) / bend, -0.5), 0.5)
+        if not ambiguous and left + right < 2.0 * best:
+            found[c, 0] = heights[at] + step * vertex(left, best, right)
             found[c, 1] = best
 
 

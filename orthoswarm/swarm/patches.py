@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.kernels import kernel
+from orthoswarm.parabola import vertex
 from orthoswarm.swarm.rig import project_point
 
 Array = NDArray[np.float64]
@@ -35,19 +36,49 @@ def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: i
     return seen / (size * size)
 
 
+@kernel
+def _scharr(gray, field, size):  # type: ignore[no-untyped-def]
+    """Scharr gradients (reflected at the border) into field (rows, columns, 2), and their lengths into size."""
+    rows, cols = gray.shape
+    three, ten = np.float32(3.0), np.float32(10.0)
+    for r in range(rows):
+        above = gray[r - 1 if r > 0 else 1]
+        here = gray[r]
+        below = gray[r + 1 if r < rows - 1 else rows - 2]
+        for c in range(cols):
+            w, e = (c - 1 if c > 0 else 1), (c + 1 if c < cols - 1 else cols - 2)
+            gx = three * (above[e] - above[w] + below[e] - below[w]) + ten * (here[e] - here[w])
+            gy = three * (below[w] - above[w] + below[e] - above[e]) + ten * (below[c] - above[c])
+            field[r, c, 0], field[r, c, 1] = gx, gy
+            size[r, c] = np.sqrt(gx * gx + gy * gy)
+
+
+@kernel
+def _compress(field, size, middle):  # type: ignore[no-untyped-def]
+    """Divide gradients by their length plus the middle one, in place; those of unknown pixels become 0."""
+    rows, cols = size.shape
+    for r in range(rows):
+        for c in range(cols):
+            if np.isnan(size[r, c]):
+                field[r, c, 0] = field[r, c, 1] = np.float32(0.0)
+            else:
+                share = np.float32(1.0) / (size[r, c] + middle)
+                field[r, c, 0] *= share
+                field[r, c, 1] *= share
+
+
 def gradient_field(gray: Floats) -> Floats:
     """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
-    gx = cv2.Scharr(gray, cv2.CV_32F, 1, 0)
-    gy = cv2.Scharr(gray, cv2.CV_32F, 0, 1)
-    size = np.sqrt(gx * gx + gy * gy)  # not cv2.magnitude: its last bit depends on where the array lies in memory
-    sample = size[::2, ::2]
-    sample = sample[np.isfinite(sample)]
-    middle = float(np.median(sample)) if len(sample) else 1.0
-    size += max(middle, 1e-3)
-    field = np.empty((*gray.shape, 2), np.float32)
-    np.divide(gx, size, out=field[..., 0])
-    np.divide(gy, size, out=field[..., 1])
-    return np.nan_to_num(field, copy=False, nan=0.0)
+    field, size = np.empty((*gray.shape, 2), np.float32), np.empty(gray.shape, np.float32)
+    _scharr(gray, field, size)
+    sample = size[::2, ::2].ravel()
+    half = len(sample) // 2
+    middle = float(np.partition(sample, half)[half])  # NaN sorts last
+    if np.isnan(sample).any():
+        sample = sample[np.isfinite(sample)]
+        middle = float(np.median(sample)) if len(sample) else 1.0
+    _compress(field, size, np.float32(max(middle, 1e-3)))
+    return field
 
 
 def match(template: Floats, window: Floats, exclude: int = 4) -> tuple[float, float, float, float]:
@@ -68,11 +99,6 @@ def match(template: Floats, window: Floats, exclude: int = 4) -> tuple[float, fl
     second = float(rest.max())
     if not (0 < c < cols - 1 and 0 < r < rows - 1):
         return 0.0, 0.0, 0.0, 1.0
-    dc = _vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
-    dr = _vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
+    dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
+    dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
     return c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, float(peak), second
-
-
-def _vertex(left: float, middle: float, right: float) -> float:
-    bend = left - 2.0 * middle + right
-    return 0.0 if bend >= -1e-9 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import rotation_from_angles
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
@@ -49,7 +50,7 @@ class Records:
         out = raw.copy()
         for i in range(1, n):
             near = np.arange(max(1, i - reach), min(n, i + reach + 1))
-            same = np.abs(wrap(self.yaw[near] - self.yaw[i])) < np.radians(12.0)
+            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < np.radians(12.0)
             chosen = near[same]
             if len(chosen) >= 3:
                 out[i] = np.median(raw[chosen], axis=0)
@@ -85,7 +86,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_
     course = _course(xy)
     return Records(
         position,
-        wrap(np.where(has_yaw, yaw, course)),
+        wrap_rad(np.where(has_yaw, yaw, course)),
         np.where(has_tilt, pitch, -np.pi / 2),
         np.where(np.isfinite(roll), roll, 0.0),
         time,
@@ -95,11 +96,6 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_
         _column([f.fix.position_sigma_m for f in frames]),
         timed,
     )
-
-
-def wrap(angle: Array) -> Array:
-    """Angles in radians brought to [-pi, pi)."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _column(values: Sequence[float | None]) -> Array:

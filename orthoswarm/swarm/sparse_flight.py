@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm import records as dense
 from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.calibrate import Calibration
 from orthoswarm.swarm.flight import Flight
-from orthoswarm.swarm.heading import wrap
 from orthoswarm.swarm.matching import Progress, ReadGray, Run, serial
 from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.plane import Array
@@ -74,12 +74,12 @@ def flight_of(
     adjustment = reduced(adjustment, pictures.scale, pictures.size)
     number = {int(row): k for k, row in enumerate(rows)}
     pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
-    yaw = wrap(start.plane.yaw[rows])
+    yaw = wrap_rad(start.plane.yaw[rows])
     mine = list(warnings)
     calibration = Calibration(
         float(adjustment.rig.lens[0, F]),
         float(np.median(heights_above_ground(adjustment))),
-        np.asarray(wrap(yaw - records.yaw)),
+        wrap_rad(yaw - records.yaw),
         bool(start.height_known[rows].any()),
         start.pairs[1],
         mine,

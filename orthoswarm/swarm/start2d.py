@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.swarm.features import Features
 from orthoswarm.swarm.heading import (
     TagHeading,
@@ -20,7 +21,6 @@ from orthoswarm.swarm.heading import (
     solve_headings,
     tag_heading,
     tag_yaw,
-    wrap,
 )
 from orthoswarm.swarm.network import Beliefs, solve_network
 from orthoswarm.swarm.pairs import Pair
@@ -204,7 +204,7 @@ def _fill_headings(records: Records, yaw: Array, known: Flags, component: Ints, 
     """Headings of parts that no course fixes: by the tag that follows the pictures elsewhere, else the way flown."""
     yaw = yaw.copy()
     velocity = records.velocity()
-    course = np.where(np.abs(velocity) > 0.3, wrap(np.pi / 2 - np.angle(velocity)), np.nan)
+    course = np.where(np.abs(velocity) > 0.3, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan)
     guess = np.full(len(yaw), np.nan)
     for v, tag in enumerate(tags):
         rows = records.vehicle == v
@@ -214,5 +214,5 @@ def _fill_headings(records: Records, yaw: Array, known: Flags, component: Ints, 
     for part in np.unique(component[~known]):
         rows = np.flatnonzero((component == part) & np.isfinite(guess))
         if len(rows):
-            yaw[component == part] += circular_mode(wrap(guess[rows] - yaw[rows]), np.ones(len(rows)))
-    return wrap(yaw)
+            yaw[component == part] += circular_mode(wrap_rad(guess[rows] - yaw[rows]), np.ones(len(rows)))
+    return wrap_rad(yaw)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_rad
 from orthoswarm.camera import Lens, focal_px
 
 Array = NDArray[np.float64]
@@ -131,7 +132,7 @@ def _slew(heading: Array, seconds: float, rate_rad_s: float) -> Array:
     """Headings that follow the path's with a limited turning rate."""
     out = heading.copy()
     for i in range(1, len(out)):
-        turn = (heading[i] - out[i - 1] + np.pi) % (2 * np.pi) - np.pi
+        turn = wrap_rad(float(heading[i] - out[i - 1]))
         out[i] = out[i - 1] + np.clip(turn, -rate_rad_s * seconds, rate_rad_s * seconds)
     return out
 

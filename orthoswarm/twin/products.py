@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.angles import wrap_deg
 from orthoswarm.geo import GroundGrid
 from orthoswarm.twin.builder import Slot
 from orthoswarm.twin.city import place_cars
@@ -155,7 +156,7 @@ def write_frames(spec: TwinSpec, site: Site, flights: list[Flight], path: Path) 
         geographic = site.grid.to_geographic(flight.position[:, :2])
         convergence = site.grid.convergence_rad(geographic[:, 0], geographic[:, 1])
         degrees = np.degrees(np.c_[flight.angles[:, 0] + convergence, flight.angles[:, 1:]])
-        degrees[:, 0] = (degrees[:, 0] + 180.0) % 360.0 - 180.0
+        degrees[:, 0] = wrap_deg(degrees[:, 0])
         for i in range(0, len(flight.time_s), spec.every):
             moment = datetime.fromtimestamp(round(float(flight.time_s[i]), 3), UTC).isoformat(timespec="milliseconds")
             rows.append(

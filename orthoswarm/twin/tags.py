@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
 
+from orthoswarm.angles import wrap_deg
+
 _XMP = (
     '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
     '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
@@ -67,7 +69,7 @@ def _segment(payload: bytes) -> bytes:
 
 
 def _wrap(angles: tuple[float, float, float]) -> tuple[float, float, float]:
-    a, b, c = ((x + 180.0) % 360.0 - 180.0 for x in angles)
+    a, b, c = (wrap_deg(x) for x in angles)
     return a, b, c
 
 
