@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.maptiles import TiledMap
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.coarse import Match, register, register_learned
 from orthoswarm.swarm.flight import Flight
@@ -43,6 +44,7 @@ def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float
     width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
     gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
     windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    basemap = TiledMap(basemap, gsd)
     matches = [
         m
         for index in windows
@@ -64,6 +66,7 @@ def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: floa
     width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
     gsd = float(np.clip(width / (2 * ACROSS_PX), 0.2, 0.6))
     windows = _windows(flight.leg, SECOND_LOOK_PICTURES)
+    basemap = TiledMap(basemap, gsd)
     chosen = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SECOND_LOOKS).round().astype(int))]
     matches = [
         m
