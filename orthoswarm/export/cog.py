@@ -6,7 +6,6 @@ because the length of every table is known at the beginning. Transparent tiles t
 """
 
 import struct
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
@@ -22,7 +22,7 @@ from orthoswarm.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
 TILE_PX = 512
-_LEVEL = 1  # zlib: higher levels gain some percent on photographs and take several times longer
+_LEVEL = 2  # of ISA-L's four: three times as fast as zlib's first level, and no larger
 # GDAL's hints for readers; the last line's blank leaves room to say YES there.
 _STRUCTURE = (
     b"LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\n"
@@ -136,13 +136,13 @@ def _tile(source: Source, first: tuple[int, int], level: _Level, r: int, c: int)
 
 
 def _deflate(tile: Bytes) -> bytes:
-    """Horizontal differences (TIFF predictor 2) and zlib; nothing for a transparent tile."""
+    """Horizontal differences (TIFF predictor 2) and deflate; nothing for a transparent tile."""
     if not tile[..., 3].any():
         return b""
     tile = tile.copy()
     tile[tile[..., 3] == 0] = 0
     tile[:, 1:] = tile[:, 1:] - tile[:, :-1]
-    return zlib.compress(tile.tobytes(), _LEVEL)
+    return isal_zlib.compress(tile.tobytes(), _LEVEL)
 
 
 # -- BigTIFF ------------------------------------------------------------------------------------------------------
