@@ -63,6 +63,18 @@ def test_known_gains_are_found_up_to_a_common_one():
     assert np.abs(left).max() < 0.1
 
 
+def test_a_vehicle_follows_those_that_are_drawn_already():
+    flight, truth = uneven_flight(2)
+    drawn = {
+        f.frame.image: np.exp(-t).astype(np.float32) for f, t in zip(flight.frames, truth) if f.frame.vehicle != "uav2"
+    }
+    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT, held=drawn)
+    assert all(gains[image] is gain for image, gain in drawn.items())
+    found = np.log([gains[f.frame.image] for f in flight.frames])
+    late = np.array([f.frame.vehicle == "uav2" for f in flight.frames])
+    assert np.abs((found + truth)[late]).mean() < 0.35 * np.abs(truth[late]).mean()  # no common factor is free now
+
+
 def test_even_pictures_are_left_alone():
     flight = scene.survey(2)
     gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT)

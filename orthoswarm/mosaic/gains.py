@@ -46,21 +46,27 @@ class _Meetings:
 
 
 def estimate_gains(
-    frames: Sequence[PlacedFrame], thumbnails: Mapping[str, Bytes], terrain: Terrain
+    frames: Sequence[PlacedFrame],
+    thumbnails: Mapping[str, Bytes],
+    terrain: Terrain,
+    held: Mapping[str, NDArray[np.float32]] | None = None,
 ) -> dict[str, NDArray[np.float32]]:
     """Gains that make neighbouring frames alike.
 
-    The mean logarithm of the mosaic's brightness stays as it was, channel by channel.
+    The mean logarithm of the mosaic's brightness stays as it was, channel by channel; where some gains are held, the
+    others follow those instead.
 
     Args:
         frames: placed frames in order of vehicle and time.
         thumbnails: image -> uint8 (rows, columns, 3), means of a picture's parts (RenderStats.thumbnails of an earlier
             rendering); a frame without one gets its vehicle's gain.
         terrain: the ground's height.
+        held: image -> gain (3,) of frames that are drawn already and stay as they are.
 
     Returns:
         image -> float32 (3,), factor of red, green and blue for every frame, within 1/1.6 to 1.6.
     """
+    held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
     if len(known) < 2:
         return {}
@@ -81,16 +87,15 @@ def estimate_gains(
         good.append(usable)
     usable = np.concatenate(good)
     a, b = (np.concatenate([getattr(m, side) for m in (seams, inner)])[usable] for side in "ab")
-    of_vehicle, of_frame = _solve(a, b, np.concatenate(ratios)[usable], vehicle, len(names))
-    own = of_vehicle[vehicle] + of_frame
+    fixed = np.array([f.frame.image in held for f in some])
+    log_held = np.array([np.log(held.get(f.frame.image, np.ones(3))) for f in some])
+    of_vehicle, of_frame = _solve(a, b, np.concatenate(ratios)[usable], vehicle, len(names), fixed, log_held)
+    own = np.where(fixed[:, None], log_held, of_vehicle[vehicle] + of_frame)
     area = np.bincount(labels[labels > 0] - 1, minlength=len(some)).astype(float)
-    level = (area[:, None] * own).sum(0) / max(1.0, area.sum())
-    gains = {
-        f.frame.image: _factor(of_vehicle[names.index(f.frame.vehicle)] - level)
-        for f in frames
-        if f.frame.image not in thumbnails
-    }
-    return gains | {f.frame.image: _factor(g - level) for f, g in zip(some, own)}
+    level = np.zeros(3) if fixed.any() else (area[:, None] * own).sum(0) / max(1.0, area.sum())
+    gains = {f.frame.image: _factor(of_vehicle[names.index(f.frame.vehicle)] - level) for f in frames}
+    gains |= {f.frame.image: _factor(g - level) for f, g in zip(some, own)}
+    return gains | {f.frame.image: held[f.frame.image] for f in frames if f.frame.image in held}
 
 
 def _factor(log_gain: Array) -> NDArray[np.float32]:
@@ -192,19 +197,29 @@ def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable):
 
 
 def _solve(
-    a: Ints, b: Ints, ratio: NDArray[np.float32], vehicle: NDArray[np.intp], vehicles: int
+    a: Ints,
+    b: Ints,
+    ratio: NDArray[np.float32],
+    vehicle: NDArray[np.intp],
+    vehicles: int,
+    fixed: NDArray[np.bool_],
+    log_held: Array,
 ) -> tuple[Array, Array]:
-    """Log gains of vehicles (V, 3) and frames (N, 3): g_a - g_b = -ratio, robust (Geman-McClure), with priors to 0."""
+    """Log gains of vehicles (V, 3) and frames (N, 3): g_a - g_b = -ratio, robust (Geman-McClure), with priors to 0.
+
+    Frames that are fixed (N,) have log_held (N, 3) and no part in the unknowns.
+    """
     from scipy.sparse import coo_array, diags_array
     from scipy.sparse.linalg import splu
 
     n = len(vehicle)
     prior = np.r_[np.full(vehicles, _VEHICLE_SIGMA**-2), np.full(n, _FRAME_SIGMA**-2)]
     rows = np.arange(len(a))
-    one = np.ones(len(a))
+    one_a, one_b = (np.where(fixed[side], 0.0, 1.0) for side in (a, b))
+    ratio = ratio + np.where(fixed[a, None], log_held[a], 0.0) - np.where(fixed[b, None], log_held[b], 0.0)
     design = coo_array(
         (
-            np.concatenate([one, -one, one, -one]),
+            np.concatenate([one_a, -one_b, one_a, -one_b]),
             (np.tile(rows, 4), np.concatenate([vehicles + a, vehicles + b, vehicle[a], vehicle[b]])),
         ),
         shape=(len(a), vehicles + n),
