@@ -178,6 +178,7 @@ def resettle(
     """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved)."""
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    surface = refit(flight, surface)  # the ground moved with its level; ties are compared on it where it is now
     return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)
 
 
