@@ -7,7 +7,9 @@ import logging
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +30,7 @@ from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.gains import estimate_gains
 from orthoswarm.mosaic.realtime import mosaic
-from orthoswarm.mosaic.render import RenderStats, render
+from orthoswarm.mosaic.render import Layer, RenderStats, render, render_layers
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras
@@ -43,6 +45,8 @@ Bytes = NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
 Load = Callable[[Progress], Ingest]
+_Map = tuple[Sequence[PlacedFrame], Terrain | None]
+"""Frames and the ground under them: what a map is drawn from."""
 
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
 PRODUCTS = (REALTIME, COARSE, ORTHOIMAGE, "frames.jsonl", "footprints.gpkg", "report.json", "report.html")
@@ -266,14 +270,13 @@ class _Batch:
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):
                 state.gains = estimate_gains(fine, state.thumbnails, terrain or Terrain.flat())
-        if with_map:
-            self.picture(state, COARSE, coarse, _coarse_terrain(refinement.coarse))
-        if self.options.until == "fine":
+        if self.options.until != "fine":
+            self.picture(state, COARSE, fine, terrain)
+        elif with_map:
+            self.both(state, (coarse, _coarse_terrain(refinement.coarse)), (fine, terrain))
+        else:
             self.picture(state, ORTHOIMAGE, fine, terrain)
-            if not with_map:
-                self.copy_coarse(state)
-            return [p for p in fine if p.frame.image not in state.rejected]
-        self.picture(state, COARSE, fine, terrain)
+            self.copy_coarse(state)
         return [p for p in fine if p.frame.image not in state.rejected]
 
     def ground(self, state: _State, refinement: _Refinement) -> Terrain | None:
@@ -285,6 +288,31 @@ class _Batch:
         nadirs = np.array([p.camera.nadir for p in fine])
         model = read_dem(self.options.dem, state.grid.epsg, placed_bounds(fine, level, level), takeoff=nadirs)
         return replace(model, z=model.z + np.float32(level))
+
+    def both(self, state: _State, coarse: _Map, fine: _Map) -> None:
+        """Render both refined maps at once, each picture read once, unless an interrupted run has one of them."""
+        if any(self.space.recall(name) is not None for name in (COARSE, ORTHOIMAGE)):
+            self.picture(state, COARSE, *coarse)
+            self.picture(state, ORTHOIMAGE, *fine)
+            return
+        with self.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage, ExitStack() as open_until_done:
+            layers = []
+            for name, (placed, terrain) in ((COARSE, coarse), (ORTHOIMAGE, fine)):
+                canvas = open_until_done.enter_context(self.canvas(name, placed, terrain or Terrain.flat(), state))
+                layers.append(Layer(placed, terrain or Terrain.flat(), canvas, state.gains))
+            drawn = partial(self.progress, "drawing orthoimage")
+            stats = render_layers(layers, run=self.workers.map, progress=drawn)
+            for name, layer in zip((COARSE, ORTHOIMAGE), layers, strict=True):
+                self.write(layer.canvas, name)
+        self.space.clear_scratch()
+        state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
+        self.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
+        self.space.remember(
+            COARSE,
+            (stats[0].rejected, (stats[0].drawn_m2, stats[0].covered_share), replace(stage, wall_s=0.0, cpu_s=0.0)),
+        )
+        for s in stats:
+            self.leave_out(state, s.rejected, fine[0])
 
     def picture(self, state: _State, name: str, placed: Sequence[PlacedFrame], terrain: Terrain | None) -> None:
         """Render one product, unless an interrupted run has."""
@@ -304,30 +332,30 @@ class _Batch:
         self, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: _State, *, realtime: bool = False
     ) -> RenderStats:
         """Render frames on a canvas of their own and write it as a COG."""
+        drawn = partial(self.progress, f"drawing {name.removesuffix('.tif')}")
+        with self.canvas(name, placed, terrain, state) as canvas:
+            if realtime:
+                stats = mosaic(placed, canvas, run=self.workers.map, progress=drawn)
+            else:
+                stats = render(placed, terrain, canvas, gains=state.gains, run=self.workers.map, progress=drawn)
+            self.write(canvas, name)
+        self.space.clear_scratch()
+        return stats
+
+    def canvas(self, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: _State) -> Canvas:
+        """An empty canvas for a product of these frames."""
         low, high = float(terrain.z.min()), float(terrain.z.max())
         usable = [p for p in placed if rejection(p.camera, float(terrain.height(p.camera.nadir)), state.gsd_m) is None]
         if not usable:
             reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
             raise OrthoSwarmError(f"no picture can be drawn: {reason}")
         grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
-        stem = name.removesuffix(".tif")
+        return Canvas.create(self.space.scratch(name.removesuffix(".tif")), grid, plane="frame")
 
-        def drawn(done: int, total: int) -> None:
-            self.progress(f"drawing {stem}", done, total)
-
-        def written(done: int, total: int) -> None:
-            self.progress(f"writing {name}", done, total)
-
-        with Canvas.create(self.space.scratch(stem), grid, plane="frame") as canvas:
-            if realtime:
-                stats = mosaic(placed, canvas, run=self.workers.map, progress=drawn)
-            else:
-                stats = render(placed, terrain, canvas, gains=state.gains, run=self.workers.map, progress=drawn)
-            write_cog(
-                canvas, self.out / name, window=drawn_window(canvas), progress=written, threads=self.workers.count
-            )
-        self.space.clear_scratch()
-        return stats
+    def write(self, canvas: Canvas, name: str) -> None:
+        """Write a canvas as a COG."""
+        written = partial(self.progress, f"writing {name}")
+        write_cog(canvas, self.out / name, window=drawn_window(canvas), progress=written, threads=self.workers.count)
 
     def copy_coarse(self, state: _State) -> None:
         """Without a map the orthoimage is the coarse product, too."""

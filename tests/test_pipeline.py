@@ -215,7 +215,7 @@ def test_two_runs_do_not_write_to_one_folder(flight, tmp_path):
 
 def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, tmp_path, monkeypatch):
     count = 0
-    compress = cog.zlib.compress
+    compress = cog.isal_zlib.compress
 
     def full(data, level):
         nonlocal count
@@ -224,7 +224,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, 
             raise OSError(errno.ENOSPC, "No space left on device")
         return compress(data, level)
 
-    monkeypatch.setattr(cog.zlib, "compress", full)
+    monkeypatch.setattr(cog.isal_zlib, "compress", full)
     with pytest.raises(OrthoSwarmError, match="disk is full") as caught:
         make(flight[2] / "photos", tmp_path / "out")
     assert caught.value.exit_code == 1

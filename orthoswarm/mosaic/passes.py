@@ -115,19 +115,33 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A picture to sample.
+    """A picture's share of a layer.
 
     Attributes:
-        index: of its frame. path: its file.
+        layer: which of the task's layers. row: of its camera there. index: of its frame.
         gain: float32 (3,), factor of its colours. factor: how much to reduce it first.
         windows: where it won.
     """
 
+    layer: int
+    row: int
     index: int
-    path: Path
     gain: NDArray[np.float32]
     factor: int
     windows: list[Window]
+
+
+@dataclass(frozen=True, slots=True)
+class TaskLayer:
+    """What a task has to know of one of the maps that are drawn.
+
+    Attributes:
+        place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
+    """
+
+    place: Place
+    shots: Shots
+    terrain: dict[Key, Terrain]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,51 +149,60 @@ class SampleTask:
     """Read pictures and colour what they won.
 
     Attributes:
-        place: where. pictures: what to read. shots: their cameras, in the same order.
-        terrain: the ground by tile. read: reads a picture.
+        layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture.
     """
 
-    place: Place
-    pictures: list[Shot]
-    shots: Shots
-    terrain: dict[Key, Terrain]
+    layers: list[TaskLayer]
+    pictures: list[tuple[Path, list[Shot]]]
     read: Read
 
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """What became of a picture: its thumbnail, or the reason why it could not be used."""
+    """What became of a picture in a layer: its thumbnail, or the reason why it could not be used."""
 
+    layer: int
     index: int
     thumbnail: Bytes | None
     reason: str | None = None
 
 
-def sample_pass(task: SampleTask) -> list[Sampled]:
-    """Colour the pixels of some frames in the tiles' files, each picture read once."""
-    place, store = task.place, task.place.store()
-    lattices = {key: place.heights(key, terrain) for key, terrain in task.terrain.items()}
-    about = {key: task.shots.about(*place.corner(key)) for key in task.terrain}
-    results = []
-    for k, shot in enumerate(task.pictures):
-        lens = task.shots.lens[k]
-        try:
-            picture = _read(task.read, shot.path, task.shots.size[k])
-        except OrthoSwarmError as error:
-            results.append(Sampled(shot.index, None, str(error)))
-            continue
-        small, factor = reduced(picture, shot.factor)
-        levels = _levels(shot.gain)
+class _Ground:
+    """A layer while it is drawn: its tiles, their heights, and the cameras about each tile."""
+
+    def __init__(self, layer: TaskLayer) -> None:
+        self.layer, self.store = layer, layer.place.store()
+        self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
+        self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
+
+    def draw(self, shot: Shot, small: Bytes, factor: int) -> None:
+        lens, levels = self.layer.shots.lens[shot.row], _levels(shot.gain)
         for w in shot.windows:
-            tile = store.get(w.key)
+            tile = self.store.get(w.key)
             assert tile is not None
-            position, rotation = about[w.key]
+            position, rotation = self.about[w.key]
             window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
             sample(
-                tile.rgba, tile.plane, shot.index + 1, window, position[k], rotation[k], lens, lattices[w.key],
-                place.grid.gsd_m, small, factor, levels, WEIGHTS,
+                tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row], lens,
+                self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor, levels, WEIGHTS,
             )  # fmt: skip
-        results.append(Sampled(shot.index, thumbnail(small)))
+
+
+def sample_pass(task: SampleTask) -> list[Sampled]:
+    """Colour the pixels of some frames in the tiles' files, each picture read once for all layers."""
+    grounds = [_Ground(layer) for layer in task.layers]
+    results = []
+    for path, shots in task.pictures:
+        try:
+            picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
+        except OrthoSwarmError as error:
+            results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
+            continue
+        sizes = {shot.factor: reduced(picture, shot.factor) for shot in shots}
+        for shot in shots:
+            grounds[shot.layer].draw(shot, *sizes[shot.factor])
+        small = thumbnail(sizes[shots[0].factor][0])
+        results += [Sampled(shot.layer, shot.index, small) for shot in shots]
     return results
 
 

@@ -2,14 +2,16 @@
 
 Two passes, both streamed, so that memory does not grow with the area or the number of frames: label every pixel with
 its frame (tiles independent of each other), then read each picture once and sample it where it won (frames
-independent of each other). The tiles are prepared beside the canvas and moved into it when they are done, so a viewer
-sees the old ones until then. Nothing in the result depends on how the work is spread.
+independent of each other). Several maps of the same pictures (coarse and fine) share the reading. The tiles are
+prepared beside the canvas and moved into it when they are done, so a viewer sees the old ones until then. Nothing in
+the result depends on how the work is spread.
 """
 
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,18 @@ from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.coverage import by_tile, coverage
 from orthoswarm.mosaic.footprint import rejections
 from orthoswarm.mosaic.lattice import Shots, crop
-from orthoswarm.mosaic.passes import LabelTask, Place, Read, SampleTask, Shot, Window, label_pass, sample_pass
+from orthoswarm.mosaic.passes import (
+    LabelTask,
+    Place,
+    Read,
+    Sampled,
+    SampleTask,
+    Shot,
+    TaskLayer,
+    Window,
+    label_pass,
+    sample_pass,
+)
 from orthoswarm.mosaic.reduce import reduction
 from orthoswarm.mosaic.tiles import Key
 from orthoswarm.picture import read_rgb
@@ -69,6 +82,25 @@ class RenderStats:
         return min(1.0, self.drawn_m2 / self.seen_m2) if self.seen_m2 > 0 else 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One of the maps that are drawn together.
+
+    Attributes:
+        frames: placed frames; their order breaks ties of distance.
+        terrain: the ground's height, made smooth (bicubic) between its nodes.
+        canvas: made with plane "frame"; gets colours, and per pixel the index of its frame in `frames` plus 1.
+        gains: image -> factor of red, green, blue (3,); 1 where absent.
+        bounds: renew only the tiles that touch these (west, south, east, north); all if None.
+    """
+
+    frames: Sequence[PlacedFrame]
+    terrain: Terrain
+    canvas: Canvas
+    gains: Mapping[str, ArrayLike] = field(default_factory=dict)
+    bounds: Bounds | None = None
+
+
 def render(
     frames: Sequence[PlacedFrame],
     terrain: Terrain,
@@ -80,39 +112,92 @@ def render(
     run: Run = serial,
     progress: Progress | None = None,
 ) -> RenderStats:
-    """Render frames onto a canvas.
+    """Render frames onto a canvas: `render_layers` of a single layer, see there and `Layer`."""
+    layer = Layer(frames, terrain, canvas, gains or {}, bounds)
+    return render_layers([layer], read=read, run=run, progress=progress)[0]
+
+
+def render_layers(
+    layers: Sequence[Layer], *, read: Read = read_rgb, run: Run = serial, progress: Progress | None = None
+) -> list[RenderStats]:
+    """Render frames onto canvases, each picture read once for all of them.
 
     Each map pixel is taken from the frame with the nearest nadir point that sees it (at most 75 degrees off
     nadir; terrain and distortion honoured), from a weak frame only where no other sees, by
     bicubic interpolation of the picture, averaged first where the map is coarser. No blending.
 
     Args:
-        frames: placed frames; their order breaks ties of distance.
-        terrain: the ground's height, made smooth (bicubic) between its nodes.
-        canvas: made with plane "frame"; gets colours, and per pixel the index of its frame in `frames` plus 1.
-        gains: image -> factor of red, green, blue (3,); 1 where absent or None.
-        bounds: renew only the tiles that touch these (west, south, east, north); all if None.
+        layers: what to draw.
         read: reads a picture, uint8 (H, W, 3); must be picklable for `run` in other processes.
-        run: where the work runs; other processes need the canvas's folder and the pictures under the same paths.
-        progress: called with the number of frames done and of frames to do.
+        run: where the work runs; other processes need the canvases' folders and the pictures under the same paths.
+        progress: called with the number of pictures done and of pictures to do.
+
+    Returns:
+        What was rendered, layer by layer.
 
     Raises:
-        InputError: if the canvas has another plane.
+        InputError: if a canvas has another plane.
         OrthoSwarmError: if the disk is full.
     """
-    if canvas.plane != "frame":
-        raise InputError(f"the canvas in {canvas.path} belongs to the real-time module; use another folder")
-    keys = None if bounds is None else _tiles_within(canvas, bounds)
-    staging = canvas.path / _STAGING
-    shutil.rmtree(staging, ignore_errors=True)
+    for layer in layers:
+        if layer.canvas.plane != "frame":
+            raise InputError(f"the canvas in {layer.canvas.path} belongs to the real-time module; use another folder")
+    staging = [layer.canvas.path / _STAGING for layer in layers]
+    for folder in staging:
+        shutil.rmtree(folder, ignore_errors=True)
     try:
-        job = _Job(frames, terrain, canvas, dict(gains or {}), read, run, progress)
-        stats = job.render(Place(staging, canvas.tile_px, canvas.grid), keys)
-        store = canvas.staging(_STAGING)
-        canvas.adopt(store, sorted({*store.existing(), *canvas.changed_since(0)} if keys is None else keys))
+        jobs = [_Job(layer, folder, run) for layer, folder in zip(layers, staging, strict=True)]
+        _draw(jobs, read, run, progress)
+        for job in jobs:
+            job.adopt()
+        return [job.stats() for job in jobs]
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
-    return stats
+        for folder in staging:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _draw(jobs: Sequence["_Job"], read: Read, run: Run, progress: Progress | None) -> None:
+    """Label and sample, and again for the pixels of pictures that turned out to be unreadable."""
+    while True:
+        for job in jobs:
+            job.label()
+        failed = False
+        pictures = sum(1 for _ in _by_picture(jobs))
+        done = 0
+        for result in run(sample_pass, _sample_tasks(jobs, read)):
+            for sampled in result:
+                jobs[sampled.layer].take(sampled)
+                failed |= sampled.reason is not None
+            done += len({sampled.index for sampled in result})
+            if progress is not None:
+                progress(min(done, pictures), pictures)
+        if not failed:
+            return
+
+
+def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, int]]]]:
+    """Files to read, and the layers and frames that each serves.
+
+    Their order walks over the tiles in a serpentine, so that few tiles are mapped at once.
+    """
+    shares: dict[Path, list[tuple[int, int]]] = defaultdict(list)
+    for number, job in enumerate(jobs):
+        for i in sorted(job.windows, key=job.home):
+            shares[job.frames[i].frame.path].append((number, i))
+    yield from shares.items()
+
+
+def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
+    """The pictures in groups, with what is needed to draw them."""
+    pictures = list(_by_picture(jobs))
+    for start in range(0, len(pictures), _FRAMES_PER_TASK):
+        some = pictures[start : start + _FRAMES_PER_TASK]
+        own: list[list[int]] = [
+            [i for _, shares in some for n, i in shares if n == number] for number in range(len(jobs))
+        ]
+        row = {(number, i): r for number, indices in enumerate(own) for r, i in enumerate(indices)}
+        shots = [(path, [jobs[n].shot(i, n, row[n, i]) for n, i in shares]) for path, shares in some]
+        yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read)
 
 
 def _tiles_within(canvas: Canvas, bounds: Bounds) -> set[Key]:
@@ -121,116 +206,103 @@ def _tiles_within(canvas: Canvas, bounds: Bounds) -> set[Key]:
     return {(r, c) for r in range(r0 // t, -(-r1 // t)) for c in range(c0 // t, -(-c1 // t))}
 
 
-@dataclass(slots=True)
 class _Job:
-    """One call of render: what its passes share."""
+    """One layer while it is drawn."""
 
-    frames: Sequence[PlacedFrame]
-    terrain: Terrain
-    canvas: Canvas
-    gains: dict[str, ArrayLike]
-    read: Read
-    run: Run
-    progress: Progress | None
-    shots: Shots = field(init=False)
-    ground: NDArray[np.float64] = field(init=False)
-    rejected: dict[str, str] = field(default_factory=dict)
-    usable: NDArray[np.bool_] = field(init=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, layer: Layer, staging: Path, run: Run) -> None:
+        self.frames, self.terrain, self.canvas, self.run = layer.frames, layer.terrain, layer.canvas, run
+        self.gains = dict(layer.gains)
+        self.place = Place(staging, self.canvas.tile_px, self.canvas.grid)
+        self.keys = None if layer.bounds is None else _tiles_within(self.canvas, layer.bounds)
         self.shots = Shots.of([f.camera for f in self.frames], [f.weak for f in self.frames])
         position = np.nan_to_num(self.shots.position)
         self.ground = self.terrain.height(position[:, :2])
         self.usable = np.ones(len(self.frames), bool)
+        self.rejected: dict[str, str] = {}
+        self.thumbnails: dict[str, Bytes] = {}
+        self.pixels = np.zeros(len(self.frames), np.int64)
+        self.windows: dict[int, list[Window]] = {}
+        self.failed: dict[int, str] = {}
         reasons = rejections([f.camera for f in self.frames], self.ground, self.canvas.grid.gsd_m)
         for i, reason in reasons.items():
             self.reject(i, reason)
+        self.candidates = {k: ids for k, ids in self.seen_by().items() if self.keys is None or k in self.keys}
 
     def reject(self, i: int, reason: str) -> None:
         self.rejected[self.frames[i].frame.image] = reason
         self.usable[i] = False
 
-    def render(self, place: Place, keys: set[Key] | None) -> RenderStats:
-        candidates = {k: ids for k, ids in self.candidates().items() if keys is None or k in keys}
-        pixels = np.zeros(len(self.frames), np.int64)
-        thumbnails: dict[str, Bytes] = {}
-        failed: dict[int, str] = {}
-        while True:  # once, and again for the pixels of pictures that turned out to be unreadable
-            windows = self.label(place, candidates, failed)
-            for i, own in windows.items():
-                pixels[i] += sum(w.pixels for w in own)
-            failed = self.sample(place, windows, thumbnails)
-            if not failed:
-                break
-            for i in sorted(failed):
-                self.reject(i, failed[i])
-                pixels[i] = 0
-            lost = {w.key for i in failed for w in windows[i]}
-            candidates = {k: ids for k, ids in candidates.items() if k in lost}
-        gsd = self.canvas.grid.gsd_m
-        return RenderStats(pixels, self.seen_m2(keys), float(pixels.sum()) * gsd * gsd, self.rejected, thumbnails)
-
-    def candidates(self) -> dict[Key, Ints]:
+    def seen_by(self) -> dict[Key, Ints]:
         """For each tile the usable frames that may see it."""
         index = np.nonzero(self.usable)[0].astype(np.int32)
         t = self.canvas.tile_px
         found = by_tile([self.frames[int(i)].camera for i in index], self.canvas.grid, t, self.terrain)
         return {(r // t, c // t): index[ids] for (r, c), ids in found.items()}
 
-    def label(self, place: Place, candidates: dict[Key, Ints], again: Iterable[int]) -> dict[int, list[Window]]:
-        """Label tiles; gives each frame's windows."""
-        lost = np.array(sorted(again), np.int32)
+    def label(self) -> None:
+        """Label the tiles, or those again that lost a frame; `windows` are where each frame won."""
+        for i in sorted(self.failed):
+            self.reject(i, self.failed[i])
+            self.pixels[i] = 0
+        lost = {w.key for i in self.failed for w in self.windows[i]}
+        if self.failed or self.windows:
+            self.candidates = {k: ids for k, ids in self.candidates.items() if k in lost}
+        again = np.array(sorted(self.failed), np.int32)
+        self.failed = {}
 
         def tasks() -> Iterator[LabelTask]:
-            for key, ids in candidates.items():
+            for key, ids in self.candidates.items():
                 good = ids[self.usable[ids]]
-                yield LabelTask(place, key, good, self.shots.take(good), self.local(key), lost)
+                yield LabelTask(self.place, key, good, self.shots.take(good), self.local(key), again)
 
         windows: dict[int, list[Window]] = defaultdict(list)
         for result in self.run(label_pass, tasks()):
             for i, window in result:
                 windows[i].append(window)
-        return {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
+        self.windows = {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
+        for i, own in self.windows.items():
+            self.pixels[i] += sum(w.pixels for w in own)
 
     def local(self, key: Key) -> Terrain:
         return crop(self.terrain, self.canvas.tile_bounds(key))
 
-    def sample(self, place: Place, windows: dict[int, list[Window]], thumbnails: dict[str, Bytes]) -> dict[int, str]:
-        """Read and sample the pictures; gives those that could not be read, and why."""
-        failed: dict[int, str] = {}
-        done = 0
-        for result in self.run(sample_pass, self.sample_tasks(place, windows)):
-            for picture in result:
-                if picture.reason is not None:
-                    failed[picture.index] = picture.reason
-                else:
-                    thumbnails[self.frames[picture.index].frame.image] = picture.thumbnail
-            done += len(result)
-            if self.progress is not None:
-                self.progress(done, len(windows))
-        return failed
+    def home(self, i: int) -> tuple[int, int, int]:
+        """Where in the serpentine over the tiles a frame is drawn."""
+        row, col = max(self.windows[i], key=lambda w: (w.pixels, w.key)).key
+        return row, col if row % 2 == 0 else -col, i
 
-    def sample_tasks(self, place: Place, windows: dict[int, list[Window]]) -> Iterator[SampleTask]:
-        """Pictures in an order that walks over the tiles in a serpentine, so that few tiles are mapped at once."""
-
-        def home(i: int) -> tuple[int, int, int]:
-            row, col = max(windows[i], key=lambda w: (w.pixels, w.key)).key
-            return row, col if row % 2 == 0 else -col, i
-
-        order = sorted(windows, key=home)
-        for start in range(0, len(order), _FRAMES_PER_TASK):
-            some = order[start : start + _FRAMES_PER_TASK]
-            pictures = [self.shot(i, windows[i]) for i in some]
-            terrain = {key: self.local(key) for key in sorted({w.key for p in pictures for w in p.windows})}
-            yield SampleTask(place, pictures, self.shots.take(np.array(some)), terrain, self.read)
-
-    def shot(self, i: int, windows: list[Window]) -> Shot:
+    def shot(self, i: int, number: int, row: int) -> Shot:
+        """A frame's share of this layer, whose number it is among those that are drawn."""
         frame = self.frames[i]
         gain = np.ones(3, np.float32) * np.asarray(self.gains.get(frame.frame.image, 1.0), np.float32)
         picture_gsd = float(frame.camera.position[2] - self.ground[i]) / frame.camera.lens.focal_px
-        return Shot(i, frame.frame.path, gain, reduction(self.canvas.grid.gsd_m, picture_gsd), windows)
+        factor = reduction(self.canvas.grid.gsd_m, picture_gsd)
+        return Shot(number, row, i, gain, factor, self.windows[i])
 
-    def seen_m2(self, keys: set[Key] | None) -> float:
+    def layer_of(self, indices: list[int]) -> TaskLayer:
+        """What a task has to know to draw some frames."""
+        keys = sorted({w.key for i in indices for w in self.windows[i]})
+        return TaskLayer(self.place, self.shots.take(np.array(indices, int)), {key: self.local(key) for key in keys})
+
+    def take(self, sampled: Sampled) -> None:
+        """Note what became of a frame."""
+        if sampled.reason is not None:
+            self.failed[sampled.index] = sampled.reason
+        elif sampled.thumbnail is not None:
+            self.thumbnails[self.frames[sampled.index].frame.image] = sampled.thumbnail
+
+    def adopt(self) -> None:
+        """Move the tiles into the canvas."""
+        store = self.canvas.staging(_STAGING)
+        keys = {*store.existing(), *self.canvas.changed_since(0)} if self.keys is None else self.keys
+        self.canvas.adopt(store, sorted(keys))
+
+    def stats(self) -> RenderStats:
+        gsd = self.canvas.grid.gsd_m
+        drawn = float(self.pixels.sum()) * gsd * gsd
+        return RenderStats(self.pixels, self.seen_m2(), drawn, self.rejected, self.thumbnails)
+
+    def seen_m2(self) -> float:
         """Ground that the usable frames see, measured on coarse cells."""
         grid, t = self.canvas.grid, self.canvas.tile_px
         factor = 1
@@ -245,9 +317,9 @@ class _Job:
             max(1, (grid.height + factor // 2) // factor),
         )
         mask = coverage([f.camera for f, good in zip(self.frames, self.usable) if good], coarse, self.terrain)
-        if keys is not None:
+        if self.keys is not None:
             wanted = np.zeros((self.canvas.tile_rows, self.canvas.tile_cols), bool)
-            for key in keys:
+            for key in self.keys:
                 wanted[key] = True
             side = t // factor
             mask &= wanted.repeat(side, 0).repeat(side, 1)[: coarse.height, : coarse.width]
