@@ -1,0 +1,1 @@
+"""Benchmarks behind `orthoswarm bench`: accuracy, growth of the cost, other programs on the same photos."""

@@ -1,0 +1,143 @@
+"""Accuracy and cost of the methods on sets with truth: do nothing, the paper, swarm, true poses."""
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.bench.paste import paste
+from gcs_plugin.bench.runs import check_set, cost, described, keep, kept, label, machine, mosaic, share, text
+
+METHODS = ("nothing", "paper", "swarm", "truth")
+NAMES = {"nothing": "do nothing", "paper": "paper", "swarm": "swarm", "truth": "true poses"}
+
+
+def run_accuracy(
+    sets: Sequence[Path], methods: Sequence[str], out: Path, workers: int | None, keep_maps: bool
+) -> dict[str, Any]:
+    """Measure every method on every set; what is in `out` already is not measured again.
+
+    Raises:
+        InputError: if a folder is no set with truth.
+    """
+    for folder in sets:
+        check_set(folder, truth=True)
+    rows = []
+    for folder in sets:
+        for method in methods:
+            path = out / f"{folder.absolute().name}-{method}.json"
+            row = kept(path)
+            if row is None:
+                print(f"{folder.name}: {method}", file=sys.stderr, flush=True)
+                row = measure(folder, method, out / "map", workers, keep_maps)
+                keep(path, row)
+            rows.append(described(folder) | row)
+    return {"machine": machine(), "rows": rows}
+
+
+def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map: bool) -> dict[str, Any]:
+    """One set mapped by one method and compared with the truth; a failure is a row with its message."""
+    from gcs_plugin.commands.evaluate import evaluate_poses
+    from orthoswarm.errors import OrthoSwarmError
+
+    out = out.with_name(f"map-{folder.absolute().name}-{method}")
+    row: dict[str, Any] = described(folder) | {"method": method}
+    try:
+        if method == "truth":
+            row |= true_orthoimage(folder, out)
+            product = out / "orthoimage.tif"
+        else:
+            how = ["--until", "realtime"] if method == "nothing" else ["--refine", method]
+            row |= cost(mosaic(folder / "photos", folder / "basemap.tif", out, how, workers))
+            product = out / ("realtime.tif" if method == "nothing" else "orthoimage.tif")
+        row |= judged(product, folder)
+        if method != "truth":
+            row["poses"] = evaluate_poses(out / "frames.jsonl", folder / "truth" / "frames.csv").figures()
+    except OrthoSwarmError as error:
+        row["error"] = str(error)
+    if not keep_map:
+        shutil.rmtree(out, ignore_errors=True)
+    return row
+
+
+def judged(product: Path, folder: Path) -> dict[str, Any]:
+    """The figures of `orthoswarm evaluate` for a map of a set."""
+    from gcs_plugin.commands.evaluate import evaluate_ortho
+
+    truth = folder / "truth"
+    mask = truth / "ground_mask.tif"
+    return evaluate_ortho(product, truth / "reference.tif", mask if mask.exists() else None).figures()
+
+
+def true_orthoimage(folder: Path, out: Path, photos: Path | None = None) -> dict[str, Any]:
+    """Render a set from its true cameras over its true ground: the ceiling of the measure. Gives the time.
+
+    Args:
+        folder: the set. out: where orthoimage.tif goes.
+        photos: some of its photos in the same sub-folders, None for all.
+    """
+    from time import perf_counter, process_time
+
+    import telemetry
+    from gcs_plugin.commands.evaluate import read_truth
+    from orthoswarm.errors import InputError
+    from orthoswarm.placement import PlacedFrame
+
+    wall, cpu = perf_counter(), process_time()
+    true = read_truth(folder / "truth" / "frames.csv")
+    frames = [f for f in telemetry.load([photos or folder / "photos"]).frames if f.image in true]
+    if not frames:
+        raise InputError(f"no photo of {folder} stands in its truth/frames.csv; make the set again")
+    placed = [PlacedFrame(f, true[f.image][2], "fine", 0.0) for f in frames]
+    paste(placed, _true_ground(folder), true[frames[0].image][1], out)
+    return {"wall_s": perf_counter() - wall, "cpu_s": process_time() - cpu, "frames": len(placed)}
+
+
+def _true_ground(folder: Path) -> Any:
+    import numpy as np
+    import rasterio
+
+    from orthoswarm.placement import Terrain
+
+    with rasterio.open(folder / "truth" / "dtm.tif") as dtm:
+        step = max(1, round(4.0 / dtm.transform.a))
+        size = (dtm.height // step, dtm.width // step)
+        z = dtm.read(1, out_shape=size, resampling=rasterio.enums.Resampling.average)[::-1].astype(np.float32)
+        pitch = (dtm.bounds.right - dtm.bounds.left) / size[1]
+        return Terrain(dtm.bounds.left + pitch / 2, dtm.bounds.bottom + pitch / 2, pitch, np.ascontiguousarray(z))
+
+
+def accuracy_table(result: dict[str, Any]) -> str:
+    """The result as a Markdown table; what is within a metre stands as a share of what true poses reach."""
+    lines = [
+        f"Machine: {result['machine']}.",
+        "",
+        "| set | method | map median m | map 95 % m | not found | within 1 m | of what true poses give "
+        "| picture centres median / 95 % m | error within 1 / 2 sigma | worst FoV error deg "
+        "| CPU s | wall s | memory MB |",
+        "|---" * 13 + "|",
+    ]
+    within = {r["set"]: r.get("share_within_1m") for r in result["rows"] if r["method"] == "truth"}
+    for row in result["rows"]:
+        start = f"| {label(row)} | {NAMES[row['method']]} |"
+        if "error" in row:
+            lines.append(f"{start} failed: {row['error']} |" + " |" * 10)
+            continue
+        best, poses = within.get(row["set"]), row.get("poses") or {}
+        fov = [abs(v) for v in (poses.get("fov_error_deg") or {}).values() if v is not None]
+        centres = " / ".join(text(poses.get(f"center_ground_{k}_m"), 2) for k in ("median", "p95")) if poses else "-"
+        honest = " / ".join(share(poses.get(f"sigma_within_{k}"), 0) for k in (1, 2)) if poses else "-"
+        cells = [
+            text(row["median_m"], 3),
+            text(row["p95_m"], 3),
+            share(row["unmatched_share"]),
+            share(row["share_within_1m"]),
+            share(row["share_within_1m"] / best if best else None),
+            centres,
+            honest,
+            text(max(fov, default=None), 2),
+            *(text(row.get(k), 0) for k in ("cpu_s", "wall_s", "peak_rss_mb")),
+        ]
+        lines.append(f"{start} {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

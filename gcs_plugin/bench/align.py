@@ -1,0 +1,169 @@
+"""Bring what other programs made to the ground: camera models by recorded positions, pictures by a homography."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.errors import OrthoSwarmError
+
+if TYPE_CHECKING:
+    from orthoswarm.camera import Camera
+
+Array = NDArray[np.float64]
+
+_LEAST_CAMERAS = 4
+_LEAST_INLIERS = 40
+
+
+class Similarity(NamedTuple):
+    """X -> scale * rotation @ X + shift."""
+
+    scale: float
+    rotation: Array
+    shift: Array
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 3) moved."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.shift)
+
+
+def fit_similarity(source: Array, target: Array, rounds: int = 30) -> Similarity:
+    """The similarity that brings points to others, robustly: least squares (Umeyama), reweighted by the residuals.
+
+    Args:
+        source: (N, 3), any frame and scale. target: (N, 3), metres.
+        rounds: of reweighting; weights are Geman-McClure's with the residuals' own median as their scale.
+
+    Raises:
+        OrthoSwarmError: if there are fewer than four points, or all lie on one line: then they leave a turn open.
+    """
+    if len(source) < _LEAST_CAMERAS:
+        raise OrthoSwarmError(f"{len(source)} cameras are too few to place a model")
+    weight = np.ones(len(source))
+    for _ in range(rounds):
+        found = _weighted(source, target, weight)
+        residual = np.linalg.norm(found.apply(source) - target, axis=1)
+        spread = max(float(np.median(residual)), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2
+    return found
+
+
+def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
+    weight = weight / weight.sum()
+    mean_s, mean_t = weight @ source, weight @ target
+    s, t = source - mean_s, target - mean_t
+    u, d, vt = np.linalg.svd((t * weight[:, None]).T @ s)
+    if d[1] < 1e-6 * max(d[0], 1e-300):
+        raise OrthoSwarmError("its cameras lie on one line, which leaves a turn open")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (weight @ (s * s).sum(1)))
+    return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
+
+
+def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array]) -> "tuple[dict[str, Camera], float]":
+    """Cameras of all models in the recorded grid, and the level of the ground below them.
+
+    Each model is placed by itself, the largest first; a picture in two models takes the larger one's camera. Models of
+    fewer than four cameras, or along one line, are left out.
+
+    Args:
+        models: as inside/colmap.py writes them.
+        recorded: image -> easting, northing, height in metres.
+
+    Returns:
+        Image -> camera; the median height of the models' 3-D points, for pasting on flat ground.
+
+    Raises:
+        OrthoSwarmError: if no model can be placed.
+    """
+    from orthoswarm.camera import Camera, Lens
+
+    cameras: dict[str, Camera] = {}
+    heights: list[Array] = []
+    for model in sorted(models, key=lambda m: -len(m["cameras"])):
+        own = {k: v for k, v in model["cameras"].items() if k in recorded}
+        centers = np.array([v["center"] for v in own.values()]).reshape(-1, 3)
+        try:
+            to_grid = fit_similarity(centers, np.array([recorded[k] for k in own]).reshape(-1, 3))
+        except OrthoSwarmError:
+            continue
+        for (name, said), center in zip(own.items(), to_grid.apply(centers), strict=True):
+            lens = Lens(said["width"], said["height"], said["focal_px"], k1=said["k1"])
+            cameras.setdefault(name, Camera(center, to_grid.rotation @ np.array(said["rotation"]), lens))
+        points = np.array(model["points"]).reshape(-1, 3)
+        heights.append(to_grid.apply(points)[:, 2])
+    known = np.concatenate(heights) if heights else np.zeros(0)
+    if not len(known):
+        raise OrthoSwarmError("no model has the cameras and points to be placed by recorded positions")
+    return cameras, float(np.median(known))
+
+
+def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
+    """Lay a picture without georeference on the reference by one homography and write it as a GeoTIFF (RGBA).
+
+    The homography comes from SIFT matches between both (MAGSAC): no hand takes part. It is fitted to the truth, so that
+    only the picture's inner shape is judged afterwards, in the picture's favour.
+
+    Returns:
+        Number of matches that agree.
+
+    Raises:
+        OrthoSwarmError: if the picture fits nowhere.
+    """
+    import cv2
+    import rasterio
+
+    rgb = cv2.imread(str(picture), cv2.IMREAD_COLOR)
+    if rgb is None:
+        raise OrthoSwarmError(f"{picture.name} cannot be read as a picture")
+    with rasterio.open(reference) as file:
+        step = 2
+        shape = (file.count, file.height // step, file.width // step)
+        ground = file.read(out_shape=shape, resampling=rasterio.enums.Resampling.average)
+        profile = {"crs": file.crs, "transform": file.transform, "width": file.width, "height": file.height}
+    h, inliers = find_homography(
+        cv2.cvtColor(rgb, cv2.COLOR_BGR2GRAY), cv2.cvtColor(np.moveaxis(ground[:3], 0, -1), cv2.COLOR_RGB2GRAY)
+    )
+    h = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1]]) @ h
+    alpha = (rgb.max(2) > 0).astype(np.uint8) * 255
+    bands = np.dstack([rgb[..., ::-1], alpha])
+    warped = cv2.warpPerspective(bands, h, (profile["width"], profile["height"]), flags=cv2.INTER_AREA)
+    warped[warped[..., 3] < 255] = 0
+    with rasterio.open(
+        out, "w", driver="GTiff", count=4, dtype="uint8", compress="deflate", tiled=True, **profile
+    ) as f:
+        f.write(np.moveaxis(warped, -1, 0))
+        f.colorinterp = [rasterio.enums.ColorInterp[n] for n in ("red", "green", "blue", "alpha")]
+    return inliers
+
+
+def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:
+    """The homography from a grey picture to a grey map, from SIFT matches; with the number that agree.
+
+    Raises:
+        OrthoSwarmError: if fewer than forty agree.
+    """
+    import cv2
+
+    lost = OrthoSwarmError("its picture fits nowhere on the true map")
+    sift = cv2.SIFT_create(nfeatures=20000)  # type: ignore[attr-defined,unused-ignore]
+    (here, own), (there, other) = sift.detectAndCompute(picture, None), sift.detectAndCompute(ground, None)
+    if own is None or other is None or len(own) < 2 or len(other) < 2:
+        raise lost
+    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
+    pairs = [p for p in matcher.knnMatch(own, other, k=2) if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+    if len(pairs) < _LEAST_INLIERS:
+        raise lost
+    a = np.array([here[p[0].queryIdx].pt for p in pairs])
+    b = np.array([there[p[0].trainIdx].pt for p in pairs])
+    try:
+        h, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, 8.0, maxIters=20000, confidence=0.9999)
+    except cv2.error:  # OpenCV 5 throws where it finds no model
+        raise lost from None
+    if h is None or int(mask.sum()) < _LEAST_INLIERS:
+        raise lost
+    return np.asarray(h, float), int(mask.sum())

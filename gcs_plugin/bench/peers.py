@@ -1,0 +1,386 @@
+"""Other programs on the same photos, side by side with this one (the paper's Table I): accuracy, time, memory.
+
+Each runs in a virtual environment of its own, made on first use; none of them is a dependency. Each gets the same
+photos, the same number of threads, the same limit, and is measured in the same way, as is this program.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.bench.accuracy import judged, true_orthoimage
+from gcs_plugin.bench.meter import run_measured
+from gcs_plugin.bench.runs import (
+    check_set,
+    described,
+    keep,
+    kept,
+    label,
+    last_words,
+    linked,
+    machine,
+    mosaic_command,
+    pictures,
+    share,
+    text,
+)
+from orthoswarm.errors import InputError, OrthoSwarmError
+
+SUCCESS = 0.9
+"""A map succeeded when this share of the ground that the photos show lies within a metre of its true place."""
+
+_INSIDE = Path(__file__).parent / "inside"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One program on one set.
+
+    Attributes:
+        folder: the set. photos: those to use, in their sub-folders. flat: the same, all in one folder.
+        out: an empty folder for what it makes. threads: how many it may use.
+    """
+
+    folder: Path
+    photos: Path
+    flat: Path
+    out: Path
+    threads: int
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A program to compare with.
+
+    Attributes:
+        title: its name in the table.
+        packages: what its environment needs, for pip; empty for this program itself.
+        command: the command line of a job, given the environment's folder of programs.
+        product: makes the GeoTIFF that is judged from what the program made; gives its path and how many pictures are
+            in it (None where it does not say).
+        georeferenced: how it knows where it is, for the table.
+    """
+
+    title: str
+    packages: tuple[str, ...]
+    command: Callable[[Job, Path], list[str]]
+    product: Callable[[Job], tuple[Path, int | None]]
+    georeferenced: str
+    variables: dict[str, str] = field(default_factory=dict)
+
+
+# -- the programs -------------------------------------------------------------------------------------------------
+
+
+def _own(refine: str) -> Program:
+    def command(job: Job, _: Path) -> list[str]:
+        return mosaic_command(
+            job.photos, job.folder / "basemap.tif", job.out / "map", ["--refine", refine], job.threads
+        )
+
+    def product(job: Job) -> tuple[Path, int | None]:
+        report = kept(job.out / "map" / "report.json") or {}
+        return job.out / "map" / "orthoimage.tif", report.get("frames", {}).get("used")
+
+    return Program(f"OrthoSwarm `{refine}`", (), command, product, "yes, on the map")
+
+
+def _orthomosaic_command(job: Job, programs: Path) -> list[str]:
+    options = ["--workers", str(job.threads), "--backend", "cpu", "--no-preview"]
+    return [str(programs / "orthomosaic"), str(job.flat), "-o", str(job.out / "ortho.tif"), *options]
+
+
+def _orthomosaic_product(job: Job) -> tuple[Path, int | None]:
+    report = kept(job.out / "ortho_report.json") or {}
+    if not report.get("georeferenced", True):
+        raise OrthoSwarmError("it made a picture without georeference")
+    return job.out / "ortho.tif", report.get("images_used")
+
+
+def _script(name: str) -> Callable[[Job, Path], list[str]]:
+    def command(job: Job, programs: Path) -> list[str]:
+        return [str(programs / "python"), str(_INSIDE / name), str(job.photos), str(job.out), str(job.threads)]
+
+    return command
+
+
+def _stitched(job: Job) -> tuple[Path, int | None]:
+    from gcs_plugin.bench.align import lay_on_reference
+
+    out = job.out / "laid.tif"
+    lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
+    return out, (kept(job.out / "said.json") or {}).get("used")
+
+
+def _pasted(job: Job) -> tuple[Path, int | None]:
+    import numpy as np
+
+    import telemetry
+    from gcs_plugin.bench.align import placed_models
+    from gcs_plugin.bench.paste import paste
+    from orthoswarm.geo import LocalGrid, area_epsg
+    from orthoswarm.placement import PlacedFrame, Terrain
+
+    frames = {f.image: f for f in telemetry.load([job.photos]).frames}
+    fixes = {name: f.fix for name, f in frames.items() if f.fix.height_m is not None}
+    epsg = area_epsg([f.lat_deg for f in fixes.values()], [f.lon_deg for f in fixes.values()])
+    grid = LocalGrid(epsg)
+    recorded = {
+        name: np.array([*np.ravel(grid.to_grid(f.lat_deg, f.lon_deg)), f.height_m], float) for name, f in fixes.items()
+    }
+    cameras, level = placed_models(kept(job.out / "poses.json") or [], recorded)
+    placed = [PlacedFrame(frames[name], camera, "fine", 0.0) for name, camera in sorted(cameras.items())]
+    return paste(placed, Terrain.flat(level), epsg, job.out), len(placed)
+
+
+PROGRAMS = {
+    "swarm": _own("swarm"),
+    "paper": _own("paper"),
+    "pyorthomosaic": Program(
+        "pyOrthomosaic", ("pyOrthomosaic==0.9.3",), _orthomosaic_command, _orthomosaic_product, "yes, by GPS tags"
+    ),
+    "stitcher": Program(
+        "OpenCV Stitcher, scans",
+        ("opencv-python-headless>=4.10,<5",),
+        _script("stitch.py"),
+        _stitched,
+        "no (laid on the truth by one homography)",
+    ),
+    "pycolmap": Program(
+        "pycolmap, pasted on flat ground",
+        ("pycolmap==4.2.1",),
+        _script("colmap.py"),
+        _pasted,
+        "yes, by a similarity to the GPS tags",
+    ),
+}
+
+
+# -- running ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How to compare.
+
+    Attributes:
+        programs: keys of PROGRAMS. out: folder for results. environments: folder of the virtual environments.
+        limit_s: CPU seconds a program may use. every: use every n-th photo of a vehicle. threads: for each program.
+        keep_maps: keep what the programs made.
+    """
+
+    programs: tuple[str, ...]
+    out: Path
+    environments: Path
+    limit_s: float
+    every: int
+    threads: int
+    keep_maps: bool
+
+    def path(self, folder: Path, name: str, suffix: str) -> Path:
+        """Where something about one program on one set is kept."""
+        thin = f"-every{self.every}" if self.every > 1 else ""
+        return self.out / f"{folder.absolute().name}-{name}{thin}{suffix}"
+
+
+def run_peers(sets: Sequence[Path], settings: Settings) -> dict[str, Any]:
+    """Run every program on every set; what is in the folder of results already is not run again.
+
+    Raises:
+        InputError: if a folder is no set with truth, or a program is not known.
+    """
+    unknown = set(settings.programs) - set(PROGRAMS)
+    if unknown or not settings.programs:
+        raise InputError(f"--programs takes some of {', '.join(PROGRAMS)}; give them with commas between")
+    for folder in sets:
+        check_set(folder, truth=True)
+    rows = []
+    for folder in sets:
+        ceiling = _kept(folder, "truth", settings)
+        for name in settings.programs:
+            rows.append(described(folder) | with_verdict(_kept(folder, name, settings), ceiling))
+        rows.append(described(folder) | with_verdict(ceiling, ceiling))
+    return {"machine": machine(), "limit_s": settings.limit_s, "threads": settings.threads, "rows": rows}
+
+
+def _kept(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
+    path = settings.path(folder, name, ".json")
+    row = kept(path)
+    if row is None:
+        print(f"{folder.name}: {name}", file=sys.stderr, flush=True)
+        row = _ceiling(folder, settings) if name == "truth" else _row(folder, name, settings)
+        row |= {"program": name, "every": settings.every}
+        keep(path, row)
+    found: dict[str, Any] = row
+    return found
+
+
+def thinned(folder: Path, every: int) -> list[Path]:
+    """Every n-th photo of each vehicle of a set."""
+    by_folder: dict[Path, list[Path]] = {}
+    for photo in pictures(folder / "photos"):
+        by_folder.setdefault(photo.parent, []).append(photo)
+    return [photo for photos in by_folder.values() for photo in photos[::every]]
+
+
+def _ceiling(folder: Path, settings: Settings) -> dict[str, Any]:
+    """The map from true poses of the same photos: how much ground there is to win."""
+    photos, out = settings.out / "photos", settings.out / "run"
+    chosen = thinned(folder, settings.every)
+    linked(chosen, folder / "photos", photos)
+    shutil.rmtree(out, ignore_errors=True)
+    row = true_orthoimage(folder, out, photos) | {"photos": len(chosen)}
+    row |= judged(out / "orthoimage.tif", folder) | {"used": row["frames"]}
+    _picture(out / "orthoimage.tif", settings.path(folder, "truth", ".jpg"))
+    _remove(settings, photos, out)
+    return row
+
+
+def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
+    """One program on one set; a failure is a row with its message."""
+    program, base = PROGRAMS[name], settings.out
+    chosen = thinned(folder, settings.every)
+    job = Job(folder.absolute(), base / "photos", base / "flat", base / "run" / name, settings.threads)
+    linked(chosen, folder / "photos", job.photos)
+    linked(chosen, folder / "photos", job.flat, flat=True)
+    shutil.rmtree(job.out, ignore_errors=True)
+    job.out.mkdir(parents=True)
+    row: dict[str, Any] = {"photos": len(chosen)}
+    log = settings.path(folder, name, ".log")
+    try:
+        programs = environment(name, settings.environments) if program.packages else Path(sys.executable).parent
+        row["version"] = _versions(programs, program)
+        used = run_measured(
+            program.command(job, programs), log, settings.limit_s, _threads(job.threads), job.out / "stdout"
+        )
+        row |= {"wall_s": used.wall_s, "cpu_s": used.cpu_s, "peak_rss_mb": used.peak_rss_mb}
+        if used.code is None:
+            raise OrthoSwarmError(f"stopped at the limit of {settings.limit_s:.0f} CPU s")
+        if used.code:
+            raise OrthoSwarmError(last_words(log.read_text(encoding="utf-8", errors="replace")))
+        product, row["used"] = program.product(job)
+        _picture(product, settings.path(folder, name, ".jpg"))
+        row |= judged(product, folder)
+    except OrthoSwarmError as error:
+        row["error"] = str(error)
+    _remove(settings, job.photos, job.flat, job.out)
+    return row
+
+
+def _remove(settings: Settings, *folders: Path) -> None:
+    for folder in folders:
+        if not settings.keep_maps:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _threads(count: int) -> dict[str, str]:
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    return {name: str(count) for name in names}
+
+
+def environment(name: str, root: Path) -> Path:
+    """The folder of programs of a program's own virtual environment, made where it is not there yet.
+
+    Raises:
+        OrthoSwarmError: if it cannot be installed, with pip's message.
+    """
+    folder = (root / name).absolute()
+    programs = folder / "bin"
+    if (folder / "made").exists():
+        return programs
+    print(f"making an environment with {' '.join(PROGRAMS[name].packages)}", file=sys.stderr, flush=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    for command in (
+        [sys.executable, "-m", "venv", str(folder)],
+        [str(programs / "python"), "-m", "pip", "install", "-q", *PROGRAMS[name].packages],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise OrthoSwarmError(f"it could not be installed: {last_words(done.stderr)}")
+    (folder / "made").touch()
+    return programs
+
+
+def _versions(programs: Path, program: Program) -> str:
+    """The installed version of a program, as its environment says it."""
+    if not program.packages:
+        from orthoswarm import __version__
+
+        return __version__
+    name = program.packages[0].split("=")[0].split(">")[0]
+    code = f"import importlib.metadata as m; print(m.version({name!r}))"
+    done = subprocess.run([str(programs / "python"), "-c", code], capture_output=True, text=True, check=False)
+    return done.stdout.strip()
+
+
+def _picture(product: Path, out: Path) -> None:
+    """A small picture of a map on white, to be looked at."""
+    import numpy as np
+    import rasterio
+    from PIL import Image
+
+    with rasterio.open(product) as file:
+        scale = max(1.0, max(file.width, file.height) / 900.0)
+        shape = (max(1, round(file.height / scale)), max(1, round(file.width / scale)))
+        data = file.read([1, 2, 3], out_shape=(3, *shape), resampling=rasterio.enums.Resampling.average)
+        seen = file.dataset_mask(out_shape=shape) > 0
+    part = out.with_suffix(".part")
+    Image.fromarray(np.moveaxis(np.where(seen, data, 255), 0, -1).astype(np.uint8)).save(part, "JPEG", quality=85)
+    os.replace(part, out)
+
+
+# -- judging ------------------------------------------------------------------------------------------------------
+
+
+def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]:
+    """A row with `right_share` and `succeeded`.
+
+    `right_share` is the ground within a metre of its true place, as a share of the ground that a map from the true
+    poses of the same photos covers: what is missing from a map counts against it like what is wrong.
+    """
+    if "error" in row or not ceiling.get("blocks"):
+        return row | {"succeeded": False}
+    right = min(1.0, row["share_within_1m"] * row["blocks"] / ceiling["blocks"])
+    return row | {"right_share": right, "succeeded": right >= SUCCESS}
+
+
+def peers_table(result: dict[str, Any]) -> str:
+    """The result as a Markdown table."""
+    lines = [
+        f"Machine: {result['machine']}; {result['threads']} thread(s) and {result['limit_s']:.0f} CPU seconds for each "
+        f"program. Succeeded: at least {SUCCESS:.0%} of the ground that the photos show lies within 1 m of its place.",
+        "",
+        "| set | program | photos in the map | georeferenced | succeeded | within 1 m, of all ground | median m "
+        "| 95 % m | not found | CPU s | wall s | memory MB |",
+        "|---" * 12 + "|",
+    ]
+    lines += [_line(row) for row in result["rows"]]
+    return "\n".join(lines) + "\n"
+
+
+def _line(row: dict[str, Any]) -> str:
+    program = PROGRAMS.get(row["program"])
+    name = program.title if program else "true poses (the ceiling)"
+    if program and program.packages and row.get("version"):
+        name += f" {row['version']}"
+    thin = f", 1 of {row['every']} photos" if row["every"] > 1 else ""
+    used = row.get("used")
+    costs = [text(row.get(k), 0) for k in ("cpu_s", "wall_s", "peak_rss_mb")]
+    if "error" in row:
+        middle = [f"- of {row['photos']}", "-", f"no: {row['error'].replace('|', '/')}", "-", "-", "-", "-"]
+    else:
+        middle = [
+            f"{'-' if used is None else used} of {row['photos']}",
+            program.georeferenced if program else "yes",
+            "yes" if row["succeeded"] else "no",
+            share(row["right_share"]),
+            text(row["median_m"], 2),
+            text(row["p95_m"], 2),
+            share(row["unmatched_share"]),
+        ]
+    return f"| {label(row)}{thin} | {name} | " + " | ".join(middle + costs) + " |"
