@@ -127,14 +127,31 @@ def test_lines_with_a_no_fly_zone_go_home_around_it(tmp_path):
     assert plan(path, "--vehicles", 1, *FLAGS, "--no-fly", path, "--out", tmp_path / "no") == 2
 
 
-def test_a_further_no_fly_zone_is_kept_clear(area, tmp_path):
+@pytest.mark.parametrize("clearance", [8, 25])
+def test_a_further_no_fly_zone_is_kept_clear(clearance, area, tmp_path):
     zone = [(100, 200), (180, 200), (180, 330), (100, 330)]
     fence = write_geojson(tmp_path / "zone.geojson", on_globe(zone))
-    assert plan(area, "--vehicles", 3, *FLAGS, "--no-fly", fence, "--clearance", 8, "--out", tmp_path / "out") == 0
+    assert (
+        plan(area, "--vehicles", 3, *FLAGS, "--no-fly", fence, "--clearance", clearance, "--out", tmp_path / "out") == 0
+    )
     for path in (tmp_path / "out").glob("*.waypoints"):
         way = shapely.LineString(fly(path.read_text()).path)
         for hole in (zone, HOLE):
-            assert way.distance(shapely.Polygon(hole)) > 7.9
+            assert way.distance(shapely.Polygon(hole)) > clearance - 0.1
+
+
+def test_a_run_in_lies_in_line_with_each_leg_before_its_first_picture(area, tmp_path):
+    start = ["--start", "47.853,9.005"]
+    assert plan(area, "--vehicles", 2, *FLAGS, *start, "--run-in", 20, "--endurance", 9, "--out", tmp_path / "out") == 0
+    for path in (tmp_path / "out").glob("*.waypoints"):
+        flown = fly(path.read_text())
+        assert crossed(flown, [HOLE]) == 0.0
+        for begin, end in flown.legs:
+            at = int(np.argmin(np.hypot(*(flown.path - begin).T)))
+            along = (end - begin) / np.hypot(*(end - begin))
+            run_in = shapely.LineString([begin - 20.0 * along, begin])
+            if run_in.distance(shapely.Polygon(HOLE)) > 1.2:
+                assert np.allclose(flown.path[at - 1], begin - 20.0 * along, atol=0.1)
 
 
 BAD_AREAS = {
@@ -173,12 +190,16 @@ def test_bad_areas_get_one_sentence_and_no_files(name, tmp_path, capsys):
         ["--altitude", "0"],
         ["--altitude", "-5"],
         ["--altitude", "nan"],
+        ["--altitude", "1e9"],
         ["--fov-min", "9"],
         ["--fov-min", "151"],
         ["--vehicles", "0"],
         ["--vehicles", "200"],
         ["--vehicles", "60", "--altitude", "120"],
         ["--speed", "0"],
+        ["--speed", "inf"],
+        ["--clearance", "inf"],
+        ["--run-in", "-1"],
         ["--endurance", "1"],
         ["--endurance", "-4"],
         ["--start", "47.1"],
@@ -189,6 +210,7 @@ def test_bad_areas_get_one_sentence_and_no_files(name, tmp_path, capsys):
         ["--ceiling", "20"],
         ["--height-step", "0"],
         ["--swap", "-1"],
+        ["--swap", "inf"],
         ["--no-fly", "nowhere.geojson"],
         ["--method", "spiral"],
         ["--altitude", "high"],

@@ -50,6 +50,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--end", choices=["rtl", "land", "hover"], default="rtl", help="after the last line (default rtl)"
     )
     flight.add_argument("--speed", type=float, metavar="M/S", help="ground speed (default 10)")
+    flight.add_argument(
+        "--run-in",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="straight flight before a leg's first picture (default 0)",
+    )
     flight.add_argument("--endurance", type=float, metavar="MIN", help="longest flight, minutes (default: no limit)")
     flight.add_argument("--swap", type=float, default=2.0, metavar="MIN", help="time to change a battery (default 2)")
     camera = parser.add_argument_group("pictures")
@@ -59,7 +66,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     safety = parser.add_argument_group("safety")
     safety.add_argument("--no-fly", type=Path, action="append", default=[], metavar="FILE", help="further no-fly zones")
     safety.add_argument(
-        "--clearance", type=float, default=1.0, metavar="M", help="distance to no-fly zones (default 1)"
+        "--clearance", type=float, metavar="M", help="distance to no-fly zones (default 1, less for small pictures)"
     )
     safety.add_argument("--separation", type=float, default=10.0, metavar="M", help="between vehicles (default 10)")
     safety.add_argument("--height-step", type=float, default=5.0, metavar="M", help="between heights (default 5)")
@@ -104,20 +111,21 @@ def make_plan(args: argparse.Namespace) -> tuple["Plan", "Area | None"]:
     foot = footprint(
         args.altitude, math.radians(args.fov_min), _aspect(args.aspect), args.side_overlap, args.forward_overlap
     )
-    if not args.swap >= 0.0:
+    if not 0.0 <= args.swap < math.inf:
         raise InputError(f"the time to change a battery is {args.swap:g} min; give 0 or more")
     ceiling = args.altitude + 4 * args.height_step if args.ceiling is None else args.ceiling
     if not ceiling >= args.altitude:
         raise InputError(f"the ceiling of {ceiling:g} m is below the altitude of {args.altitude:g} m; raise it")
-    layers = int((ceiling - args.altitude) / args.height_step + 1e-9) if args.height_step > 0 else 0
+    layers = int(min(12.0, (ceiling - args.altitude) / args.height_step + 1e-9)) if args.height_step > 0 else 0
     options = Options(
         motion=Motion() if args.speed is None else Motion(speed_m_s=args.speed),
         end=args.end,
         starts=[_position(text) for text in args.start],
         endurance_s=math.inf if args.endurance is None else 60.0 * args.endurance,
         clearance_m=args.clearance,
-        separation=Separation(args.separation, args.height_step, min(layers, 12), swap_s=60.0 * args.swap),
+        separation=Separation(args.separation, args.height_step, layers, swap_s=60.0 * args.swap),
         most_items=_MOST_ITEMS[args.autopilot],
+        run_in_m=args.run_in,
     )
     _say("area")
     shapes, no_fly = read_shapes(args.area)

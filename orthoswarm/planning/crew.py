@@ -25,6 +25,8 @@ MOST_VEHICLES = 250  # MAVLink system ids
 _ITEMS_A_LEG = 4
 _SPARE_ITEMS = 40
 _FARTHEST_M = 100_000.0
+_SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
+_LONGEST_RUN_IN_M = 200.0
 _FAIR, _UNFAIR = 1.15, 1.22
 
 
@@ -38,35 +40,45 @@ class Options:
         starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
             begins), one for all, or several that vehicles are given in turn.
         endurance_s: longest flight on one battery; infinite without a limit.
-        clearance_m: distance that paths keep from no-fly zones.
+        clearance_m: distance that paths keep from no-fly zones; None keeps a metre, less where pictures are so small
+            that a metre would leave gaps.
         separation: how far apart vehicles stay.
         most_items: mission items that the autopilot can hold.
+        run_in_m: straight flight in line with a leg before its first picture, so that the vehicle is out of its turn.
     """
 
     motion: Motion = field(default_factory=Motion)
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     endurance_s: float = float("inf")
-    clearance_m: float = 1.0
+    clearance_m: float | None = None
     separation: Separation = field(default_factory=Separation)
     most_items: int = 650
+    run_in_m: float = 0.0
 
     def check(self) -> None:
         """Refuse values that mean nothing.
 
         Raises:
-            InputError: a value that is not larger than 0, or a start that is no position.
+            InputError: a value that is not larger than 0 or out of reach, or a start that is no position.
         """
+        speed = self.motion.speed_m_s
+        if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
+            raise InputError(f"the speed is {speed:g} m/s; give a number from {_SLOWEST_M_S:g} to {_FASTEST_M_S:g}")
         positive = {
-            "speed": self.motion.speed_m_s,
-            "endurance": self.endurance_s,
-            "clearance": self.clearance_m,
-            "separation": self.separation.distance_m,
-            "height step": self.separation.height_m,
+            "endurance": (self.endurance_s / 60.0, "min"),
+            "clearance": (1.0 if self.clearance_m is None else self.clearance_m, "m"),
+            "separation": (self.separation.distance_m, "m"),
+            "height step": (self.separation.height_m, "m"),
         }
-        for name, value in positive.items():
+        for name, (value, unit) in positive.items():
             if not value > 0.0:
-                raise InputError(f"the {name} is {value:g}; give a number larger than 0")
+                raise InputError(f"the {name} is {value:g} {unit}; give a number larger than 0")
+        if not 0.0 <= self.run_in_m <= _LONGEST_RUN_IN_M:
+            raise InputError(f"the run-in is {self.run_in_m:g} m; give 0 to {_LONGEST_RUN_IN_M:g}")
+        for name in ("clearance", "separation", "height step"):
+            if not math.isfinite(positive[name][0]):
+                raise InputError(f"the {name} is not finite; give a number of metres")
         for lat, lon in self.starts:
             if not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
                 raise InputError(f"the start {lat:g},{lon:g} is no position; give latitude,longitude in degrees")
@@ -127,7 +139,7 @@ class Crew:
         fixed = (self._altitude_m + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
         if self._returns:
             fixed += (self._altitude_m + above) / motion.descent_m_s + above / motion.climb_m_s
-        most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // _ITEMS_A_LEG)
+        most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)))
         return Limits(self._options.endurance_s, fixed, apart.swap_s, most_legs)
 
     def share(self, legs: Array, reorder: bool) -> Work:
@@ -180,7 +192,8 @@ class Crew:
         return separate(makers, self._options.motion, self._options.separation)
 
     def _flight(self, legs: Array, home: Array, out_m: float, home_m: float) -> Flight:
-        return make_flight(legs, home, self._altitude_m, self._router, self._returns, out_m, home_m)
+        run_in = self._options.run_in_m
+        return make_flight(legs, home, self._altitude_m, self._router, self._returns, out_m, home_m, run_in)
 
     @property
     def _least_leg_m(self) -> float:

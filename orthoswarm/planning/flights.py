@@ -11,6 +11,7 @@ from orthoswarm.planning.routes import Router
 Array = NDArray[np.float64]
 
 _SAME_M = 0.05
+_STRAIGHT = 0.985  # cosine of ten degrees
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,14 @@ class Flight:
 
 
 def make_flight(
-    legs: Array, home: Array, altitude_m: float, router: Router, returns: bool, out_m: float = 0.0, home_m: float = 0.0
+    legs: Array,
+    home: Array,
+    altitude_m: float,
+    router: Router,
+    returns: bool,
+    out_m: float = 0.0,
+    home_m: float = 0.0,
+    run_in_m: float = 0.0,
 ) -> Flight:
     """The flight over a row of legs.
 
@@ -70,6 +78,8 @@ def make_flight(
         returns: fly back above home at the end.
         out_m: how much higher the way out is.
         home_m: how much higher the way home is.
+        run_in_m: length of a straight, in line with the leg, before its first picture; left out where an obstacle or
+            the start lies in the way, and where the vehicle comes straight on.
     """
     points: list[Array] = []
     camera: list[int] = []
@@ -82,12 +92,16 @@ def make_flight(
     far = float(np.hypot(*(legs[0, 0] - home))) > _SAME_M
     climb = altitude_m + (out_m if far else 0.0)
     if far:
-        add(router.path(home, legs[0, 0])[1:-1], climb)
+        entry = _entry(legs[0], home, router, run_in_m)
+        add(router.path(home, entry[0])[1:-1], climb)
         if out_m > 0.0:
-            add(legs[:1, 0], climb)
+            add(entry[:1], climb)
+        add(entry[:-1], altitude_m)
     for k, (start, end) in enumerate(legs):
         if k:
-            add(router.path(legs[k - 1, 1], start)[1:-1], altitude_m)
+            entry = _entry(legs[k], legs[k - 1, 1], router, run_in_m)
+            add(router.path(legs[k - 1, 1], entry[0])[1:-1], altitude_m)
+            add(entry[:-1], altitude_m)
         add(start[None], altitude_m, 1)
         add(end[None], altitude_m, -1)
     if returns:
@@ -95,3 +109,17 @@ def make_flight(
             add(legs[-1:, 1], altitude_m + home_m)
         add(router.path(legs[-1, 1], home)[1:], altitude_m + home_m)
     return Flight(home, climb, np.array(points), np.array(camera, np.int8), returns)
+
+
+def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:
+    """Where a leg is entered, coming from a point: its first point, behind that of a run-in if there is one."""
+    start = leg[:1]
+    if run_in_m <= 0.0:
+        return start
+    along = (leg[1] - leg[0]) / np.hypot(*(leg[1] - leg[0]))
+    way = leg[0] - before
+    comes_straight = float(way @ along) >= _STRAIGHT * float(np.hypot(*way))
+    ahead = start - run_in_m * along
+    if comes_straight or router.inside(ahead)[0] or router.blocked(ahead, start)[0]:
+        return start
+    return np.concatenate([ahead, start])

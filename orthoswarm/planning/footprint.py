@@ -6,6 +6,7 @@ from math import isfinite, radians, tan
 from orthoswarm.errors import InputError
 
 SMALLEST_FOV_DEG, LARGEST_FOV_DEG = 10.0, 150.0
+HIGHEST_M = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,8 @@ def footprint(
     """
     if not (isfinite(altitude_m) and altitude_m > 0.0):
         raise InputError(f"the altitude is {altitude_m:g} m; give a height above the takeoff point larger than 0")
+    if altitude_m > HIGHEST_M:
+        raise InputError(f"the altitude is {altitude_m:g} m; give metres, at most {HIGHEST_M:g}")
     if not radians(SMALLEST_FOV_DEG) - 1e-9 <= fov_min_rad <= radians(LARGEST_FOV_DEG) + 1e-9:
         raise InputError(
             f"the field of view is outside {SMALLEST_FOV_DEG:g} to {LARGEST_FOV_DEG:g} degrees; "

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _FAIR_ENOUGH = 1.25
+_CLEARANCE_M = 1.0
 _QUICKEST_S = 0.5
 _WORTH = 0.99  # a later candidate must be better by this: the first ones are in the method's own, tidier order
 
@@ -56,7 +57,7 @@ def plan_area(
     """
     options = options or Options()
     options.check()
-    clearance = max(0.1, min(options.clearance_m, 0.125 * foot.width_m))
+    clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
     crew = Crew(vehicles, altitude_m, foot, area.grid, router, options)
     progress("lines")
@@ -135,7 +136,8 @@ def plan_lines(
             f"no stretch of the line is as long as two picture distances ({2 * foot.trigger_m:.0f} m); "
             "fly lower or draw longer lines"
         )
-    router = Router(make_obstacles(no_fly.no_fly, options.clearance_m) if no_fly else shapely.MultiPolygon())
+    clearance = options.clearance_m or _CLEARANCE_M
+    router = Router(make_obstacles(no_fly.no_fly, clearance) if no_fly else shapely.MultiPolygon())
     if router.blocked(legs[:, 0], legs[:, 1]).any() or router.inside(legs.reshape(-1, 2)).any():
         raise InputError("a line crosses a no-fly zone; redraw the line or the zone")
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
