@@ -261,7 +261,8 @@ class Crew:
         """Take pictures until told to stop; the fleet must be polled by another thread."""
         while not stop.is_set():
             self._welcome()
-            if not any([_guarded(follower) for follower in list(self.followers.values())]):
+            taken = sum(_guarded(follower) for follower in list(self.followers.values()))
+            if not taken:
                 time.sleep(_IDLE_S)
 
     def close(self) -> None:
@@ -300,8 +301,8 @@ def _guarded(follower: Follower) -> bool:
 def wait_for_place(fleet: "Fleet", vehicles: int, seconds: float) -> tuple[float, float]:
     """Poll a fleet until so many vehicles know where they are; gives where the one with the lowest id stands.
 
-    Stock ArduCopter says latitude 0, longitude 0 until its receiver and filter have a position, which takes up to half a
-    minute after its start; PX4 says nothing.
+    Stock ArduCopter says latitude 0, longitude 0 until its receiver and filter have a position, which takes up to half
+    a minute after its start; PX4 says nothing.
 
     Raises:
         InputError: they do not come in time.
