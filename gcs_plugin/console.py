@@ -27,6 +27,17 @@ class Client:
         Raises:
             RuntimeError: the daemon refused, or is not there, with a sentence for the user.
         """
+        try:
+            return json.loads(self.fetch(path, body))
+        except ValueError:
+            raise RuntimeError(f"what answers at {self.url} is no daemon; say connect") from None
+
+    def fetch(self, path: str, body: dict[str, Any] | None = None) -> bytes:
+        """The answer of a route as it is.
+
+        Raises:
+            RuntimeError: the daemon refused, or is not there, with a sentence for the user.
+        """
         request = urllib.request.Request(self.url + path, method="GET" if body is None else "POST")
         request.add_header("Authorization", f"Bearer {self.token}")
         data = None
@@ -36,7 +47,7 @@ class Client:
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
             with opener.open(request, data, timeout=_TIMEOUT_S) as answer:
-                return json.loads(answer.read())
+                return bytes(answer.read())
         except urllib.error.HTTPError as error:
             raise RuntimeError(_detail(error)) from None
         except (OSError, ValueError) as error:
