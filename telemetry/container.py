@@ -6,6 +6,7 @@ chunk; TIFF through a memory map. A photo costs a few tens of microseconds.
 
 import mmap
 import os
+import stat
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,11 +51,14 @@ def read_container(path: Path) -> Container:
         NotAPicture: empty, unreadable, of another type, or cut off.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
     except OSError as error:
         raise NotAPicture(f"the file cannot be opened ({error.strerror}); check its permissions") from None
     try:
-        size = os.fstat(fd).st_size
+        state = os.fstat(fd)
+        if not stat.S_ISREG(state.st_mode):  # reading a named pipe would wait for ever
+            raise NotAPicture("this is no file but a pipe or a device; copy the picture itself here")
+        size = state.st_size
         head = os.read(fd, _HEAD)
         if size == 0 or not head:
             raise NotAPicture("the file is empty; copy it again from the camera")

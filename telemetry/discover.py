@@ -37,14 +37,25 @@ class Folder:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """All folders of the inputs, and the folder that picture names are relative to."""
+    """All folders of the inputs, and the folder that picture names are relative to.
+
+    Attributes:
+        root: names are relative to it. folders: those with something in them.
+        left_out: files with a picture's suffix that are not looked into, and why.
+    """
 
     root: Path
     folders: list[Folder]
+    left_out: list[tuple[Path, str]] = field(default_factory=list)
 
     def name(self, path: Path) -> str:
-        """A file's name in all products: relative to the root, forward slashes."""
-        return os.path.relpath(path, self.root).replace(os.sep, "/")
+        """A file's name in all products: relative to the root, forward slashes, writable as UTF-8."""
+        return _text(os.path.relpath(path, self.root))
+
+
+def _text(name: str) -> str:
+    """A path as text: bytes of its name that are no UTF-8 come as escapes, for no file format could hold them."""
+    return name.replace(os.sep, "/").encode("utf-8", "backslashreplace").decode()
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -56,7 +67,7 @@ _DIGITS = re.compile(r"([0-9]{1,18})")
 
 
 def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
-    """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are left out.
+    """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are not looked into.
 
     Raises:
         InputError: no input, or one that does not exist.
@@ -71,17 +82,31 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     root = Path(os.path.commonpath(tops))
     outside = {os.path.abspath(path) for path in exclude}
     folders: dict[Path, Folder] = {}
-    seen: set[str] = set()
-    for path in absolute:
-        files = [path] if path.is_file() else _walk(path, outside)
-        for file in files:
-            real = os.path.realpath(file)
-            if real not in seen:
-                seen.add(real)
-                _sort_in(file, folders, explicit=path.is_file())
+    seen: dict[str, Path] = {}
+    left_out: dict[Path, str] = {}
+    sorted_in: set[Path] = set()
+    inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
+    files = [*inside, *((path, False) for path in absolute if not path.is_dir())]
+    for file, walked in sorted(files, key=lambda entry: entry[0].is_symlink()):  # the file itself before links to it
+        if walked and file.name.startswith("."):
+            left_out[file] = "a hidden file; rename it if it is a photo to be mapped"
+            continue
+        first = seen.setdefault(os.path.realpath(file), file)
+        if first != file:
+            left_out[file] = f"the same file as {first.name}, which is in the input already"
+        elif file not in sorted_in:
+            sorted_in.add(file)
+            _sort_in(file, folders, explicit=not walked)
+    for folder in folders.values():
+        folder.pictures.sort(key=_by_name)
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     _name_vehicles(ordered, root)
-    return Discovery(root, ordered)
+    pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
+    return Discovery(root, ordered, [(file, why) for file, why in pictures if file not in sorted_in])
+
+
+def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
+    return natural_key(path.name)
 
 
 def _walk(top: Path, outside: set[str]) -> list[Path]:
@@ -90,7 +115,7 @@ def _walk(top: Path, outside: set[str]) -> list[Path]:
         below[:] = sorted(
             name for name in below if not name.startswith(".") and os.path.join(folder, name) not in outside
         )
-        found += [Path(folder, name) for name in sorted(files, key=natural_key) if not name.startswith(".")]
+        found += [Path(folder, name) for name in sorted(files, key=natural_key)]
     return found
 
 
@@ -116,8 +141,8 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
 def _name_vehicles(folders: list[Folder], root: Path) -> None:
     taken: set[str] = set()
     for folder in sorted(folders, key=lambda f: len(f.path.parts), reverse=True):
-        relative = os.path.relpath(folder.path, root).replace(os.sep, "/")
-        name = (root.name or "vehicle") if relative == "." else relative
+        relative = _text(os.path.relpath(folder.path, root))
+        name = (_text(root.name) or "vehicle") if relative == "." else relative
         while name in taken:
             name += "_top"
         taken.add(name)

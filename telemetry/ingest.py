@@ -128,6 +128,9 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     options = options or LoadOptions()
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(found.root, found)
+    vehicles = {folder.path: folder.vehicle for folder in found.folders}
+    for path, why in found.left_out:
+        result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, "")))
     tables = _tables(found, result)
     logs = read_logs(found, result)
     total = sum(len(folder.pictures) for folder in found.folders)

@@ -1,6 +1,7 @@
 """Bad input: the rest is mapped and the report says what was left out, or there is one clear error."""
 
 import json
+import os
 from dataclasses import replace
 
 import cv2
@@ -240,3 +241,26 @@ def test_flags_that_make_no_sense_are_refused(scene, tmp_path, mosaic):
         assert mosaic(tmp_path / "photos", **flag)[0] == 2
     (tmp_path / "out").write_text("a file")
     assert main(["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_names_that_are_no_text_and_files_that_are_no_files(scene, tmp_path, mosaic):
+    photos = tmp_path / "photos"
+    files = scene.fly(photos, legs(count=1, photos=5))
+    shot = files[2].read_bytes()
+    (photos / "._DJI_0001.JPG").write_bytes(b"\0\5\x16\7 resource fork")
+    (photos / "copy.JPG").symlink_to(files[0])
+    (photos / "gone.JPG").symlink_to(photos / "nowhere")
+    expected = {f.name for f in files} | {"._DJI_0001.JPG", "copy.JPG", "gone.JPG"}
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(photos / "pipe.JPG")  # reading it would wait for ever
+        expected.add("pipe.JPG")
+    try:
+        (photos / os.fsdecode(b"caf\xe9.JPG")).write_bytes(shot)
+        expected.add("caf\\udce9.JPG")
+    except OSError:  # not every file system takes such a name
+        pass
+    code, rows, _, _ = mosaic(photos, photos, until="realtime")
+    assert code == 0 and set(rows) == expected
+    reasons = {n: r["reason"] for n, r in rows.items() if r["stage"] == "rejected"}
+    assert set(reasons) == expected & {"._DJI_0001.JPG", "copy.JPG", "gone.JPG", "pipe.JPG"}
+    assert "hidden" in reasons["._DJI_0001.JPG"] and "DJI_0000.JPG" in reasons["copy.JPG"]

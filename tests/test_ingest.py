@@ -97,6 +97,7 @@ def test_files_that_are_no_pictures_are_ignored_and_bad_pictures_named(tmp_path)
     result = load([tmp_path])
     assert len(result.frames) == 1
     assert {r.image: r.reason.split(";")[0] for r in result.rejected} == {
+        "._a.JPG": "a hidden file",
         "empty.jpg": "the file is empty",
         "nowhere.jpg": "the picture has no position",
     }

@@ -116,6 +116,12 @@ def test_findings_say_what_tags_got_wrong():
     assert np.flatnonzero(start.yaw_flipped).tolist() == list(range(6, 12))
 
 
+def test_a_compass_that_reads_too_much_is_said_to():
+    world = crosshatch()
+    frames = [replace(f, fix=replace(f.fix, yaw_rad=f.fix.yaw_rad + np.radians(12.0))) for f in world.frames]
+    assert "recorded headings are +12 degrees off" in "\n".join(begin(world, frames).warnings)
+
+
 def test_right_tags_cause_no_finding():
     start = begin(crosshatch(gps_sigma=0.3))
     assert start.warnings == []

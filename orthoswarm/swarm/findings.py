@@ -84,7 +84,7 @@ def _yaw_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> 
         if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
             found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
         elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
-            found.append(f"{who}: recorded headings are {np.degrees(tag.offset):+.0f} degrees off, put right")
+            found.append(f"{who}: recorded headings are {-np.degrees(tag.offset):+.0f} degrees off, put right")
         elif tag.source == "flight_yaw" and np.isfinite(records.yaw[rows]).any():
             found.append(f"{who}: the pictures follow the airframe's heading, not the recorded camera yaw")
     return found
