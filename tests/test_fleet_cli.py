@@ -80,6 +80,19 @@ def test_a_plan_is_uploaded_flown_and_watched_to_its_completion(swarm, folder, c
     assert all(v["photos"] > 10 for v in flown["vehicles"])
 
 
+def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plans(swarm, folder, capsys):
+    assert fleet(capsys, "upload", folder, "--link", swarm)[0] == 0
+    other = folder / "other.waypoints"
+    lines = (folder / "v2.waypoints").read_text().splitlines()
+    other.write_text("\n".join(line.replace("\t60.000\t", "\t61.000\t") for line in lines))
+    assert fleet(capsys, "upload", other, "--vehicle", "2", "--link", swarm)[0] == 0
+    code, said = fleet(capsys, "start", "--plan", folder, "--link", swarm, "--json")
+    assert code == 1 and not any(v["ok"] for v in said["vehicles"])
+    assert "does not hold v2.plan" in said["vehicles"][1]["text"] and "its height is 61" in said["vehicles"][1]["text"]
+    code, listed = fleet(capsys, "list", "--link", swarm, "--json")
+    assert not any(v["armed"] for v in listed["vehicles"])
+
+
 def test_one_vehicle_is_started_paused_resumed_and_brought_home(swarm, folder, capsys):
     assert fleet(capsys, "upload", folder / "v1.plan", "--vehicle", "v3", "--link", swarm)[0] == 0
     code, text = fleet(capsys, "start", "--vehicle", "3", "--link", swarm)

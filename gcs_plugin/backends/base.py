@@ -58,6 +58,15 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
+    def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
+        """Read the missions that vehicles hold, all at once; None for one that does not hand it out.
+
+        Args:
+            systems: system ids.
+            report: as for `upload`.
+        """
+
+    @abc.abstractmethod
     def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
         """Start, pause, resume or bring home vehicles.
 

@@ -11,6 +11,7 @@ from gcs_plugin.fleetevents import FleetEvent
 from gcs_plugin.links import Link
 from gcs_plugin.mavlink import Autopilot
 from gcs_plugin.mission.completion import Phase
+from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.streams import default_rates
@@ -82,6 +83,22 @@ class DirectBackend(Backend):
         """All uploads at once."""
         begin = {s: (lambda s=s, m=m: self.fleet.upload(s, m)) for s, m in missions.items()}
         return self._run(begin, dict.fromkeys(missions, 0.0), "upload", report)
+
+    def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
+        """All downloads at once."""
+        fleet, jobs = self.fleet, dict[int, MissionDownload]()
+
+        def begin(system: int) -> Exchange:
+            jobs[system] = fleet.download(system)
+            return jobs[system]
+
+        reads = {system: (lambda system=system: begin(system)) for system in systems}
+        self._run(reads, dict.fromkeys(systems, 0.0), "read", report)
+        found: dict[int, Mission | None] = dict.fromkeys(systems)
+        for system, job in jobs.items():
+            if job.items is not None:
+                found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
+        return found
 
     def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
         """All commands at their times."""

@@ -138,6 +138,14 @@ class MavsdkBackend(Backend):
                 self._crafts[s].vehicle.detector.uploaded(missions[s])
         return outcomes
 
+    def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
+        """Downloads one after the other, for MAVSDK's calls wait."""
+        found: dict[int, Mission | None] = {}
+        for system in systems:
+            found[system] = self._read(system)
+            report("read", len(found), len(systems))
+        return found
+
     def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
         """All commands at their times."""
         outcomes: dict[int, Outcome] = {}

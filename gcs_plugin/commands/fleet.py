@@ -134,7 +134,8 @@ class _Prepared:
 
     Attributes:
         systems: vehicles that are asked for, empty for all.
-        files: mission file for each vehicle of an upload; `single` a file for whichever vehicle is there.
+        files: mission file for each vehicle of an upload, or of a plan that is started; `single` a file for whichever
+            vehicle is there.
         delays: seconds after the first takeoff for each vehicle of a plan.
     """
 
@@ -181,6 +182,7 @@ class _Prepared:
         flights = read_plan_folder(folder, sortie)
         first = min(start for _, start in flights.values())
         delays = {system: start - first for system, (_, start) in flights.items()}
+        self.files = {system: file for system, (file, _) in flights.items()}
         self.delays = {s: d for s, d in delays.items() if not self.systems or s in self.systems}
         if not self.delays:
             raise InputError(
@@ -312,7 +314,17 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         raise InputError(
             f"vehicle {names} was not heard, so nobody was started; check its link, or leave it out with --vehicle"
         )
-    delays = {s: prepared.delays.get(s, 0.0) for s in systems if s in found}
+    heard = [s for s in systems if s in found]
+    if args.action == "start" and prepared.files:
+        if unlike := _unlike_plan(backend, {s: prepared.files[s] for s in heard}):
+            return _report(args, unlike, {})
+    elif args.action == "start" and len(heard) > 1:
+        print(
+            f"starting {len(heard)} vehicles at once; missions of one plan keep apart only at the plan's times: "
+            "start those with --plan DIR",
+            file=sys.stderr,
+        )
+    delays = {s: prepared.delays.get(s, 0.0) for s in heard}
     outcomes = {s: Outcome(False, f"vehicle {s} was not heard; check its link and system id") for s in missing}
     outcomes |= _with_bar(lambda report: backend.command(args.action, delays, report))
     followed = [s for s, outcome in outcomes.items() if outcome.ok]
@@ -321,6 +333,29 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
             print(text, file=sys.stderr)
         return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()))
     return _report(args, outcomes, {})
+
+
+def _unlike_plan(backend: "Backend", files: dict[int, Path]) -> "dict[int, Outcome]":
+    """Does each vehicle hold its mission of the plan? Empty if all do; else how it stands with each of them.
+
+    A broken upload leaves a mixture in ArduPilot, and an earlier plan's mission has other times and heights.
+    """
+    from gcs_plugin.mission.build import read_mission
+    from gcs_plugin.mission.compare import difference
+    from gcs_plugin.mission.exchange import Outcome
+
+    missions = {s: read_mission(path, backend.autopilot(s)) for s, path in files.items()}
+    stored = _with_bar(lambda report: backend.stored(list(missions), report))
+    wrong: dict[int, str] = {}
+    for system, mission in missions.items():
+        held = stored[system]
+        found = difference(mission, held.items) if held is not None else None
+        if held is None:
+            wrong[system] = "does not hand out its mission; check the link"
+        elif found is not None:
+            wrong[system] = f"does not hold {mission.name} ({found.text}); upload the plan first"
+    others = "was not started, because others do not hold this plan"
+    return {s: Outcome(False, f"vehicle {s} {wrong.get(s, others)}") for s in missions} if wrong else {}
 
 
 def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
