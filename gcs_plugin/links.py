@@ -365,34 +365,70 @@ class SerialLink(Link):
         self._pending.clear()
 
 
-_URL = re.compile(r"(?P<kind>[a-z]+):(?://)?(?P<host>[^:/]*):(?P<port>\d+)")
-_SERIAL = re.compile(r"(?:serial:(?://)?)?(?P<device>/dev/[^:,]+|COM\d+|\\\\\.\\COM\d+)(?:[:,](?P<baud>\d+))?")
+_URL = re.compile(
+    r"(?:(?P<kind>[a-z]+):(?://)?(?P<host>[^:/]*)|(?P<plain>localhost|\d+\.\d+\.\d+\.\d+)):(?P<port>\d{1,5})/?",
+    re.IGNORECASE,
+)
+# Paths by bus position have colons of their own (/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0).
+_SERIAL = re.compile(
+    r"(?:serial(?:_flowcontrol)?:(?://)?)?(?P<device>/dev/.+?|(?:\\\\\.\\)?COM\d+)(?:[:,](?P<baud>\d{3,}))?",
+    re.IGNORECASE,
+)
+_KINDS: Final = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "tcpout", "tcpout": "tcpout",
+                 "tcpin": "tcpin"}  # fmt: skip
+_BAUD: Final = 57600
 
 
-def parse_link(text: str) -> Link:
-    """Make a link of its address.
+@dataclass(frozen=True, slots=True)
+class LinkAddress:
+    """Where a link goes, however it was written.
 
-    `udpin:HOST:PORT` (also `udp:`) listens; `udpout:HOST:PORT` speaks first; `tcp:HOST:PORT` connects;
-    `tcpin:HOST:PORT` serves; `serial:DEVICE[:BAUD]` or the device alone opens a line (57600 baud unless said). `//`
-    behind the colon is allowed.
+    Attributes:
+        kind: `udpin`, `udpout`, `tcpin`, `tcpout` or `serial`.
+        host: host, or the device of a serial line.
+        port: port, or the baud rate of a serial line.
+    """
+
+    kind: str
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}://{self.host}:{self.port}"
+
+
+def parse_address(text: str) -> LinkAddress:
+    """Read a link's address in any usual spelling.
+
+    `udpin:HOST:PORT` (also `udp:`, or the address alone) listens; `udpout:HOST:PORT` speaks first; `tcp:HOST:PORT`
+    connects; `tcpin:HOST:PORT` serves; `serial:DEVICE[:BAUD]` or the device alone is a line (57600 baud unless said).
+    `//` behind the colon is allowed.
 
     Raises:
-        InputError: not an address of this kind, or the port is taken.
+        InputError: not an address of this kind.
     """
     line = _SERIAL.fullmatch(text.strip())
     if line:
-        return SerialLink(text, line["device"], int(line["baud"] or 57600))
+        return LinkAddress("serial", line["device"], int(line["baud"] or _BAUD))
     match = _URL.fullmatch(text.strip())
     if not match or int(match["port"]) > 65535:
         raise InputError(f"'{text}' is no link; write for example {EXAMPLES}")
-    kind, host, port = match["kind"], match["host"] or "0.0.0.0", int(match["port"])
-    match kind:
-        case "udp" | "udpin":
-            return UdpLink(text, host, port, listens=True)
-        case "udpout":
-            return UdpLink(text, host if match["host"] else "127.0.0.1", port, listens=False)
-        case "tcp" | "tcpout":
-            return TcpLink(text, host if match["host"] else "127.0.0.1", port)
-        case "tcpin":
-            return TcpLink(text, host, port, serves=True)
-    raise InputError(f"'{text}' is no link: '{kind}' is not known; write for example {EXAMPLES}")
+    kind = _KINDS.get((match["kind"] or "udpin").lower())
+    if kind is None:
+        raise InputError(f"'{text}' is no link: '{match['kind']}' is not known; write for example {EXAMPLES}")
+    nowhere = "0.0.0.0" if kind.endswith("in") else "127.0.0.1"
+    return LinkAddress(kind, match["plain"] or match["host"] or nowhere, int(match["port"]))
+
+
+def parse_link(text: str) -> Link:
+    """Make a link of its address (`parse_address` says which there are).
+
+    Raises:
+        InputError: not an address, or the port is taken.
+    """
+    address = parse_address(text)
+    if address.kind == "serial":
+        return SerialLink(text, address.host, address.port)
+    if address.kind.startswith("udp"):
+        return UdpLink(text, address.host, address.port, listens=address.kind == "udpin")
+    return TcpLink(text, address.host, address.port, serves=address.kind == "tcpin")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs_plugin.links import SerialLink, TcpLink, UdpLink, parse_link
+from gcs_plugin.links import LinkAddress, SerialLink, TcpLink, UdpLink, parse_address, parse_link
 from gcs_plugin.mavlink import dialect
 from gcs_plugin.packets import Framer, checksum
 from gcs_plugin.signing import Signing, find_key, key_from, signing_time
@@ -145,17 +145,32 @@ def test_a_serial_line_goes_both_ways_and_comes_back_after_unplugging(loop):
         ("udp://127.0.0.1:0", UdpLink),
         ("udpout:127.0.0.1:14550", UdpLink),
         ("tcp:127.0.0.1:5760", TcpLink),
+        ("UDPIN://127.0.0.1:0", UdpLink),
+        ("127.0.0.1:0", UdpLink),
+        ("udp://:0", UdpLink),
+        ("tcpout://127.0.0.1:5760/", TcpLink),
         ("tcpin:127.0.0.1:0", TcpLink),
         ("/dev/ttyUSB0", SerialLink),
         ("/dev/ttyACM0,115200", SerialLink),
         ("serial:///dev/ttyUSB0:57600", SerialLink),
+        ("serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:115200", SerialLink),
+        ("serial_flowcontrol:///dev/ttyAMA0:921600", SerialLink),
         ("COM7:57600", SerialLink),
+        ("serial:COM3", SerialLink),
     ],
 )
 def test_addresses_are_understood(text, kind):
     link = parse_link(text)
     assert isinstance(link, kind) and link.name == text
     link.close()
+
+
+def test_one_address_has_one_meaning_however_it_is_written():
+    assert str(parse_address("udp:0.0.0.0:14550")) == str(parse_address("udp://:14550")) == "udpin://0.0.0.0:14550"
+    assert str(parse_address("tcp:127.0.0.1:5760")) == "tcpout://127.0.0.1:5760"
+    by_path = parse_address("/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:115200")
+    assert (by_path.host, by_path.port) == ("/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0", 115200)
+    assert parse_address("/dev/ttyUSB0") == LinkAddress("serial", "/dev/ttyUSB0", 57600)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ every message to JSON: for a few vehicles, not for a hundred.
 
 import json
 import queue
-import re
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any, Final
 
 from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
 from gcs_plugin.fleetevents import FleetEvent, mission_event
+from gcs_plugin.links import parse_address
 from gcs_plugin.mavlink import Autopilot, Message
 from gcs_plugin.mission.compare import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
@@ -87,7 +87,7 @@ class MavsdkBackend(Backend):
         self._crafts: dict[int, _Craft] = {}
         self._mavsdk = Mavsdk(Configuration.create_manual(own.system, own.component, True))
         for link in links:
-            result = self._mavsdk.add_any_connection(mavsdk_url(link))
+            result = self._mavsdk.add_any_connection(str(parse_address(link)))
             if result != ConnectionResult.SUCCESS:
                 self.close()
                 raise InputError(f"MAVSDK cannot open link {link} ({result.name.lower()}); is the port in use?")
@@ -364,17 +364,3 @@ class MavsdkBackend(Backend):
             raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not hand out its mission'}")
         vehicle.detector.knows_mission(mission)
         return vehicle.pilot.start(in_air=in_air, check=False)
-
-
-def mavsdk_url(link: str) -> str:
-    """A link's address as MAVSDK writes it."""
-    text = link.strip()
-    line = re.fullmatch(r"(?:serial:(?://)?)?(/dev/[^:,]+|COM\d+)(?:[:,](\d+))?", text)
-    if line:
-        return f"serial://{line[1]}:{line[2] or 57600}"
-    match = re.fullmatch(r"(udp|udpin|udpout|tcp|tcpout|tcpin):(?://)?([^:/]*):(\d+)", text)
-    if not match:
-        raise InputError(f"'{link}' is no link; write for example udpin:0.0.0.0:14550 or tcp:127.0.0.1:5760")
-    kind = {"udp": "udpin", "tcp": "tcpout"}.get(match[1], match[1])
-    host = match[2] or ("0.0.0.0" if kind.endswith("in") else "127.0.0.1")
-    return f"{kind}://{host}:{match[3]}"
