@@ -219,11 +219,11 @@ class FolderReader:
         for frame in found.frames if found else []:
             if self._desk.stop.is_set():
                 return
-            path = mine.get(os.path.normpath(frame.path))
-            if path is not None:
-                data, digest = whole.pop(path)
-                self._keep(frame, self._taken.name(self._name(path), digest), data)
-                self._done(path, digest)
+            photo = mine.get(os.path.normpath(frame.path))
+            if photo is not None:
+                data, digest = whole.pop(photo)
+                self._keep(frame, self._taken.name(self._name(photo), digest), data)
+                self._done(photo, digest)
         root = os.path.commonpath([path.parent.absolute() for path in asked])  # what names are relative to
         self._without(
             {os.path.normpath(os.path.join(root, r.image)): r for r in found.rejected} if found else {}, whole
