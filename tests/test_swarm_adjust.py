@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import lapack
 
 from orthoswarm.swarm import normal
-from orthoswarm.swarm.adjust import Adjustment, Ground, Ties, exp_rotation, log_rotation
+from orthoswarm.swarm.adjust import Adjustment, Ground, Ties, _back, exp_rotation, log_rotation
 from orthoswarm.swarm.flight import first_points
 from tests.swarm_block import make_block
 
@@ -134,3 +135,16 @@ def test_jacobians_are_the_derivatives(seed):
 def test_rotation_vectors_survive(vector):
     v = np.array([vector])
     np.testing.assert_allclose(log_rotation(exp_rotation(v)), v, atol=1e-7)
+
+
+@pytest.mark.parametrize(("size", "width"), [(130, 90), (900, 640), (700, 700)])
+def test_a_wide_band_is_solved_in_blocks_as_lapack_solves_it(size, width):
+    rng = np.random.default_rng(size)
+    band = np.zeros((width, size), order="F")
+    band[0] = 3.0 * np.sqrt(width)
+    for k in range(1, width):
+        band[k, : max(size - k, 0)] = rng.normal(size=max(size - k, 0))
+    factor, info = lapack.dpbtrf(band, lower=1)
+    right = rng.normal(size=(size, 7))
+    assert info == 0
+    assert np.allclose(_back(factor, right), lapack.dpbtrs(factor, right, lower=1)[0], rtol=1e-9, atol=1e-12)

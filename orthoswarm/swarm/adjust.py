@@ -7,8 +7,9 @@ records have are unknowns with priors, held together by tracks, ground heights a
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import lapack, solve_triangular
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -18,6 +19,7 @@ from orthoswarm.swarm.priors import Layout, Priors
 from orthoswarm.swarm.rig import CX, CY, K1, K2, K3, F, Ints, Rig, Tracks
 
 Array = NDArray[np.float64]
+_BLOCK, _WIDE = 64, 600
 _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 
@@ -363,7 +365,34 @@ def _factor(band: Array) -> Array:
 
 
 def _back(factor: Array, right: Array) -> Array:
-    return np.asarray(lapack.dpbtrs(factor, right, lower=1)[0])
+    """Solve with a banded Cholesky factor and many right sides (N, K).
+
+    LAPACK's own routine reads the whole factor once for each of them; in blocks of columns it is read once.
+    """
+    above, n = factor.shape
+    if above <= _WIDE:
+        return np.asarray(lapack.dpbtrs(factor, right, lower=1)[0])
+    x = np.array(right, float)
+    blocks = [(a, min(a + _BLOCK, n), min(a + _BLOCK - 1 + above, n)) for a in range(0, n, _BLOCK)]
+    for a, b, end in blocks:
+        own, below = _blocks_of(factor, a, b, end)
+        x[a:b] = solve_triangular(own, x[a:b], lower=True, check_finite=False)
+        x[b:end] -= below @ x[a:b]
+    for a, b, end in reversed(blocks):
+        own, below = _blocks_of(factor, a, b, end)
+        x[a:b] = solve_triangular(own, x[a:b] - below.T @ x[b:end], lower=True, trans="T", check_finite=False)
+    return x
+
+
+def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
+    """Of the factor's columns a to b: the triangle on the diagonal, and the rows below it down to `end`."""
+    above = len(factor)
+    # entry (i, j) of the factor lies at [i - j, j]: a step of one row and a step of one column are both strides
+    down, across = factor.strides[0], factor.strides[1] - factor.strides[0]
+    whole = np.array(as_strided(factor[:, a:], (end - a, b - a), (down, across)), order="F")
+    beyond = whole[above:]  # outside the band the view shows other columns
+    beyond[np.tril_indices(len(beyond), 0, b - a)] = 0.0
+    return whole[: b - a], whole[b - a :]
 
 
 def _solve(system: _System) -> tuple[Array, Array]:

@@ -123,10 +123,9 @@ class Tracker:
         if self._stack is None or not len(live.uv):
             return
         now = len(self._chain) - 1
-        affine = np.empty((len(live.uv), 2, 2))
-        for a in np.unique(live.anchor):
-            mine = live.anchor == a
-            affine[mine] = _backward(self._chain[now] @ np.linalg.inv(self._chain[a]), live.uv[mine])
+        anchors, which = np.unique(live.anchor, return_inverse=True)
+        back = np.stack([self._chain[a] for a in anchors]) @ np.linalg.inv(self._chain[now])
+        affine = _derivative(back[which], live.uv)
         ok = np.zeros(len(live.uv), bool)
         klt.anchor(self._stack, live.anchor % HELD, live.anchor_uv, gray, affine, ANCHOR_PX, live.uv, ok)
         lost = ~ok | (now + 1 - live.anchor >= HELD)
@@ -211,19 +210,22 @@ def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int,
 
 
 def _apply(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    p = np.c_[uv, np.ones(len(uv))] @ homography.T
+    p = uv.astype(float) @ homography[:, :2].T + homography[:, 2]
     return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
 
 
 def _backward(homography: Array, uv: NDArray[np.float32]) -> Array:
     """Derivatives (K, 2, 2) of the inverse homography at pixels (K, 2) of the later picture."""
-    h = np.linalg.inv(homography)
-    p = np.c_[uv, np.ones(len(uv))] @ h.T
-    z = p[:, 2:3]
-    out = np.empty((len(uv), 2, 2))
-    for a in range(2):
-        out[:, a] = (h[a, :2] - p[:, a : a + 1] / z * h[2, :2]) / z
-    return out
+    return _derivative(np.asarray(np.linalg.inv(homography), np.float64), uv)
+
+
+def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
+    """Derivatives (K, 2, 2) of one homography (3, 3), or of one for each pixel (K, 3, 3), at pixels (K, 2)."""
+    x, y = uv[:, 0:1].astype(float), uv[:, 1:2].astype(float)
+    p = homography[..., 0] * x + homography[..., 1] * y + homography[..., 2]
+    q = p[:, :2] / p[:, 2:]
+    out = homography[..., :2, :2] - q[:, :, None] * homography[..., 2:, :2]
+    return np.asarray(out / p[:, 2:, None])
 
 
 def _inside(uv: NDArray[np.float32], shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
