@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from telemetry.findings import Finding, plural
 from telemetry.photos import PhotoTags
 from telemetry.picks import Candidate, Picker
-from telemetry.poses import Poses
+from telemetry.picturecache import Kept, Taken, key_of, recall, remember
+from telemetry.poses import Pose, Poses
 from telemetry.sample import Sample
 from telemetry.video import VideoScan, demux, open_video, scan
 
@@ -29,6 +30,7 @@ class Picture:
         number: of the picture in the video, in order of presentation, from 0.
         sample: its pose, None where nothing is known. origin: where the pose is from.
         rgb: uint8 (rows, columns, 3). video_s: its time in the video.
+        packet: index of its packet, None where the decoder did not tell.
     """
 
     number: int
@@ -36,6 +38,7 @@ class Picture:
     origin: str
     rgb: NDArray[np.uint8]
     video_s: float
+    packet: int | None = None
 
 
 @dataclass(slots=True)
@@ -47,6 +50,7 @@ class Extraction:
     findings: list[Finding] = field(default_factory=list)
     pictures: int = 0
     without_pose: int = 0
+    damaged: int = 0
 
 
 def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tuple[int, int | None, Any]]:
@@ -136,20 +140,17 @@ def pictures(
         if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
             video_s = own
         sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
-        for taken in picker.push(Candidate(number, frame, sample, video_s, origin)):
+        for taken in picker.push(Candidate(number, frame, sample, video_s, origin, index)):
             yield _picture(taken)
     for taken in picker.flush():
         yield _picture(taken)
-    if damaged[0]:
-        result.findings.append(
-            Finding("video-damaged", f"{plural(damaged[0], 'picture')} of {found.path.name} cannot be decoded")
-        )
+    result.damaged = damaged[0]
     if progress is not None:
         progress(total, total)
 
 
 def _picture(taken: Candidate) -> Picture:
-    return Picture(taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s)
+    return Picture(taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s, taken.packet)
 
 
 def to_rgb(frame: Any) -> NDArray[np.uint8]:
@@ -179,6 +180,8 @@ def extract(
 ) -> Extraction:
     """Take the pictures of a video and write them as JPEG files into a folder.
 
+    Pictures that an earlier call left there are used again while video, choice and poses are the same.
+
     Args:
         path: the video.
         name: its name relative to the inputs; names its folder in the cache.
@@ -198,14 +201,27 @@ def extract(
     result = Extraction()
     folder = cache / name.replace("/", "__")
     folder.mkdir(parents=True, exist_ok=True)
+    key = key_of(path, poses, len(found.pictures), (every_m, every_s, JPEG_QUALITY))
+    taken = recall(folder, key)
+    if taken is None:
+        kept = []
+        for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
+            kept.append(Kept(picture.number, picture.packet, picture.rgb.shape[1], picture.rgb.shape[0]))
+            write_jpeg(folder / kept[-1].name, picture.rgb)
+        taken = Taken(kept, result.pictures, result.without_pose, result.damaged)
+        remember(folder, key, taken)
+    result.pictures, result.without_pose, result.damaged = taken.seen, taken.without_pose, taken.damaged
     lens = _LensKey(found)
-    for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
-        target = folder / f"{picture.number:06d}.jpg"
-        write_jpeg(target, picture.rgb)
-        photo = _photo(target, picture, lens)
-        vehicle = picture.sample.vehicle if picture.sample is not None and picture.sample.vehicle else path.stem
+    for one in taken.pictures:
+        pose = None if one.packet is None else poses.of(one.packet)
+        photo = _photo(folder / one.name, one, pose, lens)
+        vehicle = pose.sample.vehicle if pose is not None and pose.sample.vehicle else path.stem
         result.photos.setdefault(vehicle, []).append(photo)
-        result.names[target] = picture.number
+        result.names[photo.path] = one.number
+    if result.damaged:
+        result.findings.append(
+            Finding("video-damaged", f"{plural(result.damaged, 'picture')} of {path.name} cannot be decoded")
+        )
     result.findings += poses.findings
     if result.without_pose:
         result.findings.append(
@@ -254,13 +270,12 @@ class _LensKey:
         return f"{self._base} fov{self._fov:.1f}"
 
 
-def _photo(path: Path, picture: Picture, lens: _LensKey) -> PhotoTags:
-    rows, columns = picture.rgb.shape[:2]
-    photo = PhotoTags(path, columns, rows)
-    sample = picture.sample
-    photo.camera = lens.of(sample)
-    if sample is None:
+def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTags:
+    photo = PhotoTags(path, kept.columns, kept.rows)
+    photo.camera = lens.of(None if pose is None else pose.sample)
+    if pose is None:
         return photo
+    sample = pose.sample
     photo.lat_deg, photo.lon_deg = sample.lat_deg, sample.lon_deg
     photo.altitude_m, photo.height_m = sample.altitude_m, sample.height_m
     photo.height_is_ground = sample.height_is_ground
@@ -269,11 +284,11 @@ def _photo(path: Path, picture: Picture, lens: _LensKey) -> PhotoTags:
     photo.flight_deg = (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg)
     photo.position_sigma_m = sample.sigma_m
     # DJI's sources say "gimbal yaw" and mean different things by it; all others define the picture's.
-    photo.yaw_is_stated = not {"djmd", "SRT"} & set(picture.origin.split(" + "))
+    photo.yaw_is_stated = not {"djmd", "SRT"} & set(pose.origin.split(" + "))
     photo.fov_hint_rad = None if sample.fov_deg is None else math.radians(sample.fov_deg)
     names = {
         "position": sample.lat_deg, "height": sample.height_m, "time": sample.time_s, "angles": sample.yaw_deg,
         "flight_yaw": sample.flight_yaw_deg, "fov_hint": sample.fov_deg,
     }  # fmt: skip
-    photo.origin = {field: picture.origin for field, value in names.items() if value is not None}
+    photo.origin = {field: pose.origin for field, value in names.items() if value is not None}
     return photo

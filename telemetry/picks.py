@@ -23,7 +23,7 @@ class Candidate:
 
     Attributes:
         number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
-        origin: where the pose is from.
+        origin: where the pose is from. packet: index of its packet, None where the decoder did not tell.
     """
 
     number: int
@@ -31,6 +31,7 @@ class Candidate:
     sample: Sample | None
     video_s: float
     origin: str = ""
+    packet: int | None = None
 
 
 class Picker:

@@ -1,10 +1,12 @@
 """Video: SEI written and read in every container, binding through B-frames, picking, damage."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from gcs_plugin.cli import main
 from orthoswarm.errors import InputError
 from telemetry.extract import decoded, extract
 from telemetry.ingest import LoadOptions, load, survey
@@ -159,6 +161,36 @@ class Blurred:
     def to_ndarray(self, format):
         rng = np.random.default_rng(0)
         return (128 + self._sharp * rng.standard_normal((64, 64))).clip(0, 255).astype(np.uint8)
+
+
+def test_pictures_taken_before_are_used_again_until_something_changes(tmp_path):
+    source = make_video(tmp_path / "s.mp4")
+    target = tmp_path / "t.mp4"
+    add_sei(source, target, pose)
+    cache = tmp_path / "cache"
+
+    def take(**choice):
+        found = extract(target, "t.mp4", cache, **choice)
+        photos = [photo for row in found.photos.values() for photo in row]
+        return photos, {photo.path: photo.path.stat().st_mtime_ns for photo in photos}, found.findings
+
+    first, written, _ = take(every_m=10.0)
+    again, kept, _ = take(every_m=10.0)
+    assert again == first and kept == written
+    others, _, _ = take(every_m=5.0)
+    assert len(others) > len(first)
+    back, anew, _ = take(every_m=10.0)
+    assert back == first and anew != written
+    back[3].path.unlink()  # a folder that somebody has tidied up
+    assert take(every_m=10.0)[0] == first
+    add_sei(source, target, lambda number: replace(pose(number), height_m=50.0))
+    assert all(photo.height_m == 50.0 for photo in take(every_m=10.0)[0])
+
+
+def test_a_spacing_of_nothing_is_refused(tmp_path, capsys):
+    for flag in ("--every-m", "--every-s"):
+        assert main(["mosaic", str(tmp_path), "--out", str(tmp_path / "out"), flag, "0"]) == 2
+        assert "larger than zero" in capsys.readouterr().err
 
 
 def test_the_sharpest_of_neighbours_is_taken():

@@ -23,6 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
     add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
+    add(
+        "--every-m", type=float, metavar="M", help="of a video one picture every M metres (default: 4 %% of the height)"
+    )
+    add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
@@ -65,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     )
 
     def load(progress: pipeline.Progress) -> Ingest:
-        reading = telemetry.LoadOptions(exclude=(args.out,), cache=args.out / ".work" / VIDEO)
+        reading = telemetry.LoadOptions(args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,))
         return telemetry.load(args.inputs, progress=progress, options=reading)
 
     if args.out.is_file():
@@ -99,6 +103,9 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(f"--gsd {args.gsd:g} is no ground pixel; give metres, for example 0.1")
     if args.fov_min is not None and not 5.0 <= args.fov_min <= 150.0:
         raise InputError(f"--fov-min {args.fov_min:g} is no field of view; give degrees, for example 70")
+    for flag, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
+        if value is not None and not value > 0.0:
+            raise InputError(f"{flag} must be larger than zero; leave it out for the default")
     if args.workers is not None and args.workers < 1:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
     for flag, path in (("--basemap", args.basemap), ("--dem", args.dem)):
