@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Final, TypeVar
 
@@ -14,26 +14,37 @@ from orthoswarm.workers import single_threaded
 
 Result = TypeVar("Result")
 
-_NICE: Final = 5
+NICE: Final = 5
+LAST: Final = 15
+"""Priority of what may wait while anything else has work."""
 
 
 class Crew:
     """A few processes that run one function at a time each.
 
     Args:
-        count: how many processes.
+        count: how many processes. nice: how much lower their priority is than the daemon's (not on Windows).
     """
 
-    def __init__(self, count: int) -> None:
-        self.count = max(1, count)
+    def __init__(self, count: int, nice: int = NICE) -> None:
+        self.count, self._nice = max(1, count), nice
         self._lock = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
-        self._closed = False
+        self._closed = self._warm = False
 
     def warm_up(self) -> None:
         """Start the processes and let them import what they will need."""
         for _ in range(self.count):
             self.submit(_import_all, 0)
+
+    def warm_kernels(self) -> None:
+        """Have a process load its compiled kernels, once: the first vehicle that completes need not wait for that."""
+        with self._lock:
+            if self._warm or self._closed:
+                return
+            self._warm = True
+        for _ in range(self.count):
+            self.submit(_warm_kernels, 0)
 
     def submit(self, function: Callable[[Any], Result], item: Any) -> "Future[Result]":
         """Run a module-level function of one picklable argument."""
@@ -43,7 +54,9 @@ class Crew:
             if self._pool is None:
                 single_threaded()
                 context = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(self.count, mp_context=context, initializer=_prepare)
+                self._pool = ProcessPoolExecutor(
+                    self.count, mp_context=context, initializer=_prepare, initargs=(self._nice,)
+                )
             try:
                 return self._pool.submit(function, item)
             except BrokenProcessPool:
@@ -56,32 +69,46 @@ class Crew:
         Raises:
             OrthoSwarmError: the process was stopped from outside. What the function raises is raised here.
         """
+        future = self.submit(function, item)
+        pool = self._pool
         try:
-            return self.submit(function, item).result()
-        except BrokenProcessPool:
+            return future.result()
+        except (BrokenProcessPool, CancelledError):
             with self._lock:
-                self._pool = None
+                if self._pool is pool:
+                    self._pool = None
             raise OrthoSwarmError("a worker process was stopped from outside, mostly for lack of memory") from None
+
+    def abandon(self) -> None:
+        """Give up what is under way, at once; the processes start anew with the next work."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            _end(pool)
 
     def close(self) -> None:
         """Stop at once; what was under way is given up."""
         with self._lock:
             pool, self._pool, self._closed = self._pool, None, True
-        if pool is None:
-            return
-        processes = list((getattr(pool, "_processes", None) or {}).values())
-        for process in processes:
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-        for process in processes:
-            process.join(5.0)
+        if pool is not None:
+            for process in _end(pool):
+                process.join(5.0)
 
 
-def _prepare() -> None:
+def _end(pool: ProcessPoolExecutor) -> list[Any]:
+    """Terminate a pool's processes; gives them."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    for process in processes:
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)
+    return processes
+
+
+def _prepare(nice: int) -> None:
     """First thing in a worker: the daemon handles signals, and its end is this process's end, too."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(_NICE)
+        os.nice(nice)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import cv2
 
@@ -98,3 +125,9 @@ def _end_with_parent() -> None:
 def _import_all(_: int) -> None:
     import gcs_plugin.daemon.work  # noqa: F401
     import orthoswarm.swarm.refine  # noqa: F401
+
+
+def _warm_kernels(_: int) -> None:
+    from gcs_plugin.daemon.warmup import refine_something
+
+    refine_something()

@@ -1,67 +1,50 @@
 """The real-time layer: one thread that draws every frame of the journal that is not drawn yet, the most telling first.
 
 The journal is the queue, so nothing waits in memory without bound and nothing is forgotten by a crash. While the thread
-keeps up, frames are drawn as they come. Under overload those are drawn first that lie where the map is still empty,
-and those that would win the fewest pixels (many were drawn around their nadir point already) wait until there is time.
+keeps up, frames are drawn as they come. Under overload those that would win the fewest pixels are put off (`waiting`):
+they are on the disk, count for the refinement, and are drawn when there is time; how many they are is told.
 """
 
-import heapq
 import json
 import logging
 import shutil
 import sqlite3
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcs_plugin.daemon.events import Events
-from gcs_plugin.daemon.journal import Journal, fact_change, frames_drawn, unpacked
+from gcs_plugin.daemon.journal import Drawn, Journal, fact_change, frames_drawn, packed, unpacked
 from gcs_plugin.daemon.layers import Area, Layer, new_name, successor
 from gcs_plugin.daemon.pose import frame_of
 from gcs_plugin.daemon.store import PictureStore
+from gcs_plugin.daemon.waiting import Pending, Waiting
 from orthoswarm.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import GroundGrid, LocalGrid, utm_epsg
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.passes import thumbnail
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.picture import read_rgba
 from orthoswarm.recorded import recorded_cameras
 
 _IN_MEMORY: Final = 2000
 _AT_ONCE: Final = 16
+_LATE_S: Final = 1.0
+_LOOK_S: Final = 0.5
 _FEW: Final = 200
 _OTHER_GSD: Final = 3.0
 _FAR_M: Final = 100_000.0
 _COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"
 _log = logging.getLogger(__name__)
-
-
-@dataclass(order=True, slots=True)
-class Pending:
-    """A frame to be drawn; those with a smaller crowd at their nadir point go first, then the older."""
-
-    crowd: int
-    seq: int
-    arrived: float = field(compare=False)
-    sortie: int = field(compare=False)
-    frame: Frame = field(compare=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """What became of a frame: number, why it was rejected (None if it was not), sigma in metres."""
-
-    seq: int
-    reason: str | None
-    sigma_m: float | None
+Bytes = NDArray[np.uint8]
 
 
 class Drawer:
@@ -70,6 +53,7 @@ class Drawer:
     Attributes:
         area: where the map lies, None before the first frame.
         drawn: frames drawn since the start. late: drawn later than a second after they came.
+        put_off: frames that wait longer than a second, because they would show least of all that wait.
         latencies: seconds from arrival to the map, of the last thousand.
     """
 
@@ -99,10 +83,9 @@ class Drawer:
         """
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
         self._gsd_m, self._fov_rad, self._on_area = gsd_m, fov_rad, on_area
-        self._heap: list[Pending] = []
+        self._queue = Waiting(_IN_MEMORY)
         self._waiting: set[int] = set()
-        self._crowds: Counter[tuple[int, int]] = Counter()
-        self._cell_deg = 1e-4
+        self._looked = 0.0
         self._more = True
         self._condition = threading.Condition()
         self._stop = False
@@ -110,7 +93,7 @@ class Drawer:
         self._mosaic: RealtimeMosaic | None = None
         self._grid: LocalGrid | None = None
         self.area: Area | None = None
-        self.drawn = self.late = 0
+        self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
         document = journal.fact("area")
@@ -136,26 +119,34 @@ class Drawer:
     def add(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
         """Hand in a frame that is in the journal."""
         with self._condition:
-            if len(self._heap) >= _IN_MEMORY:
-                self._more = True  # it is found in the journal when there is room
-            elif seq not in self._waiting:
-                self._push(seq, frame, arrived, sortie)
+            if seq not in self._waiting:
+                self._put(Pending(seq, arrived, sortie, frame))
             self._condition.notify_all()
 
     @property
     def backlog(self) -> int:
         """Frames that wait in memory; up to a bound, beyond which the journal knows."""
-        return len(self._heap)
+        return len(self._queue)
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until nothing is left to draw; returns whether that is so."""
         end = time.monotonic() + timeout_s
         with self._condition:
-            while self._heap or self._waiting or self._more:
+            while len(self._queue) or self._waiting or self._more:
                 left = end - time.monotonic()
-                if left <= 0:
+                if left <= 0 or self._stop:
                     return False
                 self._condition.wait(left)
+        return True
+
+    def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
+        """Wait until a sortie's frames are drawn, whatever else waits; returns whether that is so."""
+        end = time.monotonic() + timeout_s
+        query = "SELECT 1 FROM frames WHERE drawn = 0 AND vehicle = ? AND sortie IS ? LIMIT 1"
+        while self._journal.one(query, (packed(vehicle), sortie)) is not None:
+            if time.monotonic() > end or self._stop:
+                return False
+            time.sleep(0.05)
         return True
 
     # -- the thread -----------------------------------------------------------------------------------------------
@@ -164,13 +155,14 @@ class Drawer:
         _warm_up(self._folder)
         while True:
             with self._condition:
-                while not self._heap and not self._more and not self._stop:
+                while not len(self._queue) and not self._more and not self._stop:
                     self._condition.wait()
                 if self._stop:
                     return
             try:
                 self._refill()
                 self._draw_some()
+                self._tell_overload()
                 self.problem = ""
             except OrthoSwarmError as error:  # the disk is full, or gone: nothing is lost, try again
                 self._complain(str(error))
@@ -183,13 +175,37 @@ class Drawer:
             _log.error("drawing waits: %s", problem)
             self._events.publish("problem", text=problem)
         with self._condition:
-            self._waiting = {p.seq for p in self._heap}
+            self._waiting = self._queue.seqs()
             self._more = True
             self._condition.wait(1.0)
 
+    def _tell_overload(self) -> None:
+        """Say how many frames are put off, when that has changed; the journal knows."""
+        now = time.monotonic()
+        if now - self._looked < _LOOK_S or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
+            return
+        self._looked = now
+        query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?"
+        row = self._journal.one(query, (time.time() - _LATE_S,))
+        before, self.put_off = self.put_off, 0 if row is None else int(row["n"])
+        if bool(before) != bool(self.put_off):
+            _log.warning("%s", self.overload or "all pictures are on the map again")
+        if before != self.put_off:
+            self._events.publish("overload", put_off=self.put_off, text=self.overload)
+
+    @property
+    def overload(self) -> str:
+        """What there is to say about frames that are put off; empty if there are none."""
+        if not self.put_off:
+            return ""
+        return (
+            f"more pictures come than can be drawn at once: {self.put_off} that would show least are put off;"
+            " they are safe on the disk and are drawn when there is time"
+        )
+
     def _refill(self) -> None:
         with self._condition:
-            if not self._more or len(self._heap) > _IN_MEMORY // 2:
+            if not self._more or len(self._queue) > _IN_MEMORY // 2:
                 return
             self._more = False
         rows = self._journal.rows(
@@ -198,35 +214,32 @@ class Drawer:
         with self._condition:
             for row in rows:
                 if row["seq"] not in self._waiting:
-                    if len(self._heap) >= _IN_MEMORY:
+                    if len(self._queue) >= _IN_MEMORY:
                         self._more = True
                         break
-                    self._push(row["seq"], frame_of_row(row, self._store), row["arrived"], row["sortie"])
+                    self._put(Pending(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
 
-    def _push(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
-        self._waiting.add(seq)
-        heapq.heappush(self._heap, Pending(self._crowds[self._cell(frame)], seq, arrived, sortie, frame))
-
-    def _cell(self, frame: Frame) -> tuple[int, int]:
-        fix = frame.fix
-        return int(fix.lat_deg / self._cell_deg), int(fix.lon_deg / self._cell_deg)
+    def _put(self, pending: Pending) -> None:
+        self._waiting.add(pending.seq)
+        left = self._queue.put(pending)
+        if left is not None:  # it is found in the journal when there is room
+            self._waiting.discard(left.seq)
+            self._more = True
 
     def _draw_some(self) -> None:
         done: list[Drawn] = []
         seqs: list[int] = []
         while len(done) < _AT_ONCE:
             with self._condition:
-                if not self._heap or self._stop:
-                    break
-                pending = heapq.heappop(self._heap)
-                self._crowds[self._cell(pending.frame)] += 1
+                pending = None if self._stop else self._queue.take()
+            if pending is None:
+                break
             result = self._draw(pending)
             done.append(result)
             seqs.append(pending.seq)
             self._note(pending, result)
         if done:
-            change = frames_drawn([(d.seq, d.reason, d.sigma_m) for d in done])
-            self._journal.write(change)
+            self._journal.write(frames_drawn(done))
             self._events.publish("layer", layer="realtime", version=self._layer.version)
         with self._condition:
             self._waiting.difference_update(seqs)
@@ -235,7 +248,7 @@ class Drawer:
     def _note(self, pending: Pending, result: Drawn) -> None:
         took = time.time() - pending.arrived
         self.drawn += 1
-        self.late += took > 1.0
+        self.late += took > _LATE_S
         self.latencies.append(took)
         del self.latencies[:-1000]
 
@@ -258,7 +271,7 @@ class Drawer:
             return self._told(pending, Drawn(pending.seq, str(error), None), None)
         except (ValueError, ArithmeticError) as error:
             return self._told(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
-        return self._told(pending, Drawn(pending.seq, added.reason, sigma), camera)
+        return self._told(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
 
     def _told(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
@@ -353,12 +366,12 @@ class Drawer:
         self._journal.write(change)
         if again:
             with self._condition:
+                self._queue.forget_drawn()
                 self._more = True
         self.area = area
         self._layer.replace(canvas)
         self._mosaic = RealtimeMosaic(canvas)
         self._grid = LocalGrid(area.epsg)
-        self._cell_deg = max(20.0 * area.gsd_m, 2.0) / 111_000.0
         self._on_area(area)
 
     def _open(self, name: str | None) -> None:
@@ -388,6 +401,14 @@ def _warm_up(folder: Path) -> None:
         _log.warning("%s", error)
     finally:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def _thumbnail(picture: Bytes) -> bytes:
+    """The means of a picture's parts, for gains; see `thumbnail`."""
+    import cv2
+
+    some = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
+    return thumbnail(np.ascontiguousarray(some[..., :3])).tobytes()
 
 
 def frame_of_row(row: sqlite3.Row, store: PictureStore) -> Frame:

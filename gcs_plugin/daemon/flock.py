@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _WATCH_S: Final = 0.5
 _TRAIL: Final = 600
+_REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
 
 
@@ -156,6 +157,8 @@ class Flock:
                 self._found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
                 self._journal.write(self._mission_change(event, vehicle, name))
+                if event.kind == "complete":
+                    self._jobs.drop("coarse", name, _REPLACED)
                 self._jobs.wake()
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)

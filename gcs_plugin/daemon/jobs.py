@@ -1,7 +1,8 @@
 """Jobs: what takes long, kept in the journal from the wish to the result, so that none is forgotten or done twice.
 
 A job that was queued or running when the daemon ended is queued again; what it does must be repeatable up to the one
-change of the journal that also marks it as done.
+change of the journal that also marks it as done. Refinement of completed vehicles goes before everything; what belongs
+to the background (coarse maps in flight, exports) runs one at a time and never takes a refinement's place.
 """
 
 import json
@@ -20,6 +21,10 @@ from orthoswarm.errors import OrthoSwarmError
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
 _KEPT: Final = 1000
+_BACKGROUND: Final = frozenset({"coarse", "export"})
+_ORDER: Final = (
+    "CASE WHEN kind = 'refine' THEN 0 WHEN kind = 'coarse' AND detail NOT LIKE '%\"after\"%' THEN 2 ELSE 1 END, id"
+)
 _log = logging.getLogger(__name__)
 
 
@@ -67,6 +72,10 @@ class Job:
         }  # fmt: skip
 
 
+class GaveWay(Exception):
+    """A handler's way to say that its work was taken away: to be done again later."""
+
+
 Handler = Callable[[Job, Callable[[float, str], None]], Change]
 """Does a job, telling its progress; gives the change that makes its result so. That the job is done is written with
 it, in one transaction."""
@@ -80,17 +89,27 @@ class Jobs:
         journal: where they are kept.
         events: told of every change.
         handlers: kind -> what does it.
-        slots: how many jobs run at once.
+        slots: how many refinements run at once; one job of the background runs beside them.
+        on_drop: called with a running job that is not wanted any more, so that its work may be given up.
     """
 
-    def __init__(self, journal: Journal, events: Events, handlers: Mapping[str, Handler], slots: int) -> None:
+    def __init__(
+        self,
+        journal: Journal,
+        events: Events,
+        handlers: Mapping[str, Handler],
+        slots: int,
+        on_drop: After = lambda _: None,
+    ) -> None:
         self._journal, self._events, self._handlers = journal, events, handlers
         self._condition = threading.Condition()
         self._running: dict[int, Job] = {}
+        self._unwanted: dict[int, str] = {}
+        self._on_drop = on_drop
         self._stop = False
         self._after: list[After] = []
         self._threads = [
-            threading.Thread(target=self._run, name=f"jobs {n}", daemon=True) for n in range(max(1, slots))
+            threading.Thread(target=self._run, name=f"jobs {n}", daemon=True) for n in range(max(1, slots) + 1)
         ]
         journal.write(_requeue)
 
@@ -102,6 +121,11 @@ class Jobs:
         """Begin to work."""
         for thread in self._threads:
             thread.start()
+
+    @property
+    def stopping(self) -> bool:
+        """True once nothing more is begun."""
+        return self._stop
 
     def give_up(self) -> None:
         """Begin nothing more; what fails from now on is not a failure but the end."""
@@ -124,6 +148,20 @@ class Jobs:
             self._condition.notify_all()
         return job
 
+    def drop(self, kind: str, vehicle: str, why: str) -> None:
+        """Let go of a vehicle's jobs of a kind: those that wait end at once, one that runs is given up."""
+        self._journal.write(drop_change(kind, vehicle, why))
+        with self._condition:
+            running = [
+                job
+                for job in self._running.values()
+                if (job.kind, job.vehicle) == (kind, vehicle) and "after" not in job.detail
+            ]
+            for job in running:
+                self._unwanted[job.id] = why
+        for job in running:
+            self._on_drop(job)
+
     def wake(self) -> None:
         """Look at the queue again: somebody else has put a job into the journal."""
         with self._condition:
@@ -142,9 +180,12 @@ class Jobs:
         return None if row is None else Job.of(row)
 
     def open(self, *kinds: str) -> int:
-        """How many jobs of these kinds (any, if none is named) wait or run."""
-        rows = self._journal.rows("SELECT kind FROM jobs WHERE state IN ('queued', 'running')")
-        return sum(not kinds or row["kind"] in kinds for row in rows)
+        """How many jobs of these kinds (any, if none is named) wait or run; coarse maps in flight do not count."""
+        query = (
+            "SELECT kind FROM jobs WHERE state IN ('queued', 'running')"
+            " AND (kind != 'coarse' OR detail LIKE '%\"after\"%')"
+        )
+        return sum(not kinds or row["kind"] in kinds for row in self._journal.rows(query))
 
     # -- the threads ----------------------------------------------------------------------------------------------
 
@@ -169,14 +210,11 @@ class Jobs:
 
     def _next(self) -> Job | None:
         """Take the next job that may run: refinement goes first, and a vehicle's jobs one after the other."""
-        rows = self._journal.rows(
-            "SELECT * FROM jobs WHERE state = 'queued' ORDER BY CASE kind WHEN 'refine' THEN 0 WHEN 'coarse' THEN 1"
-            " ELSE 2 END, id"
-        )
-        busy = {(job.kind, job.vehicle) for job in self._running.values()}
+        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_ORDER}")
+        busy = {_lane(job) for job in self._running.values()}
         for row in rows:
             job = Job.of(row)
-            if row["id"] in self._running or (job.kind, job.vehicle) in busy:
+            if row["id"] in self._running or _lane(job) in busy:
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
             self._running[job.id] = job
@@ -205,10 +243,19 @@ class Jobs:
         except Exception as error:
             if self._stop:  # its worker was taken away: it is queued again at the next start
                 return
-            self._failed(job, error)
+            if job.id in self._unwanted:
+                job.state, job.progress, job.ended = "done", 1.0, time.time()
+                job.message = self._unwanted[job.id]
+                self._journal.write(_ended(job))
+            elif isinstance(error, GaveWay):
+                job.state, job.progress, job.started, job.attempts = "queued", 0.0, None, job.attempts - 1
+                self._journal.write(_ended(job))
+            else:
+                self._failed(job, error)
         finally:
             with self._condition:
                 self._running.pop(job.id, None)
+                self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
         self._tell(job)
         for listener in self._after:
@@ -256,6 +303,25 @@ def new_job(kind: str, vehicle: str | None, sortie: int | None, detail: dict[str
     return change
 
 
+def drop_change(kind: str, vehicle: str, why: str) -> Change:
+    """The change that ends a vehicle's waiting jobs of a kind."""
+    values = (why, time.time(), kind, packed(vehicle))
+
+    def change(db: sqlite3.Connection) -> None:
+        db.execute(
+            "UPDATE jobs SET state = 'done', progress = 1, message = ?, ended = ? WHERE kind = ? AND vehicle = ?"
+            " AND state = 'queued' AND detail NOT LIKE '%\"after\"%'",
+            values,
+        )
+
+    return change
+
+
+def _lane(job: Job) -> tuple[str, str | None]:
+    """Of jobs in one lane one runs at a time."""
+    return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
+
+
 def _requeue(db: sqlite3.Connection) -> None:
     """What was under way when the daemon ended is done again, but not for ever if it is what ended the daemon."""
     db.execute(
@@ -267,10 +333,10 @@ def _requeue(db: sqlite3.Connection) -> None:
 
 
 def _ended(job: Job) -> Change:
-    values = (job.state, job.progress, job.message, job.ended, json.dumps(job.detail), job.id)
+    values = (job.state, job.progress, job.message, job.ended, job.attempts, json.dumps(job.detail), job.id)
 
     def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE jobs SET state=?, progress=?, message=?, ended=?, detail=? WHERE id=?", values)
+        db.execute("UPDATE jobs SET state=?, progress=?, message=?, ended=?, attempts=?, detail=? WHERE id=?", values)
 
     return change
 

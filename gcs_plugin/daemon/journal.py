@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -38,6 +39,10 @@ CREATE TABLE IF NOT EXISTS jobs (
 CREATE TABLE IF NOT EXISTS solutions (
     vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, path TEXT NOT NULL, detail TEXT NOT NULL,
     PRIMARY KEY (vehicle, sortie));
+CREATE TABLE IF NOT EXISTS coarse (
+    vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, path TEXT NOT NULL, detail TEXT NOT NULL,
+    PRIMARY KEY (vehicle, sortie));
+CREATE TABLE IF NOT EXISTS thumbnails (seq INTEGER PRIMARY KEY, rgb BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS completions (
     id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
 """
@@ -235,9 +240,26 @@ def add_frame(
     return change
 
 
-def frames_drawn(results: Iterable[tuple[int, str | None, float | None]]) -> Change:
-    """The change that notes frames (number, why it was rejected or None, sigma) as drawn in real time."""
-    rows = [(reason, "rejected" if reason else "realtime", sigma, seq) for seq, reason, sigma in results]
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What became of a frame in real time.
+
+    Attributes:
+        seq: its number. reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
+        thumbnail: bytes of uint8 (12, 16, 3), by which gains are evened out; None for a picture that was not read.
+    """
+
+    seq: int
+    reason: str | None
+    sigma_m: float | None
+    thumbnail: bytes | None = None
+
+
+def frames_drawn(results: Iterable[Drawn]) -> Change:
+    """The change that notes frames as drawn in real time; those that were refined meanwhile stay so."""
+    done = list(results)
+    rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
+    thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
 
     def change(db: sqlite3.Connection) -> None:
         db.executemany(
@@ -245,5 +267,6 @@ def frames_drawn(results: Iterable[tuple[int, str | None, float | None]]) -> Cha
             " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
             rows,
         )
+        db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
 
     return change

@@ -1,19 +1,16 @@
 """The daemon's figures as Prometheus text."""
 
-import os
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from gcs_plugin.daemon.core import Daemon
+from gcs_plugin.daemon.usage import resident_mb
 from orthoswarm import __version__
-from orthoswarm.workers import peak_rss_mb
-
-if TYPE_CHECKING:
-    from gcs_plugin.daemon.core import Daemon
 
 _QUANTILES: Final = (0.5, 0.9, 0.99)
 
 
-def prometheus(daemon: "Daemon") -> str:
+def prometheus(daemon: Daemon) -> str:
     """All figures, one metric a line with its help and type."""
     lines: list[str] = []
 
@@ -36,6 +33,7 @@ def prometheus(daemon: "Daemon") -> str:
     single("frames_drawn_total", "counter", "Frames drawn in real time since the start.", drawer.drawn)
     single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
     single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
+    single("draw_put_off", "gauge", "Frames that wait because they would show least.", drawer.put_off)
     recent = sorted(drawer.latencies)
     metric(
         "draw_latency_seconds", "gauge", "From arrival to the map, of the last thousand frames.",
@@ -54,15 +52,6 @@ def prometheus(daemon: "Daemon") -> str:
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
     single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())
     return "\n".join(lines) + "\n"
-
-
-def resident_mb() -> float:
-    """Memory of this process now, megabytes."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except (OSError, AttributeError):  # not Linux: the largest so far
-        return peak_rss_mb()
 
 
 def _escape(text: str) -> str:

@@ -29,7 +29,8 @@ class ExportTask:
         workspace: the daemon's folder. formats: some of FORMATS.
         canvases: layer -> its canvas's folder, those that there are. epsg, gsd_m: the area's.
         frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
-        solutions: pickles. basemap: the map, or None. fov_rad: theta-hat.
+        coarse, solutions: kept sorties, those only placed in flight and those refined.
+        basemap: the map, or None. fov_rad: theta-hat.
     """
 
     workspace: Path
@@ -39,6 +40,7 @@ class ExportTask:
     gsd_m: float
     frames: list[Frame]
     reasons: dict[tuple[str, str], str]
+    coarse: list[Path]
     solutions: list[Path]
     basemap: Path | None
     fov_rad: float | None
@@ -59,7 +61,8 @@ def write_products(task: ExportTask) -> dict[str, str]:
     made, area_ha = _pictures(task)
     if not made:
         raise InputError("there is no map yet; wait for pictures")
-    solutions = [load_solution(path) for path in task.solutions]
+    refined = [load_solution(path) for path in task.solutions]
+    solutions = [*(load_solution(path) for path in task.coarse), *refined]
     placed, rejected = _placements(task, solutions)
     placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
@@ -96,7 +99,7 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
             area_ha = area_ha or _drawn_ha(canvas)
             write_cog(_WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1)
         made.append(file)
-    if made and made[-1] == "coarse.tif":  # without a map the orthoimage is the coarse product
+    if task.solutions and made[-1:] == ["coarse.tif"]:  # without a map the orthoimage is the coarse product
         with written_whole(task.workspace / "orthoimage.tif") as part:
             shutil.copyfile(task.workspace / "coarse.tif", part)
         made.append("orthoimage.tif")
@@ -224,6 +227,16 @@ def facts_of(
             for j in jobs
             if j["kind"] == "refine" and j["state"] == "done"
         ),
+        *_in_flight([j["detail"] for j in jobs if j["kind"] == "coarse" and "frames" in j["detail"]]),
     ]  # fmt: skip
     document = {"stages": stages, "wall_s": wall_s, "cpu_s": cpu_s, "peak_rss_mb": rss_mb, "completions": completions}
     return dict(json.loads(json.dumps(document)))
+
+
+def _in_flight(details: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The stage of the coarse maps in flight, if there were any."""
+    if not details:
+        return []
+    wall, cpu = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))
+    frames = sum(d["frames"] for d in details)
+    return [{"name": "coarse: in flight", "wall_s": wall, "cpu_s": cpu, "items": frames}]

@@ -1,32 +1,28 @@
-"""Refinement of one vehicle's sortie: gather its frames, solve and draw in worker processes, publish at once.
-
-Until the last step nothing of what the map shows changes; the last step is one transaction of the journal, which names
-the layer's new generation, the frames' stages and the job's end.
-"""
+"""Refinement of one vehicle's sortie: gather its frames, solve and draw in worker processes, publish at once."""
 
 import json
 import sqlite3
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.crew import Crew
 from gcs_plugin.daemon.drawing import Drawer, frame_of_row
-from gcs_plugin.daemon.jobs import Job
-from gcs_plugin.daemon.journal import Change, Journal, fact_change, packed
-from gcs_plugin.daemon.layers import Area, Layer, new_name
+from gcs_plugin.daemon.jobs import Job, new_job
+from gcs_plugin.daemon.journal import Change, Journal, packed
+from gcs_plugin.daemon.kept import Bytes, thumbnail_of
+from gcs_plugin.daemon.layers import Bounds, new_name
+from gcs_plugin.daemon.press import Press
 from gcs_plugin.daemon.store import PictureStore
-from gcs_plugin.daemon.work import DrawTask, Solved, SolveTask, draw, solve
+from gcs_plugin.daemon.work import Solved, SolveTask, joined, near, solve
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
-from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.products import finite
 
 _REACH_M: Final = 400.0
-_IDLE_S: Final = 30.0
+_DRAWN_S: Final = 3.0
 _QUIET_S: Final = 0.7
 _LATE_S: Final = 6.0
 Tell = Callable[[float, str], None]
@@ -34,79 +30,59 @@ Tell = Callable[[float, str], None]
 
 @dataclass(slots=True)
 class Refinement:
-    """Does the jobs `refine` and `coarse`.
+    """Does the jobs `refine`.
 
     Attributes:
-        journal, store: what there is. layers: by name. folder: of the layers' canvases. solutions: folder for pickles.
-        crew: where the work runs. drawer: knows the area. basemap: the map, or None.
-        on_published: called with layer, vehicle, sortie and version when pixels have changed.
+        journal, store, press: what there is. crew: where the work runs. drawer: of the real-time layer.
+        basemap: the map, or None. on_published: called with layer and job when pixels have changed.
+        make_way: called with vehicle and layer before the work begins, and before the layer is needed.
     """
 
     journal: Journal
     store: PictureStore
-    layers: dict[str, Layer]
-    folder: Path
-    solutions: Path
+    press: Press
     crew: Crew
     drawer: Drawer
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
-    _one_drawing: threading.Lock = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        """Make what is missing, remove what a killed daemon left half made, and open what it had published."""
-        self._one_drawing = threading.Lock()
-        self.solutions.mkdir(parents=True, exist_ok=True)
-        for name in ("coarse", "fine"):
-            generation = self.journal.fact(name)
-            if generation is not None and (self.folder / generation / "canvas.json").exists():
-                self.layers[name].replace(Canvas.open(self.folder / generation))
-        self.sweep()
-
-    def sweep(self) -> None:
-        """Remove canvases and pickles that nothing names."""
-        import shutil
-
-        named = {self.journal.fact(name) for name in ("realtime", "coarse", "fine")}
-        for path in self.folder.iterdir():
-            if path.name not in named:
-                shutil.rmtree(path, ignore_errors=True)
-        known = {row["path"] for row in self.journal.rows("SELECT path FROM solutions")}
-        for path in self.solutions.iterdir():
-            if path.name not in known:
-                path.unlink(missing_ok=True)
+    make_way: Callable[[str, str | None], None] = lambda vehicle, layer: None
+    stopped: Callable[[], bool] = lambda: False
 
     def refine(self, job: Job, tell: Tell) -> Change:
         """The handler of `refine`."""
-        assert job.vehicle is not None
+        vehicle = str(job.vehicle)
         began = time.monotonic()
         tell(0.02, "waiting for the last pictures")
+        self.make_way(vehicle, None)
         if job.detail.get("trigger") == "complete":
             self._wait_quiet(job)
-        self.drawer.wait_idle(_IDLE_S)
+        self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
         job.detail["refine_started_s"] = time.time()
-        area, frames = self._area(), self._frames(job)
+        area = self.press.area()
+        frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
         tell(0.05, f"refining {len(frames)} pictures")
-        target = self.solutions / f"{new_name('solution')}.pickle"
-        task = SolveTask(
-            frames, area.epsg, area.origin, self.basemap, self._neighbours(job, frames), target
-        )  # fmt: skip
-        solved = self.crew.run(solve, task)
-        with self._one_drawing:
+        target = self.press.kept / f"{new_name('solution')}.pickle"
+        others = self._neighbours(job, near(frames, area.epsg))
+        solved = self.crew.run(
+            solve, SolveTask(frames, area.epsg, area.origin, self.basemap, thumbnails, others, target)
+        )
+        layer = "fine" if self.basemap is not None else "coarse"
+        self.make_way(vehicle, layer)
+        with self.press.turn(layer):
             tell(0.7, "drawing")
-            layer = "fine" if self.basemap is not None else "coarse"
-            name = new_name(layer)
-            rejected = self.crew.run(draw, self._draw_task(job, layer, name, target, frames))
             job.detail |= {
                 "layer": layer, "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3),
-                "solve_s": round(solved.wall_s, 3), "seconds": round(time.monotonic() - began, 3),
+                "solve_s": round(solved.wall_s, 3),
             }  # fmt: skip
-            version_before = self.layers[layer].version
-            change = self._publish(job, layer, name, target, solved, rejected)
-            self.journal.write(change)  # here, so that the next drawing begins from it
-            self.layers[layer].replace(Canvas.open(self.folder / name))
+            before = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
+            changed = solved.changed if before is None else joined([solved.changed, before[1]])
+            versions = self.press.print(
+                layer, self.crew, (vehicle, job.sortie), target, changed,
+                lambda rejected: self._publish(job, layer, target, solved, rejected),
+            )  # fmt: skip
         job.detail |= {
-            "version_before": version_before, "version": self.layers[layer].version, "published_s": time.time(),
+            "version_before": versions[0], "version": versions[1], "published_s": time.time(),
+            "seconds": round(time.monotonic() - began, 3),
         }  # fmt: skip
         self.on_published(layer, job)
         return lambda db: None
@@ -116,7 +92,7 @@ class Refinement:
     def _wait_quiet(self, job: Job) -> None:
         """Pictures that were on their way when the vehicle completed still belong to its sortie."""
         end, last, since = time.monotonic() + _LATE_S, -1, time.monotonic()
-        while time.monotonic() < end:
+        while time.monotonic() < end and not self.stopped():
             row = self.journal.one(
                 "SELECT COUNT(*) AS n FROM frames WHERE vehicle = ? AND sortie = ?",
                 (packed(str(job.vehicle)), job.sortie),
@@ -128,52 +104,16 @@ class Refinement:
                 return
             time.sleep(0.1)
 
-    def _area(self) -> Area:
-        if self.drawer.area is None:
-            raise OrthoSwarmError("there is no map yet; wait for pictures")
-        return self.drawer.area
-
-    def _frames(self, job: Job) -> list[Frame]:
-        rows = self.journal.rows(
-            "SELECT * FROM frames WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
-            (packed(str(job.vehicle)), job.sortie),
-        )
-        if not rows:
-            raise OrthoSwarmError(f"{job.vehicle} has no pictures that could be drawn; check its camera and its poses")
-        return [frame_of_row(row, self.store) for row in rows]
-
-    def _neighbours(self, job: Job, frames: list[Frame]) -> list[Path]:
+    def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
         """Solutions of others whose ground comes near."""
-        from gcs_plugin.daemon.work import _near
-
-        box = _near(frames, self._area().epsg)
-        near = []
-        for row in self.journal.rows("SELECT * FROM solutions"):
-            if (row["vehicle"], row["sortie"]) == (packed(str(job.vehicle)), job.sortie):
-                continue
-            w, s, e, n = json.loads(row["detail"])["bounds"]
-            apart = max(w - box[2], box[0] - e, s - box[3], box[1] - n)
-            if apart < _REACH_M:
-                near.append(self.solutions / row["path"])
-        return near
-
-    def _draw_task(self, job: Job, layer: str, name: str, target: Path, frames: list[Frame]) -> DrawTask:
         mine = (packed(str(job.vehicle)), job.sortie)
-        others, before = [], None
-        for row in self.journal.rows("SELECT * FROM solutions ORDER BY vehicle, sortie"):
-            detail = json.loads(row["detail"])
-            if (row["vehicle"], row["sortie"]) == mine:
-                w, s, e, n = detail["bounds"]
-                before = (w, s, e, n)
-            elif detail["layer"] == layer:
-                others.append(self.solutions / row["path"])
-        canvas = self.layers[layer].canvas
-        old = None if canvas is None else canvas.path
-        return DrawTask(old, self.folder / name, self._area().grid, [*others, target], target, before)
+        return [
+            self.press.kept / row["path"]
+            for row in self.journal.rows("SELECT * FROM solutions")
+            if (row["vehicle"], row["sortie"]) != mine and apart_m(json.loads(row["detail"])["bounds"], box) < _REACH_M
+        ]
 
-    def _publish(
-        self, job: Job, layer: str, name: str, target: Path, solved: Solved, rejected: dict[str, str]
-    ) -> Change:
+    def _publish(self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str]) -> Change:
         vehicle = packed(str(job.vehicle))
         dropped = {**solved.dropped, **rejected}
         placed = [
@@ -182,15 +122,11 @@ class Refinement:
             if image not in dropped
         ]
         lost = [(why, vehicle, job.sortie, packed(image)) for image, why in dropped.items()]
-        detail = json.dumps(
-            {
-                "bounds": solved.bounds, "layer": layer, "legs": [_clean(leg) for leg in solved.legs],
-                "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
-                "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
-            }
-        )  # fmt: skip
+        detail = json.dumps(detail_of(solved, solved.legs) | {"layer": layer})
         old = self.journal.one("SELECT path FROM solutions WHERE vehicle=? AND sortie=?", (vehicle, job.sortie))
-        fact = fact_change(layer, name)
+        then = None
+        if self.basemap is not None:  # the coarse layer shows all of the sortie, too
+            then = new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"})
 
         def change(db: sqlite3.Connection) -> None:
             db.executemany(
@@ -204,15 +140,44 @@ class Refinement:
             )
             # The job's result stands with this, so that it is not done again if the daemon ends right now.
             db.execute("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", (time.time(), job.id))
-            fact(db)
+            if then is not None:
+                then(db)
 
         if old is not None:
-            stale = self.solutions / old["path"]
-            later = threading.Timer(60.0, stale.unlink, kwargs={"missing_ok": True})  # others may be reading it
-            later.daemon = True
-            later.start()
+            self.press.retire(self.press.kept / old["path"])
         return change
 
 
-def _clean(leg: dict[str, Any]) -> dict[str, Any]:
-    return leg | {"confidence": finite(leg["confidence"]), "sigma_m": finite(leg["sigma_m"])}
+def sortie_frames(
+    journal: Journal, store: PictureStore, vehicle: str, sortie: int | None
+) -> tuple[list[Frame], dict[str, Bytes]]:
+    """A sortie's frames in order of time that were not rejected, and image -> thumbnail of those that were drawn.
+
+    Raises:
+        OrthoSwarmError: there are none.
+    """
+    rows = journal.rows(
+        "SELECT frames.*, thumbnails.rgb FROM frames LEFT JOIN thumbnails USING (seq)"
+        " WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
+        (packed(vehicle), sortie),
+    )
+    if not rows:
+        raise OrthoSwarmError(f"{vehicle} has no pictures that could be drawn; check its camera and its poses")
+    frames = [frame_of_row(row, store) for row in rows]
+    small = {f.image: thumbnail_of(row["rgb"]) for f, row in zip(frames, rows, strict=True) if row["rgb"] is not None}
+    return frames, small
+
+
+def detail_of(solved: Solved, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """What the journal keeps of a placed sortie, as JSON values."""
+    return {
+        "bounds": solved.bounds,
+        "legs": [leg | {key: finite(leg[key]) for key in ("confidence", "sigma_m")} for leg in legs],
+        "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
+        "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
+    }  # fmt: skip
+
+
+def apart_m(one: Bounds, other: Bounds) -> float:
+    """How far two boxes lie apart along an axis; negative where they overlap."""
+    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])

@@ -21,6 +21,7 @@ TEMPLATE: Final = """\
 # fov_min_deg = 70                # smallest horizontal field of view in the swarm, for the real-time map
 # gsd_m = 0.1                     # ground pixel of the map; from the first pictures unless given
 # workers = 1                     # processes that refine
+# coarse = true                   # place legs on the coarse layer as they finish, in one more process of low priority
 # lost_after_s = 120              # a vehicle that is silent for so long in its mission is refined as it is
 
 # [[vehicle]]
@@ -54,7 +55,8 @@ class Settings:
         workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
         links: MAVLink links. basemap: the map before the disaster, or None.
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
-        workers: processes that refine. lost_after_s: when a silent vehicle's sortie counts as over.
+        workers: processes that refine. coarse: whether legs are placed in flight.
+        lost_after_s: when a silent vehicle's sortie counts as over.
         vehicles: those that were named. token_file: where the token is, or goes.
     """
 
@@ -66,6 +68,7 @@ class Settings:
     fov_min_deg: float | None = None
     gsd_m: float | None = None
     workers: int = 1
+    coarse: bool = True
     lost_after_s: float = 120.0
     vehicles: tuple[VehicleSettings, ...] = field(default=())
     token_file: Path | None = None
@@ -96,7 +99,7 @@ class Settings:
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "fov_min_deg": (int, float),
-    "gsd_m": (int, float), "workers": (int,), "lost_after_s": (int, float), "vehicle": (list,),
+    "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
 }  # fmt: skip
 
 
@@ -116,7 +119,7 @@ def read_settings(workspace: Path) -> Settings:
     for key, value in document.items():
         if key not in _KINDS:
             raise InputError(f"{path} says '{key}', which is unknown; choose from: {', '.join(_KINDS)}")
-        if isinstance(value, bool) or not isinstance(value, _KINDS[key]):
+        if not isinstance(value, _KINDS[key]) or (isinstance(value, bool) and bool not in _KINDS[key]):
             raise InputError(f"{key} in {path} is of the wrong kind; see `orthoswarm serve --init`")
     vehicles = tuple(_vehicle(entry, path) for entry in document.pop("vehicle", ()))
     if "links" in document:
@@ -132,12 +135,13 @@ def _vehicle(entry: Any, path: Path) -> VehicleSettings:
     unknown = set(entry) - {"id", "system", "name", "pictures"}
     if unknown:
         raise InputError(f"a [[vehicle]] in {path} says '{unknown.pop()}'; it has id, system, name and pictures")
-    system = entry.get("system", _system_of(entry["id"]))
+    system = entry.get("system", system_of(entry["id"]))
     if system is not None and (isinstance(system, bool) or not isinstance(system, int) or not 1 <= system <= 255):
         raise InputError(f"the system id of {entry['id']} in {path} is not 1 to 255; correct it")
     return VehicleSettings(entry["id"], system, str(entry.get("name", "")), str(entry.get("pictures", "")))
 
 
-def _system_of(vehicle: str) -> int | None:
+def system_of(vehicle: str) -> int | None:
+    """The MAVLink system id that a vehicle's name stands for (v7: 7), None if it is no such name."""
     found = re.fullmatch(r"v(\d{1,3})", vehicle)
     return int(found[1]) if found and 1 <= int(found[1]) <= 255 else None

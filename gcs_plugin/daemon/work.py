@@ -1,45 +1,45 @@
-"""What worker processes do for the daemon: solve a vehicle's poses, and draw the next generation of a layer.
+"""What worker processes do for the daemon: place a vehicle's pictures, and draw the next generation of a layer.
 
 Both hand large things over as files: a solution is pickled beside the journal, a generation is a folder of tiles.
 """
 
-import os
-import pickle
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gcs_plugin.daemon.kept import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
 from gcs_plugin.daemon.layers import Bounds, drawn_bounds, successor, union
 from orthoswarm.basemap import Basemap
-from orthoswarm.export.partial import written_whole
 from orthoswarm.frame import Frame
-from orthoswarm.geo import GroundGrid
+from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
-from orthoswarm.mosaic.footprint import footprint_boxes
 from orthoswarm.mosaic.render import render
-from orthoswarm.placement import PlacedFrame, Solution, Terrain
-
-_OVERLAP_M = 50.0
+from orthoswarm.placement import Leg, PlacedFrame, Solution
 
 
 @dataclass(frozen=True, slots=True)
 class SolveTask:
-    """One vehicle's sortie to refine.
+    """One vehicle's sortie, or as much of it as there is.
 
     Attributes:
         frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
-        neighbours: pickled solutions of vehicles nearby, held as they are. target: where the new one goes.
+        thumbnails: image -> uint8 (12, 16, 3).
+        neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        before: in flight, what was kept of the sortie's earlier legs.
     """
 
     frames: list[Frame]
     epsg: int
     origin: tuple[float, float]
     basemap: Path | None
+    thumbnails: dict[str, Bytes]
     neighbours: list[Path]
     target: Path
+    before: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,9 @@ class Solved:
     """What became of it.
 
     Attributes:
-        stages: image -> stage and sigma in metres. dropped: image -> why.
-        legs: as JSON values. fov_deg: with its sigma. warnings: in plain words. bounds: of what its frames see.
+        stages: image -> stage and sigma in metres, of what is new. dropped: image -> why.
+        legs: as JSON values with `line`, their ends in degrees. fov_deg: with its sigma. warnings: in plain words.
+        bounds: of what all its frames see. changed: of the ground that has to be drawn anew.
         cpu_s: CPU seconds that it took; wall_s.
     """
 
@@ -59,8 +60,22 @@ class Solved:
     fov_sigma_deg: float
     warnings: list[str]
     bounds: Bounds
+    changed: Bounds
     cpu_s: float
     wall_s: float
+
+
+class _Watch:
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def solved(self, solution: Solution, frames: Sequence[Frame], kept: Kept, changed: Bounds) -> Solved:
+        return Solved(
+            {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
+            [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
+            list(solution.warnings), seen(kept.solution.placed, kept.terrain), changed,
+            time.process_time() - self._cpu, time.monotonic() - self._wall,
+        )  # fmt: skip
 
 
 def solve(task: SolveTask) -> Solved:
@@ -69,53 +84,90 @@ def solve(task: SolveTask) -> Solved:
     Raises:
         OrthoSwarmError: nothing can be made of its frames.
     """
-    from dataclasses import asdict
-
     from orthoswarm.swarm.refine import SwarmRefiner
 
-    began, cpu = time.monotonic(), time.process_time()
-    basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg, _near(task.frames, task.epsg))
-    neighbours = [_load(path) for path in task.neighbours]
-    solution = SwarmRefiner(task.epsg, np.array(task.origin)).refine(task.frames, neighbours, basemap)
-    with written_whole(task.target) as part, part.open("wb") as file:
-        pickle.dump(solution, file, pickle.HIGHEST_PROTOCOL)
-        file.flush()
-        os.fsync(file.fileno())
-    return Solved(
-        {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed},
-        dict(solution.dropped),
-        [asdict(leg) for leg in solution.legs],
-        solution.fov_deg,
-        solution.fov_sigma_deg,
-        list(solution.warnings),
-        _seen(solution.placed, solution.terrain or Terrain.flat(solution.ground_z_m)),
-        time.process_time() - cpu,
-        time.monotonic() - began,
-    )
+    watch = _Watch()
+    others = [load_kept(path) for path in task.neighbours]
+    refiner = SwarmRefiner(task.epsg, np.array(task.origin))
+    solution = refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task))
+    kept = Kept(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
+    kept.write(task.target)
+    return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
 
 
-def _near(frames: list[Frame], epsg: int) -> Bounds:
-    from orthoswarm.geo import LocalGrid
+def place(task: SolveTask) -> Solved:
+    """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
 
+    Raises:
+        OrthoSwarmError: the pictures do not hold together (yet).
+    """
+    from orthoswarm.swarm.inflight import place_in_flight
+
+    watch = _Watch()
+    solution = place_in_flight(task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task))
+    mine = {frame.image for frame in task.frames}
+    before = Kept(replace(solution, placed=[])) if task.before is None else load_kept(task.before)
+    earlier = [p for p in before.solution.placed if p.frame.image not in mine]
+    moved = [p for p in before.solution.placed if p.frame.image in mine]
+    whole = replace(solution, placed=[*earlier, *solution.placed])
+    stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
+    thumbnails = before.thumbnails | task.thumbnails
+    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], stays)
+    kept = Kept(whole, thumbnails, gains)
+    kept.write(task.target)
+    changed = seen([*solution.placed, *moved], kept.terrain)
+    return watch.solved(solution, _in_units(task.frames), kept, changed)
+
+
+def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
+    """The coarse placement that a refined sortie began from, for the coarse layer.
+
+    Args:
+        task: the kept refined sortie, the area's origin, where the coarse one goes.
+
+    Raises:
+        OrthoSwarmError: the refined one does not know any more.
+    """
+    from orthoswarm.swarm.inflight import coarse_of
+
+    watch = _Watch()
+    source, origin, target = task
+    fine = load_kept(source)
+    solution = coarse_of(fine.solution, np.array(origin))
+    kept = replace(fine, solution=solution)
+    kept.write(target)
+    return watch.solved(replace(solution, legs=[]), [], kept, seen(solution.placed, kept.terrain))
+
+
+def _basemap(task: SolveTask) -> Basemap | None:
+    return None if task.basemap is None else Basemap.open(task.basemap, task.epsg, near(task.frames, task.epsg))
+
+
+def near(frames: Sequence[Frame], epsg: int) -> Bounds:
+    """West, south, east, north of where pictures were taken, by their records."""
     ground = LocalGrid(epsg).to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
     (west, south), (east, north) = ground.min(0), ground.max(0)
     return float(west), float(south), float(east), float(north)
 
 
-def load_solution(path: Path) -> Solution:
-    """A solution that `solve` wrote."""
-    return _load(path)
+def _in_units(frames: Sequence[Frame]) -> list[Frame]:
+    """Frames in the order in which legs number them: unit by unit."""
+    from orthoswarm.swarm.units import split_units
+
+    return [frame for unit in split_units({frames[0].vehicle: frames}) for frame in unit]
 
 
-def _load(path: Path) -> Solution:
-    solution: Solution = pickle.loads(path.read_bytes())
-    return solution
-
-
-def _seen(placed: list[PlacedFrame], terrain: Terrain) -> Bounds:
-    boxes = footprint_boxes([p.camera for p in placed], float(terrain.z.min()), float(terrain.z.max()))
-    boxes = boxes[np.isfinite(boxes).all(1)]
-    return union(boxes) if len(boxes) else (0.0, 0.0, 0.0, 0.0)
+def _leg(leg: Leg, frames: Sequence[Frame]) -> dict[str, Any]:
+    """A leg as JSON values, with its ends by the record and the pictures at them."""
+    values: dict[str, Any] = {
+        "vehicle": leg.vehicle, "first": leg.first, "last": leg.last, "state": leg.state,
+        "confidence": leg.confidence, "sigma_m": leg.sigma_m,
+    }  # fmt: skip
+    if 0 <= leg.first < leg.last < len(frames):
+        ends = [frames[leg.first], frames[leg.last]]
+        values["line"] = [[f.fix.lon_deg, f.fix.lat_deg] for f in ends]
+        values["images"] = [f.image for f in ends]
+    return values
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +177,8 @@ class DrawTask:
     Attributes:
         old: folder of the present generation, None for the first. new: folder of the next.
         grid: where the layer lies.
-        solutions: pickled solutions, in the order that breaks ties; all that show on the layer.
-        changed: the solution whose ground is drawn anew. before: what its vehicle's frames saw till now, if it did.
+        solutions: kept sorties, in the order that breaks ties; all that show on the layer near the changed ground.
+        changed: the one whose ground is drawn anew. bounds: that ground.
     """
 
     old: Path | None
@@ -134,28 +186,30 @@ class DrawTask:
     grid: GroundGrid
     solutions: list[Path]
     changed: Path
-    before: Bounds | None
+    bounds: Bounds
 
 
 def draw(task: DrawTask) -> dict[str, str]:
-    """Draw a solution, and what overlaps it, into a new generation; gives image -> why it could not be drawn.
+    """Draw a sortie, and what overlaps it, into a new generation; gives image -> why it could not be drawn.
 
     Raises:
         OrthoSwarmError: the disk is full.
     """
-    changed = _load(task.changed)
-    terrain = changed.terrain or Terrain.flat(changed.ground_z_m)
-    own = _seen(changed.placed, terrain)
-    bounds = own if task.before is None else union([own, task.before])
     placed: list[PlacedFrame] = []
+    gains: dict[str, Any] = {}
+    terrain = load_kept(task.changed).terrain
     for path in task.solutions:
-        mine = path == task.changed
-        solution = changed if mine else _load(path)
-        placed += [_marked(p, len(placed) + i, mine) for i, p in enumerate(solution.placed) if _touches(p, bounds)]
+        kept = load_kept(path)
+        for p in kept.solution.placed:
+            if touches(p, task.bounds):
+                frame = marked(p, len(placed), own=path == task.changed)
+                placed.append(frame)
+                if p.frame.image in kept.gains:
+                    gains[frame.frame.image] = kept.gains[p.frame.image]
     old = None if task.old is None else Canvas.open(task.old, writable=False)
     canvas = successor(old, task.new, task.grid, "frame", share=True)
     try:
-        stats = render(placed, terrain, canvas, bounds=bounds)
+        stats = render(placed, terrain, canvas, gains=gains, bounds=task.bounds)
         canvas.flush()
         assert drawn_bounds(canvas) is not None or not stats.pixels.any()
     finally:
@@ -163,20 +217,14 @@ def draw(task: DrawTask) -> dict[str, str]:
         if old is not None:
             old.close()
     named = ([*key.split(" ", 2), why] for key, why in stats.rejected.items())
-    return {image: why for _, whose, image, why in named if whose == _OWN}
+    return {image: why for _, whose, image, why in named if whose == OWN}
 
 
-_OWN, _OTHER = "own", "other"
+def load_solution(path: Path) -> Solution:
+    """The solution of a kept sortie."""
+    return load_kept(path).solution
 
 
-def _marked(placed: PlacedFrame, number: int, mine: bool) -> PlacedFrame:
-    """Vehicles may use the same names for their pictures, the renderer tells frames apart by name."""
-    frame = placed.frame
-    return replace(placed, frame=replace(frame, image=f"{number} {_OWN if mine else _OTHER} {frame.image}"))
-
-
-def _touches(placed: PlacedFrame, bounds: Bounds) -> bool:
-    reach = 3.0 * float(placed.camera.position[2]) + _OVERLAP_M
-    x, y = (float(v) for v in placed.camera.position[:2])
-    west, south, east, north = bounds
-    return west - reach < x < east + reach and south - reach < y < north + reach
+def joined(boxes: Sequence[Bounds | None]) -> Bounds:
+    """The box around those boxes that there are."""
+    return union([box for box in boxes if box is not None])
