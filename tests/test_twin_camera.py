@@ -146,7 +146,7 @@ def test_a_real_flight_is_mapped_and_refined_from_the_twins_pictures(autopilot, 
     relay, video, folder = free_port(), free_port(), tmp_path / "twin"
     camera = CameraProcess(
         "--link", address, "--relay", f"tcpin:127.0.0.1:{relay}", "--stream", f"tcp://127.0.0.1:{video}",
-        "--set", str(folder), "--rate", str(RATE_HZ),
+        "--set", str(folder), "--rate", str(RATE_HZ), "--fast",
     )  # fmt: skip
     try:
         camera.wait_for("map: ")

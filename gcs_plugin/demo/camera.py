@@ -36,13 +36,14 @@ class TwinCamera:
         stage: the city. site: where it lies.
         setting: the demonstration's.
         system: the vehicle's MAVLink system id.
+        rays: along the side of a pixel; 2 smooth edges, 1 is four times faster.
     """
 
-    def __init__(self, stage: "Stage", site: "Site", setting: Setting, system: int) -> None:
+    def __init__(self, stage: "Stage", site: "Site", setting: Setting, system: int, rays: int = 2) -> None:
         self._stage, self._site, self._system = stage, site, system
         self._errors = Errors.of(setting, system)
         self._lens = Lens(WIDTH, HEIGHT, focal_px(self._errors.fov_rad, WIDTH))
-        self._rays = lens_rays(self._lens)
+        self._rays = lens_rays(self._lens, rays)
         self._sensor = Sensor(WIDTH, HEIGHT, setting.seed)
         self._seed = setting.seed
 

@@ -244,14 +244,15 @@ class Crew:
         stream: where pictures go (`open_outlet`).
         seed: of the cameras' errors.
         shutter: makes a vehicle's shutter.
-        level: see Follower.
+        level: see Follower. rays: see TwinCamera.
         opened: told of each new camera.
     """
 
     def __init__(
         self, fleet: "Fleet", stage: "Stage", site: "Site", stream: str, *, seed: int, shutter: Callable[[], Shutter],
-        level: bool, opened: Callable[[Follower], None],
+        level: bool, rays: int, opened: Callable[[Follower], None],
     ) -> None:  # fmt: skip
+        self._rays = rays
         self._fleet, self._stage, self._site, self._stream = fleet, stage, site, stream
         self._setting, self._shutter, self._level, self._opened = Setting(seed=seed), shutter, level, opened
         self.followers: dict[int, Follower] = {}
@@ -277,8 +278,8 @@ class Crew:
             if system not in self.followers:
                 follower = Follower(
                     vehicle, LivePoses(f"v{system}"), self._shutter(),
-                    TwinCamera(self._stage, self._site, self._setting, system), open_outlet(self._stream, system),
-                    self._level,
+                    TwinCamera(self._stage, self._site, self._setting, system, self._rays),
+                    open_outlet(self._stream, system), self._level,
                 )  # fmt: skip
                 self.followers[system] = follower
                 self._opened(follower)
