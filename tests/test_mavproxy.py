@@ -72,10 +72,14 @@ class MavProxy:
             try:
                 line = self.lines.get(timeout=max(0.01, end - time.monotonic()))
             except queue.Empty:
-                raise AssertionError(f"no answer {answer!r} to '{words}':\n{''.join(self.said[-30:])}") from None
+                raise AssertionError(f"no answer {answer!r} to '{words}':\n{self.end()}") from None
             if match := re.search(answer, line):
                 return match
-            assert "Traceback" not in line, "".join(self.said[-30:])
+            assert "Traceback" not in line, self.end()
+            assert not (words and line.startswith("orthoswarm: ")), f"to '{words}': {line}"
+
+    def end(self):
+        return "".join([line for line in self.said if "COMMAND_ACK" not in line][-30:])
 
     def close(self):
         self.process.terminate()
@@ -114,7 +118,7 @@ def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
     cameras = Cameras()
     vehicles = make_swarm(2, home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0), on_exposure=cameras.expose)
     (tmp_path / "area.geojson").write_text(json.dumps(square(130)))
-    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=5.0) as swarm:
+    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=3.0) as swarm:
         proxy = MavProxy(tmp_path, swarm.addresses)
         try:
             proxy.wait("Loaded module gcs_plugin.mavproxy")
@@ -127,10 +131,15 @@ def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
             proxy.type("orthoswarm vehicles", r"v2: ")
             assert float(proxy.type("orthoswarm plan area.geojson 2 60 65", r"([\d.]+) % covered")[1]) > 99.0
             for name in ("v1", "v2"):
+                served.until(
+                    "/api/vehicles", lambda rows, n=name: any(r["id"] == n and r["state"] == "found" for r in rows)
+                )
                 proxy.type(f"orthoswarm upload {name}", rf"vehicle {name[1]}\b.*(mission|stored|verified)")
                 proxy.type(f"orthoswarm start {name}", "flies its mission")
             proxy.wait(r"MAP Mosaic orthoswarm mosaic \(\d+, \d+, 4\) 255")
-            done = served.until("/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows))
+            done = served.until(
+                "/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows), limit_s=600.0
+            )
             assert {row["vehicle"] for row in done} == {"v1", "v2"}
             assert cameras.posted == cameras.count > 10
             assert "version" not in served.get("/healthz").json()["problems"]
