@@ -5,7 +5,7 @@ import json
 import pytest
 
 from gcs_plugin.bench import accuracy, scaling
-from gcs_plugin.bench.runs import keep, label, linked, pictures
+from gcs_plugin.bench.runs import described, keep, label, linked, pictures
 from gcs_plugin.cli import main
 
 
@@ -131,6 +131,12 @@ def test_photos_are_laid_out_in_folders_or_in_one(tmp_path):
     ]  # fmt: skip
 
 
-def test_a_set_is_named_by_what_it_is():
-    assert label({"set": "x", "disaster": "water", "noise": "hard", "seed": 2}) == "water, hard, seed 2"
-    assert label({"set": "x", "disaster": None, "noise": None, "seed": None}) == "x"
+def test_a_set_is_named_by_what_it_is(tmp_path):
+    folder = swarm_of(tmp_path / "city", [1])
+    assert label(described(folder)) == "city"  # without a manifest
+    known = {"disaster": "water", "noise_name": "hard", "seed": 2, "lens_k": [0.0, 0.0], "relief_m": 0.0, "every": 1}
+    manifest = folder / "truth" / "manifest.json"
+    manifest.write_text(json.dumps(known))
+    assert label(described(folder)) == "water, hard, seed 2"
+    manifest.write_text(json.dumps(known | {"disaster": "none", "lens_k": [-0.05, 0.01], "relief_m": 8.0}))
+    assert label(described(folder)) == "clear, hard, lens -0.05, 0.01, relief +-8 m, seed 2"

@@ -25,19 +25,28 @@ def check_set(folder: Path, *, truth: bool = False) -> None:
 
 
 def described(folder: Path) -> dict[str, Any]:
-    """What a set is, from its manifest: name, disaster, noise, seed (None where unknown)."""
+    """What a set is, from its manifest: its name, and disaster, noise, seed and what else is special (None unknown)."""
     manifest = folder / "truth" / "manifest.json"
     known = json.loads(manifest.read_text(encoding="utf-8")) if manifest.exists() else {}
+    special = []
+    if any(known.get("lens_k") or ()):
+        special.append(f"lens {', '.join(f'{k:g}' for k in known['lens_k'])}")
+    if known.get("relief_m"):
+        special.append(f"relief +-{known['relief_m']:g} m")
+    if known.get("ground"):
+        special.append("real ground")
+    if known.get("every", 1) > 1:
+        special.append(f"1 of {known['every']} photos")
     keys = {"disaster": "disaster", "noise": "noise_name", "seed": "seed"}
-    return {"set": folder.absolute().name} | {k: known.get(name) for k, name in keys.items()}
+    return {"set": folder.absolute().name} | {k: known.get(name) for k, name in keys.items()} | {"special": special}
 
 
 def label(row: dict[str, Any]) -> str:
-    """A set in the words of a table: disaster, noise and seed, else its folder's name."""
+    """A set in the words of a table: disaster, noise, what is special, seed; else its folder's name."""
     if row.get("disaster") is None or row.get("seed") is None:
         return str(row["set"])
-    disaster = "clear" if row["disaster"] == "none" else row["disaster"]
-    return f"{disaster}, {row['noise']}, seed {row['seed']}"
+    disaster = {"none": "clear", "all": "all disasters"}.get(row["disaster"], row["disaster"])
+    return ", ".join([disaster, row["noise"], *row.get("special", ()), f"seed {row['seed']}"])
 
 
 def keep(path: Path, value: Any) -> None:

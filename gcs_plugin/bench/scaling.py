@@ -49,7 +49,7 @@ def run_scaling(
             print(f"{count} vehicles, {number} pictures each", file=sys.stderr, flush=True)
             photos = [photo for vehicle in whole[:count] for photo in vehicle[:number]]
             report = _run(folder, photos, name, refine, out, workers, maps)
-        rows.append({"kind": kind, "vehicles": count, "images": number} | cost(report) | _beside(report))
+        rows.append({"kind": kind, "vehicles": count, "images": number} | cost(report))
     return {"machine": machine(), "set": folder.absolute().name, "refine": refine, "rows": rows}
 
 
@@ -64,15 +64,6 @@ def _run(
     if not maps:
         shutil.rmtree(product, ignore_errors=True)
     return report
-
-
-def _beside(report: dict[str, Any]) -> dict[str, Any]:
-    """Wall seconds by stage: what of the work runs side by side."""
-    walls: dict[str, float] = {}
-    for stage in report["stages"]:
-        name = stage["name"].split(":")[0]
-        walls[name] = walls.get(name, 0.0) + stage["wall_s"]
-    return {"walls": walls}
 
 
 def growth(result: dict[str, Any]) -> dict[str, Any]:
