@@ -165,8 +165,25 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, posetable
                 continue
             if table is not None:
                 tables.append((folder.path, kind, table))
-                result.sources.append(SourceInfo(found.name(path), kind))
+                source = SourceInfo(found.name(path), kind)
+                source.findings += _table_findings(path, folder.path, table, found)
+                result.sources.append(source)
     return sorted(tables, key=lambda entry: len(entry[0].parts))
+
+
+def _table_findings(path: Path, folder: Path, table: posetable.PoseTable, found: Discovery) -> list[Finding]:
+    """Lines of a pose table that say nothing, or are about pictures that are not there."""
+    findings = []
+    if table.useless:
+        text = f"{plural(table.useless, 'line')} of {path.name} hold no position that can be one; they are not used"
+        findings.append(Finding("table-lines", text))
+    pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
+    names = {p.name.lower() for p in pictures} | {p.relative_to(folder).as_posix().lower() for p in pictures}
+    absent = [name for name in table if name not in names]
+    if absent:
+        text = f"{plural(len(absent), 'line')} of {path.name} name pictures that are not here, {absent[0]} first"
+        findings.append(Finding("table-pictures", text, note=len(absent) < len(table)))
+    return findings
 
 
 def _photo_folder(

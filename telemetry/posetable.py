@@ -38,8 +38,14 @@ class PoseRow:
     vehicle: str | None = None
 
 
-PoseTable = dict[str, PoseRow]
-"""Lower-case picture name (or relative path with forward slashes) -> row."""
+class PoseTable(dict[str, PoseRow]):
+    """Lower-case picture name (or relative path with forward slashes) -> row.
+
+    Attributes:
+        useless: lines that name a picture and give no position that can be one.
+    """
+
+    useless: int = 0
 
 
 def lookup(table: PoseTable, relative: str) -> PoseRow | None:
@@ -92,10 +98,11 @@ def read_geo_txt(path: Path) -> PoseTable:
     projection = _projection(lines[0]) if lines else None
     if projection is None:
         raise InputError(f"{path.name} has no projection in its first line; write EPSG:4326 or the projection there")
-    table: PoseTable = {}
+    table = PoseTable()
     for line in lines[1:]:
         name, numbers = _split_row(line)
         if name is None or len(numbers) < 2:
+            table.useless += 1
             continue
         n = [v if math.isfinite(v) else None for v in numbers] + [None] * 8
         row = PoseRow(n[1], n[0], n[2], None, n[3], n[4], n[5], n[6])
@@ -130,7 +137,8 @@ def _to_geographic(table: PoseTable, projection: str, path: Path) -> None:
 
     try:
         transformer = Transformer.from_crs(CRS.from_user_input(projection), 4326, always_xy=True)
-        lon, lat = transformer.transform([r.lon_deg for r in table.values()], [r.lat_deg for r in table.values()])
+        x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
+        lon, lat = transformer.transform([x for x, _ in x_y], [y for _, y in x_y])
     except ProjError as error:
         raise InputError(f"{path.name}: the projection '{projection}' is not understood ({error})") from None
     for row, x, y in zip(table.values(), lon, lat, strict=True):
@@ -138,6 +146,7 @@ def _to_geographic(table: PoseTable, projection: str, path: Path) -> None:
             row.lon_deg, row.lat_deg = float(x), float(y)
         else:
             row.lon_deg = row.lat_deg = None
+            table.useless += 1
 
 
 def _pitch_by_value(table: PoseTable) -> None:
@@ -172,7 +181,9 @@ def read_pose_csv(path: Path) -> PoseTable | None:
     reader = csv.reader(io.StringIO(_read(path)), delimiter=separator)
     try:
         header = [_COLUMNS.get(column.strip().lower(), "") for column in next(reader)]
-        return dict(filter(None, (_csv_row(header, cells) for cells in reader)))
+        table = PoseTable(filter(None, (_csv_row(header, cells) for cells in reader)))
+        table.useless = sum(row.lat_deg is None for row in table.values())
+        return table
     except (csv.Error, StopIteration):
         return None
 
@@ -182,7 +193,8 @@ def _csv_row(header: list[str], cells: list[str]) -> tuple[str, PoseRow] | None:
     name = values.pop("image", "").replace("\\", "/")
     if not name:
         return None
-    row = PoseRow(vehicle=values.pop("vehicle", None))
+    vehicle = "".join(c for c in values.pop("vehicle", "") if c.isprintable()).strip()
+    row = PoseRow(vehicle=vehicle[:64] or None)
     written = values.pop("time", "")
     if written:
         try:

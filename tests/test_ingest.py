@@ -145,6 +145,21 @@ def test_geo_txt_without_projection_is_an_error_that_says_what_to_do(tmp_path):
         load([tmp_path])
 
 
+def test_lines_of_a_table_that_say_nothing_are_named(tmp_path):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        photo(tmp_path / name)
+    (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg nan 47.5\nb.jpg 8.2 95.0\nc.jpg 8.2\nd.jpg 8.2 47.5\n")
+    findings = {f.code: str(f) for source in survey([tmp_path]).sources for f in source.findings}
+    assert "3 lines of geo.txt" in findings["table-lines"]
+    assert "d.jpg" in findings["table-pictures"]
+    (tmp_path / "geo.txt").unlink()
+    long = "v" * 65536
+    (tmp_path / "poses.csv").write_text(f"image,lat_deg,lon_deg,vehicle\na.jpg,47.5,8.2,{long}\nb.jpg,,8.2,\n")
+    found = survey([tmp_path])
+    assert "1 line of poses.csv" in next(str(f) for s in found.sources for f in s.findings if f.code == "table-lines")
+    assert max(len(frame.vehicle) for frame in found.frames()) <= 64
+
+
 def test_a_csv_of_poses_gives_every_field(tmp_path):
     (tmp_path / "v1").mkdir()
     jpeg(tmp_path / "v1" / "a.jpg")

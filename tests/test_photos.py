@@ -34,9 +34,11 @@ def jpeg(path: Path, *, xmp_packet: bytes = b"", exif_bytes: bytes = b"", size=(
     return path
 
 
-def gps_exif(lat=47.5, lon=8.25, *, local="2024:05:06 12:00:01", subsec="250", offset=None, gps_utc=None) -> bytes:
+def gps_exif(
+    lat=47.5, lon=8.25, *, local="2024:05:06 12:00:01", subsec="250", offset=None, gps_utc=None, make="DJI"
+) -> bytes:
     tags = Image.Exif()
-    tags[0x010F], tags[0x0110] = "DJI", "FC1"
+    tags[0x010F], tags[0x0110] = make, "FC1"
     inner = tags.get_ifd(0x8769)
     inner[0x9003], inner[0x9291] = local, subsec
     inner[0xA405] = 24
@@ -60,6 +62,51 @@ def test_xmp_attributes_and_elements_read_alike():
     assert xmp.number(xmp.properties(elements), "drone-dji:GimbalYawDegree") == 44.2
     assert xmp.number(xmp.properties(elements), "drone-dji:RelativeAltitude") == 40.1
     assert xmp.number(xmp.properties(DJI_ATTRIBUTES), "drone-dji:GimbalYawDegree") == -12.5
+
+
+MAKERS = {
+    # maker: (EXIF make, XMP attributes, camera's yaw, pitch and roll, height and whether above ground, sigma)
+    "parrot-anafi": (
+        "Parrot",
+        'drone-parrot:CameraYawDegree="31.5" drone-parrot:CameraPitchDegree="-88" drone-parrot:CameraRollDegree="0.5" '
+        'drone-parrot:DroneYawDegree="30.0" drone-parrot:DronePitchDegree="-4.0" drone-parrot:DroneRollDegree="1.0" '
+        'drone-parrot:RelativeAltitude="42.5"',
+        (31.5, -88.0, 0.5), (42.5, False), None,
+    ),
+    "parrot-sequoia": (
+        "Parrot",
+        'Camera:Yaw="120.0" Camera:Pitch="2.0" Camera:Roll="-3.0" Camera:AboveGroundAltitude="61.0" '
+        'Camera:GPSXYAccuracy="1.5"',
+        (120.0, -88.0, -3.0), (61.0, True), 1.5,
+    ),
+    "autel-evo": (
+        "Autel Robotics",
+        'Camera:Yaw="-75.0" Camera:Pitch="-90.0" Camera:Roll="0.0" drone:RelativeAltitude="55.0"',
+        (-75.0, -90.0, 0.0), (55.0, False), None,
+    ),
+    "sensefly": (
+        "senseFly",
+        'Camera:Yaw="200.0" Camera:Pitch="5.0" Camera:Roll="4.0" Camera:GPSXYAccuracy="0.03"',
+        (200.0, -85.0, -4.0), (None, False), 0.03,
+    ),
+    "micasense": (
+        "MicaSense",
+        'Camera:Yaw="10.0" Camera:Pitch="-3.0" Camera:Roll="1.0" Camera:BandName="Green"',
+        (10.0, -93.0, 1.0), (None, False), None,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_attitude_height_and_accuracy_are_read_as_each_maker_writes_them(tmp_path, maker):
+    make, attributes, angles, height, sigma = MAKERS[maker]
+    packet = f"<x:xmpmeta><rdf:Description {attributes}/></x:xmpmeta>".encode()
+    photo = read_photo(jpeg(tmp_path / "a.jpg", xmp_packet=packet, exif_bytes=gps_exif(make=make)))
+    assert photo is not None
+    assert photo.camera_deg == pytest.approx(angles)
+    assert (photo.height_m, photo.height_is_ground) == height
+    assert photo.position_sigma_m == sigma
+    assert photo.band == ("Green" if maker == "micasense" else "")
 
 
 def test_position_comes_from_xmp_where_exif_has_none(tmp_path):
