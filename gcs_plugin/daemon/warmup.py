@@ -30,21 +30,15 @@ _LENS: Final = Lens(240, 180, focal_px(float(np.radians(70.0)), 240))
 
 def refine_something() -> None:
     """Refine and draw a vehicle beside another of the same path, over a made-up map; the result is thrown away."""
-    import cv2
-
-    rng = np.random.default_rng(7)
-    ground = np.zeros((_SIDE_M, _SIDE_M, 3), np.float32)
-    for cells in (20, 80, 300):
-        part = rng.uniform(0.0, 85.0, (cells, cells, 3)).astype(np.float32)
-        ground += cv2.resize(part, (_SIDE_M, _SIDE_M), interpolation=cv2.INTER_LINEAR)
+    ground = made_up_ground()
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(OrthoSwarmError):
         place = Path(folder)
-        _write_map(ground, place / "map.tif")
+        write_map(ground, place / "map.tif")
         basemap = Basemap.open(place / "map.tif", _EPSG)
         origin = np.array([_EAST, _NORTH])
         refiner = SwarmRefiner(_EPSG, origin)
-        first = refiner.refine(_flight(ground, place, "a"), [], basemap)
-        second = refiner.refine(_flight(ground, place, "b"), [first], basemap)
+        first = refiner.refine(made_up_flight(ground, place, "a"), [], basemap)
+        second = refiner.refine(made_up_flight(ground, place, "b"), [first], basemap)
         terrain = second.terrain
         if terrain is None:
             return
@@ -54,7 +48,20 @@ def refine_something() -> None:
             estimate_gains(second.placed, stats.thumbnails, terrain)
 
 
-def _write_map(ground: NDArray[np.float32], path: Path) -> None:
+def made_up_ground() -> NDArray[np.float32]:
+    """Colours of a ground with detail of all sizes, float32 (metres down, metres right, 3)."""
+    import cv2
+
+    rng = np.random.default_rng(7)
+    ground = np.zeros((_SIDE_M, _SIDE_M, 3), np.float32)
+    for cells in (20, 80, 300):
+        part = rng.uniform(0.0, 85.0, (cells, cells, 3)).astype(np.float32)
+        ground += cv2.resize(part, (_SIDE_M, _SIDE_M), interpolation=cv2.INTER_LINEAR)
+    return ground
+
+
+def write_map(ground: NDArray[np.float32], path: Path) -> None:
+    """Write the ground as a georeferenced map."""
     import rasterio
     from rasterio.transform import from_origin
 
@@ -66,8 +73,8 @@ def _write_map(ground: NDArray[np.float32], path: Path) -> None:
         raster.write(np.moveaxis(ground.astype(np.uint8), -1, 0))
 
 
-def _flight(ground: NDArray[np.float32], folder: Path, vehicle: str) -> list[Frame]:
-    """Two legs, there and back, photographed."""
+def made_up_flight(ground: NDArray[np.float32], folder: Path, vehicle: str) -> list[Frame]:
+    """Two legs of 14 pictures, there and back, photographed into a folder."""
     grid = LocalGrid(_EPSG)
     frames = []
     for number in range(28):

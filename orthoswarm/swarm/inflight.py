@@ -25,6 +25,7 @@ from orthoswarm.swarm.passes import Options, from_flight, read_frame, relative
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
 from orthoswarm.swarm.units import merge_units, split_units
+from orthoswarm.swarm.weak import ENOUGH, observations_per_camera
 
 __all__ = ["coarse_of", "local_origin", "place_in_flight"]
 
@@ -148,6 +149,8 @@ def _hold_drift(flight: Flight) -> None:
 def _check(flight: Flight) -> None:
     """Refuse what a few pictures can make of themselves but no camera can be."""
     rig, records = flight.rig(), flight.records
+    if float(np.median(observations_per_camera(flight))) < ENOUGH:
+        raise OrthoSwarmError("its pictures show too little that one can be laid beside the other")
     if not (np.isfinite(rig.position).all() and np.isfinite(rig.rotation).all()):
         raise OrthoSwarmError("its pictures do not hold together yet")
     focal = float(rig.lens[0, 0])
