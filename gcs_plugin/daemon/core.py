@@ -18,9 +18,9 @@ from gcs_plugin.daemon.events import Events
 from gcs_plugin.daemon.flock import Flock, completion_rows, note_completion
 from gcs_plugin.daemon.ground import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.jobs import Job, Jobs
-from gcs_plugin.daemon.journal import Change, Journal, add_frame, packed, unpacked
+from gcs_plugin.daemon.journal import LATE, Change, Journal, add_frame, packed, unpacked
 from gcs_plugin.daemon.layers import NAMES, Area, Layer
-from gcs_plugin.daemon.legwatch import LegWatch
+from gcs_plugin.daemon.legwatch import FEWEST, LegWatch
 from gcs_plugin.daemon.plans import Plans
 from gcs_plugin.daemon.pose import PostedPose, frame_of
 from gcs_plugin.daemon.press import Press
@@ -98,7 +98,16 @@ class Daemon:
         if settings.links:
             self.flock = Flock(settings, self.journal, self.events, self.jobs)
         self.sources = [
-            Source(v.id, v.pictures, self.add_picture, self._pose_at, self._say, folder / "videos", self._link_log)
+            Source(
+                v.id,
+                v.pictures,
+                self.add_picture,
+                self._pose_at,
+                self._say,
+                folder / "videos",
+                self._link_log,
+                self._card_read,
+            )
             for v in settings.vehicles
             if v.pictures
         ]
@@ -251,6 +260,13 @@ class Daemon:
             if not wanted:
                 raise InputError(f"vehicle {vehicle} has sent no picture; see /api/vehicles")
         return [self.jobs.add("refine", name, sortie) for name, sortie in wanted]
+
+    def _card_read(self, vehicle: str) -> None:
+        """A card was read after landing: a sortie that was complete before is refined with what its camera kept."""
+        sortie = self.sortie(vehicle)
+        (count,) = self.journal.rows(LATE, {"vehicle": packed(vehicle), "sortie": sortie})
+        if count["late"] >= FEWEST or 0 < count["late"] == count["frames"]:
+            self.jobs.add("refine", vehicle, sortie, trigger="late")
 
     def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
         """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""

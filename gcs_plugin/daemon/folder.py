@@ -34,6 +34,7 @@ _SETTLED_S: Final = 3.0
 _BATCH: Final = 32
 _BATCH_BYTES: Final = 64 << 20
 _STALLED_S: Final = 30.0
+_REST_S: Final = 5.0
 _AGAIN_S: Final = (20.0, 600.0)
 _NEAR_M: Final = 50.0
 _log = logging.getLogger(__name__)
@@ -68,6 +69,7 @@ class Desk:
         pose_at: the vehicle's pose at a moment (UTC) from its link.
         link_log: writes what the vehicle has said so far to a .tlog; False if it has said nothing.
         tell: told what happens, in words.
+        settled: told when the folder has come to rest after new pictures were taken from it.
         cache: folder of the workspace for what is remembered, and for pictures of videos until they are kept.
         stop: set when it is time to end.
     """
@@ -77,6 +79,7 @@ class Desk:
     pose_at: PoseAt
     link_log: LinkLog
     tell: Callable[[str], None]
+    settled: Callable[[], None]
     cache: Path
     stop: threading.Event
 
@@ -105,6 +108,7 @@ class FolderReader:
         self._taken = Taken(desk.cache, desk.vehicle, folder)
         self._tried: object = None
         self._again_at, self._again_s = 0.0, _AGAIN_S[0]
+        self._fresh_at: float | None = None
 
     def run(self) -> None:
         """Watch until told to stop."""
@@ -141,6 +145,9 @@ class FolderReader:
             if path.suffix.lower() in self._videos and self._settled(path, now, _QUIET_S):
                 self._take_video(path, now)
         self._pair(here, now)
+        if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
+            self._fresh_at = None
+            self._desk.settled()
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; what cannot be read now is left for the next look."""
@@ -299,6 +306,7 @@ class FolderReader:
         file = self._files[path]
         file.done = True
         self.poseless.discard(path)
+        self._fresh_at = time.monotonic()
         if not self._desk.stop.is_set():
             self._taken.add(self._name(path), file.stamp, digest)
 

@@ -255,6 +255,15 @@ class Drawn:
     thumbnail: bytes | None = None
 
 
+LATE: Final = """
+SELECT COUNT(*) AS frames, COALESCE(SUM(arrived > COALESCE((SELECT MAX(started) FROM jobs
+    WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie), 0)), 0) AS late
+FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
+    AND EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
+"""
+"""Frames of a sortie that is complete (0 of another one), and how many of them its last refinement has not seen."""
+
+
 def frames_drawn(results: Iterable[Drawn]) -> Change:
     """The change that notes frames as drawn in real time; those that were refined meanwhile stay so."""
     done = list(results)

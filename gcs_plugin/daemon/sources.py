@@ -37,12 +37,13 @@ class Source:
         pose_at: the vehicle's pose at a moment from its link, for pictures without one of their own.
         tell: told what happens, in words.
         cache: folder for pictures of videos, and for what is remembered of folders.
+        settled: told of a vehicle whose folder has come to rest after new pictures.
         link_log: writes what a vehicle has said on its link into a .tlog; False if it has said nothing.
     """
 
     def __init__(
         self, vehicle: str, where: str, take: Take, pose_at: PoseAt, tell: Callable[[str], None], cache: Path,
-        link_log: LinkLog = lambda vehicle, out: False,
+        link_log: LinkLog = lambda vehicle, out: False, settled: Callable[[str], None] = lambda vehicle: None,
     ) -> None:  # fmt: skip
         self.vehicle, self.where = vehicle, where
         self._take, self._pose_at, self._tell = take, pose_at, tell
@@ -51,7 +52,14 @@ class Source:
         self._reader: FolderReader | None = None
         if not is_stream(where):
             desk = Desk(
-                vehicle, self._keep, partial(pose_at, vehicle), partial(link_log, vehicle), tell, cache, self._stop
+                vehicle,
+                self._keep,
+                partial(pose_at, vehicle),
+                partial(link_log, vehicle),
+                tell,
+                partial(settled, vehicle),
+                cache,
+                self._stop,
             )
             self._reader = FolderReader(Path(where), desk)
         run = self._stream if self._reader is None else self._reader.run
