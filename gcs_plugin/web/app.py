@@ -99,7 +99,8 @@ class Routes:
     ) -> Response:
         """Frames in the order in which they came."""
         moment = None if since is None else await self.work(_moment, since)
-        rows = await self.work(self.daemon.frames, vehicle, moment, limit)
+        most = None if limit is None else min(limit, 2**62)  # larger ones do not fit the journal's integers
+        rows = await self.work(self.daemon.frames, vehicle, moment, most)
         return Ascii(rows)
 
     async def layers(self) -> Response:
