@@ -160,7 +160,10 @@ def write_folder(folder: Path, files: Mapping[str, str | bytes]) -> None:
     try:
         for name, content in files.items():
             data = content.encode() if isinstance(content, str) else content
-            (temporary / name).write_bytes(data)
+            with (temporary / name).open("wb") as file:  # a mission that a power cut has shortened would still be flown
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
         if not folder.exists():
             temporary.chmod(0o755)
             os.replace(temporary, folder)

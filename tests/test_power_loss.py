@@ -5,6 +5,7 @@ disk of our own may be mounted, the disk's image as it was at that moment, so th
 """
 
 import contextlib
+import json
 import os
 import random
 import shutil
@@ -20,6 +21,7 @@ import pytest
 
 from tests.daemon_kit import line, serving, start, stop
 from tests.test_daemon_crash import check, post_until_gone
+from tests.test_daemon_flight import square
 
 # Loaded by every interpreter of the daemon: notes what was synced, and how long it was then.
 SPY = """
@@ -130,6 +132,10 @@ def goes_on(workspace, acknowledged, asked, shots):
         layers = {row["name"]: row for row in served.get("/api/layers").json()}
         assert not layers["realtime"]["empty"]
         if asked:
+            (plan,) = served.get("/api/plans").json()
+            folder = workspace / "plans" / plan["id"]
+            assert (folder / "v1.waypoints").read_text().count("\n") > 5
+            assert "mission" in json.loads((folder / "v1.plan").read_text())
             assert not layers["coarse"]["empty"]
             served.until("/api/jobs", lambda jobs: all(job["state"] in ("done", "failed") for job in jobs))
             export = [job for job in served.get("/api/jobs").json() if job["kind"] == "export"]
@@ -141,6 +147,8 @@ def fly_until(served, shots, acknowledged, lock, chance, refine):
     """Post for a random while; gives how many refinements were acknowledged, and the thread that goes on posting."""
     asked = 0
     if refine:
+        body = {"area": square(150), "vehicles": 1, "altitude_m": 60, "fov_min_deg": 65}
+        assert served.command("/api/plans", body).status_code == 201
         first = [shot for shot in shots if shot.pose["vehicle"] == "v1"]
         post_until_gone(served, first, acknowledged, lock)
         answer = served.command("/api/refine", {"vehicle": "v1"})

@@ -1,5 +1,6 @@
 """Plans made over HTTP: a folder each in the workspace, with the same files as `orthoswarm plan` writes."""
 
+import contextlib
 import json
 import re
 import shutil
@@ -59,7 +60,8 @@ class Plans:
         """The figures of all plans, oldest first."""
         found = []
         for path in sorted(self.folder.glob("plan-*/plan.json")):
-            found.append(json.loads(path.read_text(encoding="utf-8")) | {"id": path.parent.name})
+            with contextlib.suppress(ValueError):  # not written to its end: nobody was told of it
+                found.append(json.loads(path.read_text(encoding="utf-8")) | {"id": path.parent.name})
         return found
 
     def geojson(self, name: str) -> bytes:

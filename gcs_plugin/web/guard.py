@@ -37,15 +37,21 @@ def take_token(path: Path) -> tuple[str, bool]:
         InputError: the file holds none, or cannot be read or written.
     """
     try:
-        if path.exists():
+        # a file without content is one that was being written when the power went
+        if path.exists() and path.read_bytes().strip(b"\0 \r\n"):
             token = path.read_text(encoding="ascii").strip()
             if len(token) < 8:
                 raise InputError(f"{path} holds no token; put at least eight characters there, or remove it")
             return token, False
         token = secrets.token_urlsafe(24)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        part = path.with_name(f".{path.name}.part")
+        part.unlink(missing_ok=True)
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
             file.write(token + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the token file {path} cannot be used ({error}); name another with --token-file") from None
     return token, True
