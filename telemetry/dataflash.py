@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.logs import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
+from telemetry.flightlog import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
 from telemetry.mavposes import CameraEvent
 from telemetry.sample import Sample, checked
 

@@ -5,102 +5,28 @@ angles, and an absolute altitude never becomes a height.
 """
 
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from orthoswarm.errors import InputError
-from orthoswarm.frame import Fix, Frame, Ingest, Rejection
+from orthoswarm.frame import Ingest, Rejection
 from telemetry import posetable
-from telemetry.attitude import check_legs, decide
 from telemetry.checks import flight_findings
 from telemetry.container import NotAPicture
-from telemetry.course import courses_deg, local_metres, straight_legs
 from telemetry.discover import Discovery, Folder, discover, natural_key
 from telemetry.findings import Finding, plural
+from telemetry.ingest_logs import LogSource, add_logs, read_logs
+from telemetry.ingest_video import read_videos
 from telemetry.order import in_order
+from telemetry.photoframes import frames_of
 from telemetry.photos import Angles, PhotoTags, read_photos
-from telemetry.sample import Sample
+from telemetry.survey import LoadOptions, Progress, SourceInfo, Survey
 
-if TYPE_CHECKING:
-    from telemetry.ingest_logs import LogSource
+__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, how many there are."""
-
-_LEAST_HEIGHT_M = 1.0
 _BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
 """Spectral bands by how well they show the ground; "" is a colour picture."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoadOptions:
-    """How inputs are read.
-
-    Attributes:
-        every_m: distance between pictures taken from a video, metres; None for the default of `telemetry.picks`.
-        every_s: seconds between pictures taken from a video.
-        cache: folder for pictures taken from videos; None makes one under the system's temporary folder.
-        exclude: files and folders that are left out (the output folder, for instance).
-        workers: threads that read.
-        decode: False to look at the metadata of videos only, without taking pictures (for `inspect`).
-    """
-
-    every_m: float | None = None
-    every_s: float | None = None
-    cache: Path | None = None
-    exclude: tuple[Path, ...] = ()
-    workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
-    decode: bool = True
-
-
-@dataclass(slots=True)
-class SourceInfo:
-    """One source for `inspect`: a folder of photos, a video, a log or a table.
-
-    Attributes:
-        path: relative to the inputs' root. kind: "photos", "video", "geo.txt" and so on.
-        counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious.
-        frames: the frames. tracks: for sources without frames, the poses of each vehicle in order.
-        shown: number of pictures of each vehicle where that is not the number of its frames.
-    """
-
-    path: str
-    kind: str
-    counts: Counter[str] = field(default_factory=Counter)
-    findings: list[Finding] = field(default_factory=list)
-    frames: list[Frame] = field(default_factory=list)
-    tracks: dict[str, list[Sample]] = field(default_factory=dict)
-    shown: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(slots=True)
-class Survey:
-    """Everything that was found out about a set of inputs."""
-
-    root: Path
-    discovery: Discovery | None = None
-    sources: list[SourceInfo] = field(default_factory=list)
-    rejected: list[Rejection] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
-
-    def frames(self) -> list[Frame]:
-        """All frames by vehicle, then time, then natural name order."""
-        return sorted((frame for source in self.sources for frame in source.frames), key=_frame_key)
-
-
-def _frame_key(frame: Frame) -> tuple[object, ...]:
-    return (
-        natural_key(frame.vehicle),
-        frame.vehicle,
-        math.inf if frame.time_s is None else frame.time_s,
-        natural_key(frame.image),
-    )
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -122,9 +48,6 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
     """The same as `load`, source by source, for `inspect`."""
-    from telemetry.ingest_logs import read_logs
-    from telemetry.ingest_video import read_videos
-
     options = options or LoadOptions()
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(found.root, found)
@@ -190,14 +113,12 @@ def _photo_folder(
     folder: Folder,
     found: Discovery,
     tables: Sequence[tuple[Path, str, posetable.PoseTable]],
-    logs: "Sequence[LogSource]",
+    logs: Sequence[LogSource],
     options: LoadOptions,
     advance: Callable[[int], None],
     result: Survey,
 ) -> None:
     """Read one folder's photos into one source."""
-    from telemetry.ingest_logs import add_logs
-
     name = found.name(folder.path)
     source = SourceInfo(folder.path.name if name == "." else name, "photos")
     groups: dict[str, list[PhotoTags]] = {}
@@ -290,104 +211,6 @@ def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= given[0] is not None
     return vehicle
-
-
-def frames_of(
-    photos: Sequence[PhotoTags], vehicle: str, name: Callable[[Path], str], findings: list[Finding]
-) -> list[Frame]:
-    """Frames of one vehicle's photos (in order of time), after its tags were weighed against each other.
-
-    Args:
-        photos: with positions.
-        vehicle: id.
-        name: from a file to its name in the products.
-        findings: what was found is appended here.
-    """
-    ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
-    course = courses_deg(ground)
-    heights = _heights(photos, findings, vehicle)
-    chosen: dict[int, tuple[Angles, str]] = {}
-    for model in sorted({p.model for p in photos}):
-        index = [i for i, p in enumerate(photos) if p.model == model]
-        decided = decide([photos[i] for i in index], course[index], vehicle)
-        findings += decided.findings
-        chosen.update((i, (angles, decided.yaw_origin)) for i, angles in zip(index, decided.angles, strict=True))
-    yaw = np.array([math.nan if (y := chosen[i][0][0]) is None else y for i in range(len(photos))])
-    findings += check_legs(yaw, straight_legs(ground, least_frames=4), vehicle)
-    return [_frame(photo, vehicle, name(photo.path), heights[i], *chosen[i]) for i, photo in enumerate(photos)]
-
-
-def _frame(
-    photo: PhotoTags, vehicle: str, image: str, height_m: float | None, angles: Angles, yaw_origin: str
-) -> Frame:
-    def rad(value: float | None) -> float | None:
-        return None if value is None else math.radians(value)
-
-    origin = dict(photo.origin)
-    if angles[0] is not None and yaw_origin:
-        origin["yaw"] = f"{yaw_origin} ({origin.get('angles') or origin.get('flight_yaw', '')})"
-    fix = Fix(
-        lat_deg=photo.lat_deg or 0.0,
-        lon_deg=photo.lon_deg or 0.0,
-        height_m=height_m,
-        altitude_m=photo.altitude_m,
-        yaw_rad=rad(angles[0]),
-        pitch_rad=rad(angles[1]),
-        roll_rad=rad(angles[2]),
-        flight_yaw_rad=rad(photo.flight_deg[0]),
-        position_sigma_m=photo.position_sigma_m,
-        height_is_ground=photo.height_is_ground,
-    )
-    return Frame(
-        image=image,
-        path=photo.path,
-        vehicle=vehicle,
-        time_s=photo.time_s,
-        fix=fix,
-        width=photo.width,
-        height=photo.height,
-        camera=photo.camera,
-        fov_hint_rad=photo.fov_hint_rad,
-        origin=origin,
-    )
-
-
-def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str) -> list[float | None]:
-    """Heights that can be true; a height of nothing or below is not, and an altitude is none at all."""
-    heights = [p.height_m if p.height_m is not None and math.isfinite(p.height_m) else None for p in photos]
-    low = [h for h in heights if h is not None and h < _LEAST_HEIGHT_M]
-    if low:
-        findings.append(
-            Finding(
-                "height-implausible",
-                f"the recorded height is below {_LEAST_HEIGHT_M:g} m in {plural(len(low), 'photo')} "
-                f"(down to {min(low):.1f} m); these heights are ignored",
-                vehicle,
-            )
-        )
-    heights = [h if h is not None and h >= _LEAST_HEIGHT_M else None for h in heights]
-    missing = sum(h is None for h in heights)
-    if missing:
-        findings.append(
-            Finding(
-                "height-missing",
-                f"{plural(missing, 'photo')} of {len(photos)} have no height above ground; "
-                "it is estimated from the distance flown",
-                vehicle,
-            )
-        )
-    altitudes = np.array([p.altitude_m for p in photos if p.altitude_m is not None], dtype=np.float64)
-    wrong = altitudes[(altitudes < 0.0) | (altitudes > 15_000.0)]
-    if len(wrong):
-        findings.append(
-            Finding(
-                "altitude-implausible",
-                f"the GPS altitude is {wrong.min():.0f} to {wrong.max():.0f} m in {plural(len(wrong), 'photo')}, "
-                "which cannot be where it flew; altitudes are not used as heights",
-                vehicle,
-            )
-        )
-    return heights
 
 
 def _check_vehicles(result: Survey) -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,10 +16,8 @@ from telemetry.mavposes import CameraEvent, fixed_camera
 from telemetry.pairing import Pairing, pair
 from telemetry.photos import PhotoTags
 from telemetry.sample import Sample
+from telemetry.survey import SourceInfo, Survey
 from telemetry.timeline import Timeline
-
-if TYPE_CHECKING:
-    from telemetry.ingest import SourceInfo, Survey
 
 _LEAST_SHARE = 0.5
 _SAME_EXPOSURE_S = 1.0
@@ -34,15 +31,13 @@ class LogSource:
 
     folder: Path
     log: FlightLog
-    source: "SourceInfo"
+    source: SourceInfo
     timeline: Timeline
     used: bool = False
 
 
-def read_logs(found: Discovery, result: "Survey") -> list[LogSource]:
+def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
     """All logs of the inputs, as sources; the same exposures in a second log are counted once."""
-    from telemetry.ingest import SourceInfo
-
     logs: list[LogSource] = []
     for folder in found.folders:
         for path in folder.logs:

@@ -5,21 +5,19 @@ import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from orthoswarm.frame import Rejection
 from telemetry import srt
 from telemetry.discover import Discovery, Folder
 from telemetry.extract import extract
 from telemetry.findings import Finding
+from telemetry.ingest_logs import LogSource
+from telemetry.photoframes import frames_of
 from telemetry.poses import Poses
 from telemetry.sample import Sample
+from telemetry.survey import LoadOptions, Progress, SourceInfo, Survey
 from telemetry.video import NotAVideo, VideoScan, scan
 from telemetry.videolog import add_log
-
-if TYPE_CHECKING:
-    from telemetry.ingest import LoadOptions, Progress, SourceInfo, Survey
-    from telemetry.ingest_logs import LogSource
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT or a log beside it"
 
@@ -27,14 +25,12 @@ NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an
 def read_videos(
     folder: Folder,
     found: Discovery,
-    logs: "Sequence[LogSource]",
-    options: "LoadOptions",
-    progress: "Progress | None",
-    result: "Survey",
+    logs: Sequence[LogSource],
+    options: LoadOptions,
+    progress: Progress | None,
+    result: Survey,
 ) -> None:
     """Read the videos of a folder, each with the SRT of its name; SRT files without a video are named only."""
-    from telemetry.ingest import SourceInfo
-
     beside = {path.stem.lower(): path for path in folder.subtitles}
     for path in folder.videos:
         name = found.name(path)
@@ -71,14 +67,12 @@ def _take(
     name: str,
     scanned: VideoScan,
     poses: Poses,
-    options: "LoadOptions",
-    progress: "Progress | None",
-    source: "SourceInfo",
-    result: "Survey",
+    options: LoadOptions,
+    progress: Progress | None,
+    source: SourceInfo,
+    result: Survey,
 ) -> None:
     """Take pictures and make frames of them."""
-    from telemetry.ingest import frames_of
-
     if not poses.has_positions:
         result.rejected.append(Rejection(name, NO_POSITION, path.stem))
         return
@@ -98,7 +92,7 @@ def _take(
         source.shown[vehicle] = len(photos)
 
 
-def _look(path: Path, scanned: VideoScan, poses: Poses, source: "SourceInfo") -> None:
+def _look(path: Path, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
     """Only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
@@ -111,9 +105,7 @@ def _look(path: Path, scanned: VideoScan, poses: Poses, source: "SourceInfo") ->
         source.tracks.setdefault(vehicle, []).append(sample)
 
 
-def _lone_subtitles(path: Path, name: str, result: "Survey") -> None:
-    from telemetry.ingest import SourceInfo
-
+def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source = SourceInfo(name, "srt")
     result.sources.append(source)
     try:

@@ -4,55 +4,22 @@ All give the same: samples over UTC and exposures in order. Readers take only th
 truncation and damage: a bad record is skipped, the next good one found.
 """
 
-import contextlib
 import mmap
 import os
-from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from telemetry.dataflash import read_dataflash
 from telemetry.findings import Finding, plural
+from telemetry.flightlog import LEAST_STEP_S, FlightLog, NotALog, mapped
 from telemetry.mavposes import TYPES, CameraEvent, MavlinkPoses
 from telemetry.sample import Sample
-from telemetry.timeline import Timeline
+from telemetry.ulog import read_ulog
 
-Row = dict[str, Any]
-"""One record of a binary log."""
-
-
-LEAST_STEP_S = 0.04
-"""Attitude and position are kept at 25 Hz at most: more adds nothing, and a long log would fill the memory."""
-
-
-class NotALog(Exception):
-    """A file with a log's suffix is none; the text is one sentence for the user."""
-
-
-@dataclass(slots=True)
-class FlightLog:
-    """One vehicle's log.
-
-    Attributes:
-        path: the file. kind: "tlog", "DataFlash" or "ULog". vehicle: "sysid3" or the file's name.
-        samples: poses over UTC, in order. events: exposures, in order.
-        has_gimbal: whether the camera's own attitude was logged.
-        findings: what is odd.
-    """
-
-    path: Path
-    kind: str
-    vehicle: str
-    samples: list[Sample] = field(default_factory=list)
-    events: list[CameraEvent] = field(default_factory=list)
-    has_gimbal: bool = False
-    findings: list[Finding] = field(default_factory=list)
-
-    def timeline(self) -> Timeline:
-        """Its poses, for reading at any moment."""
-        return Timeline(self.samples)
+__all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
 
 
 def read_log(path: Path) -> list[FlightLog]:
@@ -61,9 +28,6 @@ def read_log(path: Path) -> list[FlightLog]:
     Raises:
         NotALog: it is none, or holds nothing that can be used.
     """
-    from telemetry.dataflash import read_dataflash
-    from telemetry.ulog import read_ulog
-
     readers: dict[str, Callable[[Path], list[FlightLog]]] = {
         ".tlog": read_tlog,
         ".bin": lambda p: [read_dataflash(p)],
@@ -127,24 +91,6 @@ def _note_missing_numbers(log: FlightLog) -> None:
     if 0 < missing < 10 * len(numbers):
         text = f"{plural(missing, 'camera event')} of {log.path.name} are missing by their numbers"
         log.findings.append(Finding("event-gaps", text))
-
-
-@contextlib.contextmanager
-def mapped(path: Path) -> Iterator[mmap.mmap]:
-    """A log's bytes without reading them all into memory.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        yield data
-
-
-def each(rows: Iterable[Row], take: Callable[[Row], None]) -> None:
-    """Take every record; one whose fields are missing or of the wrong type (a damaged format) is skipped."""
-    for row in rows:
-        with contextlib.suppress(KeyError, TypeError, ValueError, ArithmeticError):
-            take(row)
 
 
 _HEADER = 8

@@ -14,9 +14,9 @@ from telemetry.course import local_metres, straight_legs
 from telemetry.discover import natural_key
 from telemetry.findings import Finding, plural
 from telemetry.headings import heading_findings
-from telemetry.ingest import SourceInfo, Survey
 from telemetry.sample import Sample
 from telemetry.sidefiles import control_point_findings, raster_finding, read_control_points
+from telemetry.survey import SourceInfo, Survey
 
 COUNTS = ("frames", "sei", "klv", "camera_events")
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.logs import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
+from telemetry.flightlog import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
 from telemetry.mavposes import CameraEvent, euler_deg
 from telemetry.rotations import camera_angles_deg, euler_ned, quaternion_ned
 from telemetry.sample import Sample, checked

@@ -1,18 +1,15 @@
 """A flight log beside a video that carries no poses of its own: where in the log the video lies."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telemetry.findings import Finding, plural
+from telemetry.ingest_logs import LogSource
 from telemetry.offset import offset_by_positions, offset_by_turning, offset_by_zone, turning_of_pictures
 from telemetry.poses import Poses
 from telemetry.video import VideoScan
-
-if TYPE_CHECKING:
-    from telemetry.ingest_logs import LogSource
 
 Array = NDArray[np.float64]
 
