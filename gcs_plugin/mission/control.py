@@ -5,13 +5,14 @@ mission and refuses to arm there), arm, MAV_CMD_MISSION_START. Before that the m
 an autopilot that refuses MISSION_START has been armed already by then.
 """
 
+import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import Address, Exchange
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
 from gcs_plugin.mission.modes import Modes, mode_params
 
@@ -184,29 +185,31 @@ def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: boo
 
 
 @dataclass(slots=True)
-class InOrder(Exchange):
-    """Steps one after the other; the first that fails ends it.
+class _Several(Exchange):
+    """Dialogues one after the other; what the end of one means is the business of whoever inherits.
 
     Attributes:
-        steps: the steps.
-        done: what to say at the end.
+        steps: the dialogues.
     """
 
     steps: list[Exchange] = field(kw_only=True)
-    done: str = field(kw_only=True)
     _at: int = field(default=0, init=False)
 
     def start(self, now: float) -> list[Message]:
-        """Begin with the first step."""
+        """Begin with the first."""
         return self._follow(self.steps[0].start(now), now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Hand a message to the present step."""
+        """Hand a message to the present one."""
         return self._follow(self.steps[self._at].feed(message, now), now) if self.outcome is None else []
 
     def tick(self, now: float) -> list[Message]:
-        """Let time pass for the present step."""
+        """Let time pass for the present one."""
         return self._follow(self.steps[self._at].tick(now), now) if self.outcome is None else []
+
+    def rebooted(self, now: float) -> list[Message]:
+        """Tell the present one."""
+        return self._follow(self.steps[self._at].rebooted(now), now) if self.outcome is None else []
 
     @property
     def progress(self) -> float:
@@ -215,46 +218,45 @@ class InOrder(Exchange):
 
     def _follow(self, messages: list[Message], now: float) -> list[Message]:
         while (outcome := self.steps[self._at].outcome) is not None:
-            if not outcome.ok:
-                self._end(False, outcome.text)
-                return messages
-            if self._at + 1 == len(self.steps):
-                self._end(True, f"vehicle {self.vehicle.system} {self.done}")
+            last = self._at + 1 == len(self.steps)
+            if self._ended(outcome, last):
                 return messages
             self._at += 1
             messages = messages + self.steps[self._at].start(now)
         self.deadline = self.steps[self._at].deadline
         return messages
 
+    @abc.abstractmethod
+    def _ended(self, outcome: Outcome, last: bool) -> bool:
+        """One has ended: end the whole and say True, or say False to go on with the next."""
+
 
 @dataclass(slots=True)
-class Either(Exchange):
+class InOrder(_Several):
+    """Steps one after the other; the first that fails ends it.
+
+    Attributes:
+        done: what to say at the end.
+    """
+
+    done: str = field(kw_only=True)
+
+    def _ended(self, outcome: Outcome, last: bool) -> bool:
+        if not outcome.ok:
+            self._end(False, outcome.text)
+        elif last:
+            self._end(True, f"vehicle {self.vehicle.system} {self.done}")
+        return self.outcome is not None
+
+
+@dataclass(slots=True)
+class Either(_Several):
     """A way of doing something, and another one where the vehicle refuses the first."""
 
-    ways: list[Exchange] = field(kw_only=True)
-    _at: int = field(default=0, init=False)
-
-    def start(self, now: float) -> list[Message]:
-        """Try the first way."""
-        return self._follow(self.ways[0].start(now), now)
-
-    def feed(self, message: Message, now: float) -> list[Message]:
-        """Hand a message to the present way."""
-        return self._follow(self.ways[self._at].feed(message, now), now) if self.outcome is None else []
-
-    def tick(self, now: float) -> list[Message]:
-        """Let time pass for the present way."""
-        return self._follow(self.ways[self._at].tick(now), now) if self.outcome is None else []
-
-    def _follow(self, messages: list[Message], now: float) -> list[Message]:
-        while (outcome := self.ways[self._at].outcome) is not None:
-            if outcome.ok or self._at + 1 == len(self.ways):
-                self._end(outcome.ok, outcome.text)
-                return messages
-            self._at += 1
-            messages = messages + self.ways[self._at].start(now)
-        self.deadline = self.ways[self._at].deadline
-        return messages
+    def _ended(self, outcome: Outcome, last: bool) -> bool:
+        if outcome.ok or last:
+            self._end(outcome.ok, outcome.text)
+        return self.outcome is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +304,7 @@ class Pilot:
         ways: list[Exchange] = [self.set_mode(self.modes.hold)]
         if self.autopilot is Autopilot.ARDUPILOT:
             ways.insert(0, self._pause_continue(0.0, "pause"))
-        return Either(self.vehicle, self.own, ways=ways)
+        return Either(self.vehicle, self.own, steps=ways)
 
     def resume(self, *, in_mission_mode: bool) -> Exchange:
         """Go on with the mission from where it was."""
@@ -315,7 +317,7 @@ class Pilot:
         home = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, verb="return to launch", insist_s=2.0
         )
-        return Either(self.vehicle, self.own, ways=[home, self.set_mode(self.modes.rtl)])
+        return Either(self.vehicle, self.own, steps=[home, self.set_mode(self.modes.rtl)])
 
     def _pause_continue(self, go_on: float, verb: str) -> Command:
         return Command(

@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.mavlink import Message, dialect
-from gcs_plugin.mission.exchange import Exchange, RoundTrip
+from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip
 from gcs_plugin.mission.items import MissionItem
 from gcs_plugin.mission.refusal import ACCEPTED, DENIED
 
-_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 _BUSY_S: Final = 1.0
 
 
@@ -38,11 +37,7 @@ class MissionDownload(Exchange):
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Take MISSION_COUNT, items and refusals."""
-        kind = message.get_type()
-        if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
-            return []
-        if not self._for_us(message) or getattr(message, "mission_type", _MISSION) != _MISSION:
-            return []
+        kind = self._mission_kind(message)
         if kind == "MISSION_COUNT":
             return self._counted(int(message.count), now)
         if kind in ("MISSION_ITEM_INT", "MISSION_ITEM"):
@@ -85,9 +80,9 @@ class MissionDownload(Exchange):
         self.deadline = now + self._trip.wait_s
         to = self.vehicle
         if self._count is None:
-            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, _MISSION)]
+            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, MISSION)]
         seq = next(seq for seq in range(self._count) if seq not in self._got)
-        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, _MISSION)]
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, MISSION)]
 
     def _heard(self, now: float) -> None:
         self._heard_at = now
@@ -113,4 +108,4 @@ class MissionDownload(Exchange):
         self.items = [self._got[seq] for seq in range(self._count or 0)]
         self._end(True, f"{len(self.items)} items were read from vehicle {self.vehicle.system}")
         to = self.vehicle
-        return [dialect.MAVLink_mission_ack_message(to.system, to.component, ACCEPTED, _MISSION)]
+        return [dialect.MAVLink_mission_ack_message(to.system, to.component, ACCEPTED, MISSION)]

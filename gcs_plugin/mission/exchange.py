@@ -9,9 +9,10 @@ import abc
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message
+from gcs_plugin.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, dialect
 
 NEVER: Final = float("inf")
+MISSION: Final = int(dialect.MAV_MISSION_TYPE_MISSION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,15 @@ class Exchange(abc.ABC):
             self.own.component,
             BROADCAST,
         )
+
+    def _mission_kind(self, message: Message) -> str:
+        """The type of a message of the mission protocol that is meant for us while this is under way, else empty."""
+        kind = str(message.get_type())
+        if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
+            return ""
+        if getattr(message, "mission_type", MISSION) != MISSION:
+            return ""
+        return kind if self._for_us(message) else ""
 
     def _end(self, ok: bool, text: str) -> None:
         self.outcome, self.deadline = Outcome(ok, text), NEVER

@@ -19,7 +19,7 @@ from typing import Final
 from gcs_plugin.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.compare import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import Exchange, Outcome, RoundTrip
+from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.refusal import (
     ACCEPTED,
@@ -31,8 +31,6 @@ from gcs_plugin.mission.refusal import (
     Refusal,
     explain,
 )
-
-_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 
 # Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): silence of a few of these means more than loss.
 _COUNT_AGAIN_S: Final = 1.0
@@ -97,11 +95,7 @@ class MissionUpload(Exchange):
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Take requests, acknowledgements and, while reading back, items."""
-        kind = message.get_type()
-        if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
-            return []
-        if not self._for_us(message) or getattr(message, "mission_type", _MISSION) != _MISSION:
-            return []
+        kind = self._mission_kind(message)
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
             return self._requested(int(message.seq), now)
         if kind == "MISSION_ACK":
@@ -151,7 +145,7 @@ class MissionUpload(Exchange):
 
     def _count_message(self) -> Message:
         to = self.vehicle
-        return dialect.MAVLink_mission_count_message(to.system, to.component, len(self.mission), _MISSION)
+        return dialect.MAVLink_mission_count_message(to.system, to.component, len(self.mission), MISSION)
 
     def _announce(self, now: float) -> list[Message]:
         self._begun += 1
