@@ -19,6 +19,9 @@ from pathlib import Path
 
 import pytest
 
+from gcs_plugin.daemon.plans import Plans
+from gcs_plugin.web.guard import take_token
+from orthoswarm.errors import InputError
 from tests.daemon_kit import line, serving, start, stop
 from tests.test_daemon_crash import check, post_until_gone
 from tests.test_daemon_flight import square
@@ -271,3 +274,26 @@ def test_a_disk_that_lost_power_holds_what_was_acknowledged(disk, tmp_path):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_disk_that_lost_power_during_a_refinement_holds_it_once(disk, tmp_path, seed):
     print(cut_on_a_disk(disk, tmp_path, seed=seed, refine=True))
+
+
+# -- parts --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("left", [b"", b"\0" * 33, b"\n"])
+def test_a_token_that_a_power_cut_has_emptied_is_made_anew(left, tmp_path):
+    path = tmp_path / "token"
+    path.write_bytes(left)
+    token, new = take_token(path)
+    assert new and len(token) > 20
+    assert take_token(path) == (token, False)
+    assert path.stat().st_mode & 0o077 == 0
+    path.write_text("short")  # somebody's own, and too easy to guess
+    with pytest.raises(InputError):
+        take_token(path)
+
+
+def test_a_plan_that_was_not_written_to_its_end_is_not_offered(tmp_path):
+    for name, text in (("plan-1", '{"covered_share": 1.0}'), ("plan-2", '{"covered'), ("plan-3", "")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "plan.json").write_text(text)
+    assert [plan["id"] for plan in Plans(tmp_path).all()] == ["plan-1"]
