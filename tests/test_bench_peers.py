@@ -236,6 +236,7 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
     assert rows["absent"]["error"].startswith("it could not be installed: ")
     assert rows["truth"]["right_share"] == 1.0
     assert (out / "tiny-good-every2.jpg").stat().st_size > 1000 and not (out / "run" / "good").exists()
+    assert (out / "peers-every2.jpg").stat().st_size > 5000
     kept = out / "tiny-good-every2.json"
     kept.write_text(json.dumps(json.loads(kept.read_text()) | {"median_m": 7.0}))
     assert main(command[:-1]) == 0

@@ -349,6 +349,19 @@ def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]
     return row | {"right_share": right, "succeeded": right >= SUCCESS}
 
 
+def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
+    """Draw the maps of all programs side by side, one row for each set."""
+    from gcs_plugin.bench.sheet import contact_sheet, verdict
+
+    by_set: dict[str, list[tuple[str, Path | None]]] = {}
+    for row in result["rows"]:
+        title = PROGRAMS[row["program"]].title if row["program"] in PROGRAMS else "true poses"
+        picture = settings.path(Path(row["set"]), row["program"], ".jpg")
+        cell = (verdict(title, row), None if "error" in row else picture)
+        by_set.setdefault(label(row), []).append(cell)
+    contact_sheet(list(by_set.items()), out)
+
+
 def peers_table(result: dict[str, Any]) -> str:
     """The result as a Markdown table."""
     lines = [

@@ -34,7 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     scaling.add_argument("--images", default="42,85,170,339", help="pictures a vehicle (default %(default)s)")
     scaling.add_argument("--refine", default="swarm", help="which refiner (default %(default)s)")
-    scaling.add_argument("--figures", type=Path, metavar="DIR", help="folder for the plots (default: that of --out)")
     peers = kinds.add_parser(
         "peers",
         help="other programs on the same photos (Table I)",
@@ -53,6 +52,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     peers.add_argument(
         "--environments", type=Path, metavar="DIR", help="where they are (default environments in --out)"
     )
+    for sub in (scaling, peers):
+        sub.add_argument("--figures", type=Path, metavar="DIR", help="folder for pictures (default: that of --out)")
     for sub in (accuracy, scaling, peers):
         sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for results")
         sub.add_argument("--keep", action="store_true", help="keep the maps")
@@ -71,7 +72,11 @@ def run(args: argparse.Namespace) -> int:
     for folder in args.sets:
         check_set(folder)
     args.out.mkdir(parents=True, exist_ok=True)
-    result, table = {"accuracy": _accuracy, "scaling": _scaling, "peers": _peers}[args.kind](args)
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a program that is measured ends, too
+    try:
+        result, table = {"accuracy": _accuracy, "scaling": _scaling, "peers": _peers}[args.kind](args)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     thin = f"-every{args.every}" if args.kind == "peers" and args.every > 1 else ""
     keep(args.out / f"{args.kind}{thin}.json", result)
     (args.out / f"{args.kind}{thin}.md").write_text(table, encoding="utf-8")
@@ -101,10 +106,9 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from gcs_plugin.bench.peers import Settings, peers_table, run_peers
+    from gcs_plugin.bench.peers import Settings, peers_sheet, peers_table, run_peers
     from orthoswarm.errors import InputError
 
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a program under test is stopped, too
     if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
         raise InputError("--every, --limit-s and --workers take numbers above 0")
     settings = Settings(
@@ -117,6 +121,8 @@ def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         args.keep,
     )
     result = run_peers(args.sets, settings)
+    thin = f"-every{args.every}" if args.every > 1 else ""
+    peers_sheet(result, settings, (args.figures or args.out) / f"peers{thin}.jpg")
     return result, peers_table(result)
 
 
