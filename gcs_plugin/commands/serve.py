@@ -82,12 +82,15 @@ def settings_of(args: argparse.Namespace) -> "Settings":
 def serve(settings: "Settings") -> int:
     """Run daemon and web server until SIGINT or SIGTERM."""
     import logging
+    import os
     import socket
     import sys
+    import threading
 
     import uvicorn
 
     from gcs_plugin.daemon.core import Daemon
+    from gcs_plugin.daemon.sources import STREAM_THREAD
     from gcs_plugin.web.app import make_app
     from gcs_plugin.web.guard import take_token
     from orthoswarm.errors import InputError
@@ -116,5 +119,16 @@ def serve(settings: "Settings") -> int:
             print(f"token: {token}", flush=True)
         else:
             print(f"token: in {settings.token_file or settings.workspace / 'token'}", flush=True)
-        uvicorn.Server(config).run(sockets=[listener])
+
+        class Server(uvicorn.Server):
+            def handle_exit(self, sig: int, frame: object) -> None:
+                """End at a signal, and do not raise it again: the daemon has to be closed, too."""
+                self.force_exit, self.should_exit = self.should_exit, True
+
+        Server(config).run(sockets=[listener])
+    if any(thread.name.startswith(STREAM_THREAD) for thread in threading.enumerate()):
+        logging.shutdown()  # a dead stream keeps its reader inside a library; everything else is closed
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
     return 0

@@ -36,6 +36,7 @@ from orthoswarm.errors import InputError
 from telemetry.sample import Sample
 
 _FEW: Final = 10
+_SOURCES_S: Final = 1.0
 _REPLACED: Final = "dropped: the vehicle's refinement takes its place"
 _log = logging.getLogger(__name__)
 
@@ -130,8 +131,7 @@ class Daemon:
     def close(self) -> None:
         """Stop; what is under way goes on at the next start."""
         self.jobs.give_up()
-        for source in self.sources:
-            source.close()
+        self._close_sources()
         if self.legwatch is not None:
             self.legwatch.close()
         if self.flock is not None:
@@ -145,6 +145,15 @@ class Daemon:
         self.journal.remember("clean", True)
         self.journal.close()
         self._lock.close()
+
+    def _close_sources(self) -> None:
+        """Stop all at once; one that waits for a silent or dead stream is left to its time-out, and takes nothing."""
+        for source in self.sources:
+            source.stop()
+        end = time.monotonic() + _SOURCES_S
+        stuck = [source.vehicle for source in self.sources if not source.close(max(0.0, end - time.monotonic()))]
+        if stuck:
+            _log.info("the streams of %s are silent; they are left alone", ", ".join(stuck))
 
     def __enter__(self) -> "Daemon":
         self.start()

@@ -15,6 +15,7 @@ from telemetry.sample import Sample
 
 _SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
 _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://", "http://", "https://")
+STREAM_THREAD: Final = "pictures of "
 _log = logging.getLogger(__name__)
 
 PoseAt = Callable[[str, float], Sample | None]
@@ -63,7 +64,7 @@ class Source:
             )
             self._reader = FolderReader(Path(where), desk)
         run = self._stream if self._reader is None else self._reader.run
-        self._thread = threading.Thread(target=self._guarded, args=(run,), name=f"pictures of {vehicle}", daemon=True)
+        self._thread = threading.Thread(target=self._guarded, args=(run,), name=STREAM_THREAD + vehicle, daemon=True)
 
     @property
     def state(self) -> str:
@@ -79,10 +80,16 @@ class Source:
         """Begin to read."""
         self._thread.start()
 
-    def close(self) -> None:
-        """Stop reading."""
+    def stop(self) -> None:
+        """Read no more; what waits inside a stream's library notices later."""
         self._stop.set()
-        self._thread.join(5.0)
+
+    def close(self, wait_s: float = 5.0) -> bool:
+        """Stop reading; returns whether it has ended within that time."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(wait_s)
+        return not self._thread.is_alive()
 
     def document(self) -> dict[str, Any]:
         """Its state as JSON values; addresses are not told, they may hold passwords."""
