@@ -157,6 +157,8 @@ def fly_until(served, shots, acknowledged, lock, chance, refine):
         answer = served.command("/api/refine", {"vehicle": "v1"})
         assert answer.status_code == 202, answer.text
         asked = 1
+    else:
+        post_until_gone(served, shots[:6], acknowledged, lock)
     poster = threading.Thread(target=post_until_gone, args=(served, shots, acknowledged, lock))
     poster.start()
     time.sleep(chance.uniform(0.0, 6.0 if refine else 1.5))

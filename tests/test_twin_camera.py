@@ -300,3 +300,18 @@ def test_streams_can_be_joined_late_and_carry_their_poses(kind):
         assert picture.sample is not None
         k = picture.time_s - 1_780_000_000.0
         assert picture.sample.lon_deg == pytest.approx(2.0 + 1e-4 * k, abs=1e-6)
+
+
+def test_photos_can_be_posted_to_a_daemon(tmp_path):
+    with serving(tmp_path / "w") as served:
+        poster = open_outlet(served.url, 3)
+        for image, sample in pictures(3):
+            poster.send(image, sample)
+        poster.close()
+        rows = served.get("/api/frames").json()
+        assert [row["vehicle"] for row in rows] == ["v3"] * 3
+        assert [row["lon_deg"] for row in rows] == pytest.approx([2.0, 2.0001, 2.0002])
+        assert (rows[0]["width"], rows[0]["height"]) == (640, 480)
+        assert poster.failed == 0
+    poster.send(*next(pictures(1)))  # nobody is there any more: counted, and the flight goes on
+    assert poster.failed == 1
