@@ -24,6 +24,10 @@ from tests.mosaic_scene import EAST, NORTH, picture_of
 GRID = LocalGrid(32648)
 FOV_DEG = 70.0
 SIZE = (160, 120)
+# One for all: each new client reads all certificates of the machine, which costs more than the daemon's answer.
+_CLIENT = httpx.Client(
+    timeout=120, verify=False, trust_env=False, limits=httpx.Limits(max_connections=None, max_keepalive_connections=0)
+)
 
 
 def camera_at(east=0.0, north=0.0, height=60.0, yaw_deg=0.0) -> Camera:
@@ -87,10 +91,10 @@ class Served:
         return {"Authorization": f"Bearer {self.token}"}
 
     def get(self, path: str, **options) -> httpx.Response:
-        return httpx.get(self.url + path, timeout=120, **options)
+        return _CLIENT.get(self.url + path, **options)
 
     def post(self, path: str, **options) -> httpx.Response:
-        return httpx.post(self.url + path, timeout=120, **options)
+        return _CLIENT.post(self.url + path, **options)
 
     def command(self, path: str, body: dict | None = None) -> httpx.Response:
         return self.post(path, json=body or {}, headers=self.auth)

@@ -113,6 +113,7 @@ def init(mpstate):
 """
 
 
+@pytest.mark.timeout(1800)
 def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
     lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))
     cameras = Cameras()

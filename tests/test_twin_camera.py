@@ -140,6 +140,7 @@ def small_area(lat, lon, north_m=60.0, east_m=160.0):
     return {"type": "Polygon", "coordinates": [[[float(o), float(a)] for a, o in grid.to_geographic(corners)]]}
 
 
+@pytest.mark.timeout(1800)
 def test_a_real_flight_is_mapped_and_refined_from_the_twins_pictures(autopilot, tmp_path):
     """Plan, upload, start, camera, daemon, refinement: nothing here knows whether the autopilot is simulated."""
     address, pace = autopilot
@@ -192,7 +193,7 @@ def fly(served, name, pace):
         pace(next(r for r in served.get("/api/vehicles").json() if r["id"] == name)["pictures"]["taken"])
         return rows and "version" in rows[0]
 
-    done = served.until("/api/completions", refined, limit_s=600.0)
+    done = served.until("/api/completions", refined, limit_s=1200.0)
     assert [row["vehicle"] for row in done] == [name]
     assert done[0]["layer"] == "fine" and done[0]["version"] > done[0]["version_before"]
 
