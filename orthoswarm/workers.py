@@ -5,11 +5,14 @@ of workers or on which of them was faster. Every item is pickled, also for work 
 that changes what it was given changes the same copy everywhere: hand over paths and small arrays.
 """
 
+import contextlib
+import ctypes
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -25,6 +28,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_LONG_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +72,7 @@ class Serial:
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
-        return (function(_own(item)) for item in items)
+        return (_tidily(function, _own(item)) for item in items)
 
     def usage(self) -> Usage:
         """See Workers."""
@@ -96,7 +100,7 @@ class Processes:
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         if self.count == 1:
-            yield from (function(_own(item)) for item in items)
+            yield from (_tidily(function, _own(item)) for item in items)
             return
         source = iter(items)
         queue: deque[Future[_Outcome[Result]]] = deque()
@@ -174,8 +178,23 @@ class _Outcome(Generic[Result]):
 
 
 def _measured(function: Callable[[Item], Result], item: Item) -> _Outcome[Result]:
-    value = function(item)
+    value = _tidily(function, item)
     return _Outcome(value, os.getpid(), time.process_time(), peak_rss_mb())
+
+
+def _tidily(function: Callable[[Item], Result], item: Item) -> Result:
+    """Apply a function; what a long one leaves unused goes back to the system, or it piles up over a hundred tasks."""
+    begun = time.process_time()
+    value = function(item)
+    if time.process_time() - begun > _LONG_S:
+        trim_memory()
+    return value
+
+
+def trim_memory() -> None:
+    """Give unused memory of the C library's heap back to the system, where there is a call for it (glibc)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _own(item: Item) -> Item:
@@ -187,7 +206,7 @@ def _own(item: Item) -> Item:
 def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Result]]":
     future: Future[_Outcome[Result]] = Future()
     try:
-        future.set_result(_Outcome(function(_own(item)), os.getpid(), 0.0, 0.0))
+        future.set_result(_Outcome(_tidily(function, _own(item)), os.getpid(), 0.0, 0.0))
     except Exception as error:
         future.set_exception(error)
     return future
@@ -196,9 +215,23 @@ def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Re
 def _prepare() -> None:
     """First thing in a new process: the parent handles Ctrl-C, and threads would only fight over the cores."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     import cv2
 
     cv2.setNumThreads(1)
+
+
+def end_with_parent() -> None:
+    """End this process as soon as the one that started it is gone, killed or not; a pool's workers would wait on."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def follow() -> None:
+        parent.join()  # also wakes up when it was killed
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def workers(count: int | None = None) -> Serial | Processes:
