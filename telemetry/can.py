@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from types import TracebackType
 from typing import Any
 
@@ -97,6 +98,8 @@ def open_bus(url: str) -> Any:
     import can
 
     kind, _, rest = url.partition(":")
+    if kind == "udp_multicast" and find_spec("msgpack") is None:
+        raise InputError(f"the CAN bus '{url}' needs msgpack; install it with: pip install msgpack")
     channel, _, rate = rest.partition("@")
     if not channel or (rate and not rate.isdigit()):
         raise InputError(f"'{url}' names no CAN bus; write for instance socketcan:can0 or slcan:/dev/ttyACM0@1000000")

@@ -73,6 +73,25 @@ def test_fixes_attitude_and_gimbal_come_from_a_bus():
     assert (poses.latest.yaw_deg, poses.latest.pitch_deg) == pytest.approx((30.0, -90.0), abs=0.2)
 
 
+def test_fixes_come_over_udp_multicast():
+    pytest.importorskip("msgpack")
+    group = "udp_multicast:239.74.163.2"
+    poses = LivePoses("uav1", clock=lambda: 1_700_000_005.0)
+    try:  # packets stay on this machine
+        node = sender(can.Bus(interface="udp_multicast", channel="239.74.163.2", hop_limit=0))
+        source = CanSource(BusDriver(open_bus(group)), poses, clock=lambda: 1_700_000_005.0)
+    except (OSError, can.CanError, InputError) as error:
+        pytest.skip(f"no multicast here: {error}")
+    with source:
+        for number in range(20):
+            node.broadcast(fix2(number))
+        deadline = time.monotonic() + 20.0
+        while source.received < 20 and time.monotonic() < deadline:
+            source.spin(0.05)
+    assert source.received == 20
+    node.close()
+
+
 def test_an_rtk_receiver_on_the_bus_outdoes_the_autopilots_position():
     from telemetry.sample import Sample
 
