@@ -1,7 +1,10 @@
 """Work gives the same results, in the same order, whatever the number of workers."""
 
 import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -115,3 +118,25 @@ def test_helpers(monkeypatch):
     assert workers(4).count == 4
     assert workers().count == cores() >= 1
     assert peak_rss_mb() > 10
+
+
+PARENT = """
+import os, sys
+from orthoswarm.workers import Processes
+from tests.test_workers import where
+pool, others = Processes(3), set()
+while not others:
+    others = set(pool.map(where, range(40))) - {os.getpid()}
+print(*others, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_workers_end_with_a_parent_that_was_killed():
+    root = Path(__file__).parents[1]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", PARENT], cwd=root, text=True, **pipes) as parent:
+        assert parent.stdout is not None and parent.stdout.readline().split()
+        parent.kill()
+        # Workers hold the other end of this pipe: it ends with the last of them, and never if they wait on.
+        assert parent.communicate(timeout=60) == ("", None)
