@@ -34,6 +34,7 @@ _SETTLED_S: Final = 3.0
 _BATCH: Final = 32
 _BATCH_BYTES: Final = 64 << 20
 _STALLED_S: Final = 30.0
+_UNCHANGED_S: Final = 2.0
 _REST_S: Final = 5.0
 _AGAIN_S: Final = (20.0, 600.0)
 _NEAR_M: Final = 50.0
@@ -50,12 +51,14 @@ class _File:
 
     Attributes:
         stamp: size and time of change. since: when it was first seen so. done: True once it needs no more work.
+        again_at: when to look into it again, after it was found not whole.
         told: True once the user knows that it does not get on.
     """
 
     stamp: Stamp
     since: float
     done: bool = False
+    again_at: float = 0.0
     told: bool = False
 
 
@@ -119,7 +122,7 @@ class FolderReader:
             wait = max(_POLL_S, min(5.0, (time.monotonic() - began) / _SCAN_SHARE if not self._busy() else 0.0))
 
     def _busy(self) -> bool:
-        return any(not file.done for file in self._files.values())
+        return any(not file.done and not file.told for file in self._files.values())
 
     # -- looking --------------------------------------------------------------------------------------------------
 
@@ -184,7 +187,7 @@ class FolderReader:
 
     def _settled(self, path: Path, now: float, quiet_s: float) -> bool:
         file = self._files[path]
-        return not file.done and now - file.since >= quiet_s
+        return not file.done and now - file.since >= quiet_s and now >= file.again_at
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
@@ -192,6 +195,7 @@ class FolderReader:
     def _wait_for(self, path: Path, now: float) -> None:
         """A file is not whole yet; after a while say so, once."""
         file = self._files[path]
+        file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.told:
             file.told = True
             self._desk.tell(f"{self._name(path)} of {self._desk.vehicle} is not whole; copy it again")
@@ -328,7 +332,7 @@ class FolderReader:
 
     def _pair(self, here: Sequence[Path], now: float) -> None:
         """Give pictures that have no pose the poses of a log beside them or of the vehicle's link, all at once."""
-        waiting = sorted(path for path in self.poseless if path in set(here))
+        waiting = sorted(self.poseless.intersection(here))
         if not waiting or any(now - self._files[path].since < _SETTLED_S for path in here):
             return
         sides = [p for p in here if p.suffix.lower() not in self._pictures | self._videos]
