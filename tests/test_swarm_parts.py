@@ -1,6 +1,7 @@
 """Legs, units, records and the placing of weak pictures."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from orthoswarm.placement import Leg, PlacedFrame, Solution
 from orthoswarm.swarm.legs import split_legs
 from orthoswarm.swarm.records import read_records
 from orthoswarm.swarm.units import LONGEST, merge_units, split_units
+from orthoswarm.swarm.weak import steady_weak
 
 
 def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):
@@ -124,3 +126,39 @@ def test_steps_ignore_a_single_outlier():
     frames[6] = frame(6, lat_deg=48.0 + 1e-4 * 6 + 2e-4)
     steps = read_records(frames, LocalGrid(32632), np.zeros(2)).steps()
     assert np.hypot(*steps[3:10, :2].T) == pytest.approx(11.12, abs=0.1)
+
+
+def weak_at(position, recorded, leg, weak):
+    """What placing weak pictures makes of solved positions, where nothing looked at the weak ones."""
+    n = len(position)
+    strong = np.setdiff1d(np.arange(n), weak)
+    flight = SimpleNamespace(
+        frames=range(n),
+        leg=np.asarray(leg),
+        records=SimpleNamespace(time_s=np.arange(n, dtype=float)),
+        adjustment=SimpleNamespace(
+            rig=SimpleNamespace(position=position.copy(), rotation=np.tile(np.eye(3), (n, 1, 1))),
+            priors=SimpleNamespace(position=recorded, rotation=np.tile(np.eye(3), (n, 1, 1))),
+            obs_weight=np.ones(len(strong) * 20),
+            tracks=SimpleNamespace(camera=np.repeat(strong, 20)),
+        ),
+    )
+    sigma = np.full(n, 0.1)
+    assert np.flatnonzero(steady_weak(flight, sigma)).tolist() == list(weak)
+    return flight.adjustment.rig.position, sigma
+
+
+def test_a_weak_picture_at_a_corner_follows_the_record_and_not_the_line_across_it():
+    way = np.c_[boustrophedon(2, 5), np.full(10, 100.0)]
+    placed, sigma = weak_at(way, way + [3.0, -2.0, 0.0], [0] * 5 + [1] * 5, [5])
+    np.testing.assert_allclose(placed[5], way[5], atol=1e-9)
+    assert sigma[5] < 2.0
+
+
+def test_a_weak_picture_with_an_outlier_of_a_record_stays_on_its_leg_and_says_how_far_that_is_from_it():
+    way = np.c_[np.zeros(9), 10.0 * np.arange(9), np.full(9, 100.0)]
+    recorded = way.copy()
+    recorded[4, 0] += 18.0
+    placed, sigma = weak_at(way, recorded, [0] * 9, [4])
+    np.testing.assert_allclose(placed[4], way[4], atol=1e-9)
+    assert sigma[4] == pytest.approx(9.0)

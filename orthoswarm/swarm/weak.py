@@ -23,7 +23,8 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
     """Interpolate weakly held cameras from strong ones before and after, in place; returns which they are.
 
     Positions follow the record's own shape where it agrees with its neighbours, else a straight line in time; the
-    attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance.
+    attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance, and with what
+    the record and the line disagree by.
     """
     adj = flight.adjustment
     n = len(flight.frames)
@@ -42,9 +43,11 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         follows = recorded[i] + offset
         gap = float(np.hypot(*(follows - straight)[:2]))
         step = float(np.hypot(*(adj.rig.position[b] - adj.rig.position[a])[:2]))
-        adj.rig.position[i] = follows if a == b or gap < max(4.0, 0.3 * step) else straight  # a == b: at an end
+        turning = flight.leg[a] != flight.leg[b]  # a straight line means nothing there
+        believed = a == b or turning or gap < max(4.0, 0.3 * step)  # a == b: at an end
+        adj.rig.position[i] = follows if believed else straight
         near = a if i - a <= b - i else b
         turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
         adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
-        sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST))
+        sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST), 0.0 if believed else 0.5 * gap)
     return weak
