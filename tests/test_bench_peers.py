@@ -1,5 +1,6 @@
 """Other programs are measured whole, stopped at their limit, brought to the ground by rule and judged by the truth."""
 
+import dataclasses
 import json
 import os
 import sys
@@ -167,6 +168,8 @@ def test_a_stitched_picture_is_laid_where_it_belongs(tmp_path):
 def test_a_picture_of_another_place_is_not_laid_anywhere(tmp_path):
     write_map(tmp_path / "reference.tif", texture(1))
     cv2.imwrite(str(tmp_path / "picture.png"), texture(2))
+    with pytest.raises(OrthoSwarmError, match="cannot be read as a picture"):
+        align.lay_on_reference(tmp_path / "none.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
     with pytest.raises(OrthoSwarmError, match="fits nowhere"):
         align.lay_on_reference(tmp_path / "picture.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
 
@@ -181,6 +184,12 @@ def test_what_is_missing_from_a_map_counts_like_what_is_wrong():
     wrong = peers.with_verdict({"blocks": 200, "share_within_1m": 0.5}, ceiling)
     assert whole["succeeded"] and not half["succeeded"] and not wrong["succeeded"]
     assert half["right_share"] == wrong["right_share"] == 0.5
+    moved = peers.with_verdict(
+        {"blocks": 200, "share_within_1m": 0.0, "shape": {"blocks": 200, "share_within_1m": 0.95}}, ceiling
+    )
+    assert moved["shape_share"] == 0.95 and not moved["succeeded"]
+    nowhere = peers.with_verdict({"shape": {"blocks": 200, "share_within_1m": 0.95}}, ceiling)
+    assert nowhere["right_share"] is None and nowhere["succeeded"]
     assert not peers.with_verdict({"error": "no"}, ceiling)["succeeded"]
 
 
@@ -216,6 +225,7 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
         "bad": program("import sys; print('working', file=sys.stderr); sys.exit('no | pairs')"),
         "endless": program("while True: pass"),
         "absent": program(copy, ("something",)),
+        "placeless": dataclasses.replace(program(copy), placed=False, georeferenced="no"),
     }
     monkeypatch.setattr(peers, "PROGRAMS", made)
     out = tmp_path / "out"
@@ -241,7 +251,8 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
     kept.write_text(json.dumps(json.loads(kept.read_text()) | {"median_m": 7.0}))
     assert main(command[:-1]) == 0
     table = capsys.readouterr().out
-    assert "clear, paper, seed 1, 1 of 2 photos | a | b | 7 of 6 | yes | yes | 100.0 % | 7.00 |" in table
+    assert "clear, paper, seed 1, 1 of 2 photos | a | b | 7 of 6 | yes | yes | 100.0 % | - | 7.00 |" in table
+    assert "| 7 of 6 | no | yes (its shape) | - | 100.0 % | 0.0" in table
     assert "no: no / pairs" in table and "true poses (the ceiling)" in table and "cores of" in table
 
 

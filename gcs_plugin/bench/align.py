@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 _LEAST_CAMERAS = 4
 _LEAST_INLIERS = 40
+_MATCHED_PX = 6_000_000
 
 
 class Similarity(NamedTuple):
@@ -103,10 +104,14 @@ def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array
 
 
 def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
-    """Lay a picture without georeference on the reference by one homography and write it as a GeoTIFF (RGBA).
+    """Lay a picture on the reference by one homography, whatever georeference it has, and write it as a GeoTIFF (RGBA).
 
     The homography comes from SIFT matches between both (MAGSAC): no hand takes part. It is fitted to the truth, so that
     only the picture's inner shape is judged afterwards, in the picture's favour.
+
+    Args:
+        picture: RGB or RGBA in a file; what is black or transparent is empty.
+        reference: the true map. out: the file to write.
 
     Returns:
         Number of matches that agree.
@@ -116,29 +121,56 @@ def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
     """
     import cv2
     import rasterio
+    from rasterio.enums import ColorInterp
 
-    rgb = cv2.imread(str(picture), cv2.IMREAD_COLOR)
-    if rgb is None:
-        raise OrthoSwarmError(f"{picture.name} cannot be read as a picture")
+    rgb, _ = _colours(picture, None)
+    small, per_small = _colours(picture, _MATCHED_PX)
+    ground, per_ground = _colours(reference, _MATCHED_PX)
+    h, inliers = find_homography(*(cv2.cvtColor(c, cv2.COLOR_RGB2GRAY) for c in (small, ground)))
+    h = _enlarged(per_ground) @ h @ np.linalg.inv(_enlarged(per_small))
     with rasterio.open(reference) as file:
-        step = 2
-        shape = (file.count, file.height // step, file.width // step)
-        ground = file.read(out_shape=shape, resampling=rasterio.enums.Resampling.average)
         profile = {"crs": file.crs, "transform": file.transform, "width": file.width, "height": file.height}
-    h, inliers = find_homography(
-        cv2.cvtColor(rgb, cv2.COLOR_BGR2GRAY), cv2.cvtColor(np.moveaxis(ground[:3], 0, -1), cv2.COLOR_RGB2GRAY)
-    )
-    h = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1]]) @ h
-    alpha = (rgb.max(2) > 0).astype(np.uint8) * 255
-    bands = np.dstack([rgb[..., ::-1], alpha])
-    warped = cv2.warpPerspective(bands, h, (profile["width"], profile["height"]), flags=cv2.INTER_AREA)
+    bands = np.dstack([rgb, (rgb.max(2) > 0).astype(np.uint8) * 255])
+    warped = cv2.warpPerspective(bands, h, (profile["width"], profile["height"]), flags=cv2.INTER_LINEAR)
     warped[warped[..., 3] < 255] = 0
     with rasterio.open(
         out, "w", driver="GTiff", count=4, dtype="uint8", compress="deflate", tiled=True, **profile
     ) as f:
         f.write(np.moveaxis(warped, -1, 0))
-        f.colorinterp = [rasterio.enums.ColorInterp[n] for n in ("red", "green", "blue", "alpha")]
+        f.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
     return inliers
+
+
+def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
+    """Red, green, blue (rows, columns, 3) of a file, black where it is empty, with at most so many pixels.
+
+    Gives how many of the file's pixels one of these is wide and high, too.
+    """
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            file = rasterio.open(path)
+    except RasterioIOError:
+        raise OrthoSwarmError(f"{path.name} cannot be read as a picture") from None
+    with file:
+        shrink = max(1.0, (file.width * file.height / (most or np.inf)) ** 0.5)
+        shape = (max(1, int(file.height / shrink)), max(1, int(file.width / shrink)))
+        which = [1, 2, 3] if file.count >= 3 else [1, 1, 1]
+        bands = file.read(which, out_shape=(3, *shape), resampling=rasterio.enums.Resampling.average)
+        bands = np.where(file.dataset_mask(out_shape=shape) > 0, bands, 0)
+        per = np.array([file.width / shape[1], file.height / shape[0]])
+    return np.ascontiguousarray(np.moveaxis(bands, 0, -1).astype(np.uint8)), per
+
+
+def _enlarged(per: Array) -> Array:
+    """From pixels of a reduced picture to those of the whole; pixel centres at integers."""
+    x, y = per
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:

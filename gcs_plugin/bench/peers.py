@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,7 @@ class Program:
         product: makes the GeoTIFF that is judged from what the program made; gives its path and how many pictures are
             in it (None where it does not say).
         georeferenced: how it knows where it is, for the table.
+        placed: False for a program whose map has no place, and is judged by its shape alone.
     """
 
     title: str
@@ -71,7 +72,7 @@ class Program:
     command: Callable[[Job, Path], list[str]]
     product: Callable[[Job], tuple[Path, int | None]]
     georeferenced: str
-    variables: dict[str, str] = field(default_factory=dict)
+    placed: bool = True
 
 
 # -- the programs -------------------------------------------------------------------------------------------------
@@ -112,7 +113,7 @@ def _script(name: str) -> Callable[[Job, Path], list[str]]:
 def _stitched(job: Job) -> tuple[Path, int | None]:
     from gcs_plugin.bench.align import lay_on_reference
 
-    out = job.out / "laid.tif"
+    out = job.out / "laid.tif"  # the best that anyone could do with it afterwards
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
     return out, (kept(job.out / "said.json") or {}).get("used")
 
@@ -149,7 +150,8 @@ PROGRAMS = {
         ("opencv-python-headless>=4.10,<5",),
         _script("stitch.py"),
         _stitched,
-        "no (laid on the truth by one homography)",
+        "no",
+        placed=False,
     ),
     "pycolmap": Program(
         "pycolmap, pasted on flat ground",
@@ -265,11 +267,27 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
             raise OrthoSwarmError(last_words(log.read_text(encoding="utf-8", errors="replace")))
         product, row["used"] = program.product(job)
         _picture(product, settings.path(folder, name, ".jpg"))
-        row |= judged(product, folder)
+        if not program.placed:
+            row["shape"] = judged(product, folder)
+        else:
+            row |= judged(product, folder)
+            row["shape"] = _shape(product, job) if program.packages else None
     except OrthoSwarmError as error:
         row["error"] = str(error)
     _remove(settings, job.photos, job.flat, job.out)
     return row
+
+
+def _shape(product: Path, job: Job) -> dict[str, Any] | None:
+    """The figures of a map without its place: laid on the truth by one homography. None where it fits nowhere."""
+    from gcs_plugin.bench.align import lay_on_reference
+
+    laid = job.out / "shape.tif"
+    try:
+        lay_on_reference(product, job.folder / "truth" / "reference.tif", laid)
+        return judged(laid, job.folder)
+    except OrthoSwarmError:
+        return None
 
 
 def _remove(settings: Settings, *folders: Path) -> None:
@@ -338,15 +356,23 @@ def _picture(product: Path, out: Path) -> None:
 
 
 def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]:
-    """A row with `right_share` and `succeeded`.
+    """A row with `right_share`, `shape_share` and `succeeded`.
 
     `right_share` is the ground within a metre of its true place, as a share of the ground that a map from the true
-    poses of the same photos covers: what is missing from a map counts against it like what is wrong.
+    poses of the same photos covers: what is missing from a map counts against it like what is wrong. `shape_share` is
+    the same for the map laid on the truth by one homography, where that was done.
     """
     if "error" in row or not ceiling.get("blocks"):
         return row | {"succeeded": False}
-    right = min(1.0, row["share_within_1m"] * row["blocks"] / ceiling["blocks"])
-    return row | {"right_share": right, "succeeded": right >= SUCCESS}
+
+    def right(figures: dict[str, Any] | None) -> float | None:
+        if not figures or "blocks" not in figures:
+            return None
+        return float(min(1.0, figures["share_within_1m"] * figures["blocks"] / ceiling["blocks"]))
+
+    placed, shape = right(row), right(row.get("shape"))
+    verdict = {"right_share": placed, "shape_share": shape}
+    return row | verdict | {"succeeded": (placed if placed is not None else shape or 0.0) >= SUCCESS}
 
 
 def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
@@ -368,9 +394,9 @@ def peers_table(result: dict[str, Any]) -> str:
         f"Machine: {result['machine']}; {result['threads']} thread(s) and {result['limit_s']:.0f} CPU seconds for each "
         f"program. Succeeded: at least {SUCCESS:.0%} of the ground that the photos show lies within 1 m of its place.",
         "",
-        "| set | program | photos in the map | georeferenced | succeeded | within 1 m, of all ground | median m "
-        "| 95 % m | not found | CPU s | wall s | memory MB |",
-        "|---" * 12 + "|",
+        "| set | program | photos in the map | georeferenced | succeeded | within 1 m, of all ground "
+        "| the same, its shape alone | median m | 95 % m | not found | CPU s | wall s | memory MB |",
+        "|---" * 13 + "|",
     ]
     lines += [_line(row) for row in result["rows"]]
     return "\n".join(lines) + "\n"
@@ -383,17 +409,19 @@ def _line(row: dict[str, Any]) -> str:
         name += f" {row['version']}"
     thin = f", 1 of {row['every']} photos" if row["every"] > 1 else ""
     used = row.get("used")
+    figures = row if "median_m" in row else row.get("shape") or {}
     costs = [text(row.get(k), 0) for k in ("cpu_s", "wall_s", "peak_rss_mb")]
     if "error" in row:
-        middle = [f"- of {row['photos']}", "-", f"no: {row['error'].replace('|', '/')}", "-", "-", "-", "-"]
+        middle = [f"- of {row['photos']}", "-", f"no: {row['error'].replace('|', '/')}", *"-----"]
     else:
         middle = [
             f"{'-' if used is None else used} of {row['photos']}",
             program.georeferenced if program else "yes",
-            "yes" if row["succeeded"] else "no",
+            ("yes" if row["succeeded"] else "no") + ("" if row["right_share"] is not None else " (its shape)"),
             share(row["right_share"]),
-            text(row["median_m"], 2),
-            text(row["p95_m"], 2),
-            share(row["unmatched_share"]),
+            share(row["shape_share"]),
+            text(figures["median_m"], 2),
+            text(figures["p95_m"], 2),
+            share(figures["unmatched_share"]),
         ]
     return f"| {label(row)}{thin} | {name} | " + " | ".join(middle + costs) + " |"

@@ -46,4 +46,6 @@ def verdict(title: str, row: dict[str, Any]) -> str:
     """What stands above a map: the program and its share of right ground."""
     if "error" in row:
         return f"{title}\nfailed"
+    if row["right_share"] is None:
+        return f"{title}\nno place; shape {100 * (row['shape_share'] or 0.0):.0f} % within 1 m"
     return f"{title}\n{100 * row['right_share']:.0f} % within 1 m"
