@@ -150,7 +150,7 @@ def weak_at(position, recorded, leg, weak):
 
 def test_a_weak_picture_at_a_corner_follows_the_record_and_not_the_line_across_it():
     way = np.c_[boustrophedon(2, 5), np.full(10, 100.0)]
-    placed, sigma = weak_at(way, way + [3.0, -2.0, 0.0], [0] * 5 + [1] * 5, [5])
+    placed, sigma = weak_at(way, way + np.array([3.0, -2.0, 0.0]), [0] * 5 + [1] * 5, [5])
     np.testing.assert_allclose(placed[5], way[5], atol=1e-9)
     assert sigma[5] < 2.0
 
