@@ -5,7 +5,7 @@ Metres per pixel come from the distance flown; where nothing was flown the recor
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,38 @@ FEWEST = 3
 _NEIGHBOURS = 5
 _EXTRA_SIGMA_M = 2.0
 _SPOT_SHARE = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Sorted:
+    """Recorded frames by what a refiner can make of them, each in the order of the frames.
+
+    Attributes:
+        fit: those that it can refine. odd: too few of their camera and size, to be carried by the others.
+        still: those of vehicles that took all pictures at one spot, to stay as recorded.
+        warnings: what was sorted out, in plain words.
+    """
+
+    fit: list[PlacedFrame]
+    odd: list[PlacedFrame]
+    still: list[PlacedFrame]
+    warnings: list[str]
+
+
+def sort_out(recorded: Sequence[PlacedFrame]) -> Sorted:
+    """Find the frames that a refiner would fail on, or worse, be sure of (see `hovering` and `odd_ones`)."""
+    spots = hovering(recorded)
+    warnings = [
+        f"{vehicle}: all pictures were taken at one spot; they are placed as recorded" for vehicle in sorted(spots)
+    ]
+    moving = [p for p in recorded if p.frame.vehicle not in spots]
+    few = odd_ones([p.frame for p in moving])
+    odd = [p for p, alone in zip(moving, few, strict=True) if alone]
+    if odd:
+        names = f"{len(odd)} pictures" if len(odd) > 1 else "1 picture"
+        warnings.append(f"{names} of another camera or size, too few to be refined, follow their neighbours")
+    fit = [p for p, alone in zip(moving, few, strict=True) if not alone]
+    return Sorted(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
 
 
 def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
@@ -51,10 +83,14 @@ def carry(
         odd: as recorded.
         recorded: the refined frames as recorded, with the same assumed field of view.
         refined: frames after refinement.
+
+    Returns:
+        One for each odd frame; where nothing was refined it stays as recorded.
     """
     before = {p.frame.image: p for p in recorded}
-    pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before and not p.weak]
-    return [_carried(one, _near(one, pairs)) for one in odd] if pairs else []
+    pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
+    pairs = [pair for pair in pairs if not pair[1].weak] or pairs
+    return [_carried(one, _near(one, pairs)) for one in odd] if pairs else list(odd)
 
 
 def _near(one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> list[tuple[PlacedFrame, PlacedFrame]]:

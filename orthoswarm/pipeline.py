@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap
-from orthoswarm.carried import carry, hovering, odd_ones
+from orthoswarm.carried import carry, sort_out
 from orthoswarm.dem import read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import write_cog
@@ -97,7 +97,7 @@ class _State:
     rejected: dict[str, Rejection] = field(default_factory=dict)
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
     gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    still: set[str] = field(default_factory=set)
+    still: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     equation_5: dict[str, float] | None = None
@@ -171,8 +171,10 @@ class _Batch:
             near = placed_bounds(recorded.placed, 0.0, 0.0)
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
             warnings += partial_cover(basemap, recorded.placed)
+        if self.options.dem is not None:  # told now, not after the refinement
+            read_dem(self.options.dem, grid.epsg, placed_bounds(recorded.placed, 0.0, 0.0))
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected, still=hovering(recorded.placed))
+        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected)
 
     def realtime(self, state: _State) -> list[PlacedFrame]:
         """The picture from recorded poses; the frames that it holds."""
@@ -195,22 +197,17 @@ class _Batch:
 
     def refine(self, state: _State) -> _Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
-        recorded = [p for p in state.recorded.placed if p.frame.vehicle not in state.still]
-        for vehicle in sorted(state.still):
-            state.warnings.append(f"{vehicle}: all pictures were taken at one spot; they are placed as recorded")
-        if not recorded:
+        by_kind = sort_out(state.recorded.placed)
+        state.still = by_kind.still
+        state.warnings += by_kind.warnings
+        if not by_kind.fit:
             return None
-        few = odd_ones([p.frame for p in recorded])
-        odd = [p for p, alone in zip(recorded, few, strict=True) if alone]
-        if odd:
-            names = f"{len(odd)} pictures" if len(odd) > 1 else "1 picture"
-            state.warnings.append(f"{names} of another camera or size, too few to be refined, follow their neighbours")
         known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
         if known is not None:
             self.clock.stages += known[1]
             return known[0]
         outer = Clock(self.workers.usage)
-        frames = [p.frame for p, odd in zip(recorded, few, strict=True) if not odd]
+        frames = [p.frame for p in by_kind.fit]
         with outer.stage("refine", len(frames)) as stage:
             try:
                 refinement = self.call_refiner(frames, state)
@@ -222,9 +219,8 @@ class _Batch:
                 fault = f"{type(error).__name__}: {error}"
                 state.warnings.append(f"the refinement failed ({fault}); the map is the real-time one")
                 return None
-        if odd:
-            for solutions in (refinement.coarse, refinement.fine):
-                _append(solutions, carry(odd, recorded, [p for s in solutions for p in s.placed]))
+        for solutions in (refinement.coarse, refinement.fine):
+            _append(solutions, carry(by_kind.odd, by_kind.fit, [p for s in solutions for p in s.placed]))
         stages = _split_time(stage, refinement, self.options.until, state.basemap is not None)
         self.clock.stages += stages
         self.space.remember("refinement", (refinement, stages))
@@ -262,9 +258,8 @@ class _Batch:
         with_map = state.basemap is not None and self.options.until == "fine"
         if with_map and not on_map:
             state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
-        still = [p for p in state.recorded.placed if p.frame.vehicle in state.still]
-        coarse = [p for s in refinement.coarse for p in s.placed] + still
-        fine = [p for s in refinement.fine for p in s.placed] + still
+        coarse = [p for s in refinement.coarse for p in s.placed] + state.still
+        fine = [p for s in refinement.fine for p in s.placed] + state.still
         if self.options.gsd_m is None and _heights_assumed(state.recorded.placed):
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:

@@ -2,8 +2,10 @@
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all, solo
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
+from orthoswarm.vehicles import legs_as_vehicles
 from telemetry import load
 
 
@@ -149,3 +152,84 @@ def test_a_map_of_other_ground_leaves_the_flight_in_its_own_frame(scene):
     state = solo(frames, epsg=grid.epsg, origin=origin, basemap=Elsewhere(), options=Options())
     assert not state.on_map
     assert any("not" in w or "no part" in w for w in state.flight.warnings)
+
+
+def alone(scene, frames, basemap):
+    _, grid, *_ = scene
+    return SwarmRefiner(grid.epsg, local_origin(grid, scene[0]["uav01"])).refine(frames, [], basemap)
+
+
+def other_size(frame, folder, turned):
+    picture = cv2.imread(str(frame.path))
+    picture = cv2.rotate(picture, cv2.ROTATE_90_CLOCKWISE) if turned else cv2.resize(picture, (480, 360))
+    path = folder / frame.path.name
+    cv2.imwrite(str(path), picture)
+    return replace(frame, path=path, width=picture.shape[1], height=picture.shape[0])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_picture_of_another_size_or_turn_follows_the_others_of_its_vehicle(scene, tmp_path, turned):
+    vehicles, grid, basemap, truth = scene
+    frames = list(vehicles["uav01"])
+    frames[7] = other_size(frames[7], tmp_path, turned)
+    solution = alone(scene, frames, basemap)
+    assert [p.frame.image for p in solution.placed if p.weak] == [frames[7].image]
+    assert all(p.stage == "fine" for p in solution.placed)
+    assert any("follow their neighbours" in w for w in solution.warnings)
+    (odd,) = (p for p in solution.placed if p.weak)
+    true = true_camera(truth[odd.frame.image], odd.frame, grid)
+    # its own records place it: 1 m of receiver, some degrees of heading
+    assert np.hypot(*(odd.camera.position - true.position)[:2]) < 3 * odd.sigma_m
+
+
+def test_a_drone_that_hovered_stays_as_recorded_and_is_not_called_fine(scene):
+    vehicles, _, basemap, _ = scene
+    fix = vehicles["uav01"][5].fix
+    rng = np.random.default_rng(0)
+    frames = [
+        replace(f, fix=replace(fix, lat_deg=fix.lat_deg + a, lon_deg=fix.lon_deg + b))
+        for f, (a, b) in zip(vehicles["uav01"], rng.normal(0, 3e-6, (20, 2)), strict=False)
+    ]
+    solution = alone(scene, frames, basemap)
+    assert {p.stage for p in solution.placed} == {"realtime"} and len(solution.placed) == len(frames)
+    assert [leg.state for leg in solution.legs] == ["failed"]
+    assert any("one spot" in w for w in solution.warnings)
+
+
+def test_a_vehicle_of_unreadable_pictures_is_dropped_with_reasons(scene, tmp_path):
+    path = tmp_path / "bad.jpg"
+    path.write_bytes(b"\xff\xd8" + bytes(100))
+    frames = [replace(f, path=path) for f in scene[0]["uav01"]]
+    solution = alone(scene, frames, scene[2])
+    assert not solution.placed and set(solution.dropped) == {f.image for f in frames}
+
+
+def test_one_sparse_flight_after_the_other_comes_onto_the_map(real_data):
+    """Eighteen photos, a leg each as a vehicle of its own, as they complete."""
+    frames = load([real_data("brighton_beach_1600")]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    basemap = Basemap.open(real_data("brighton_derived") / "ortho_from_cloud_0.1m_utm15.tif", grid.epsg)
+    refiner, done = SwarmRefiner(grid.epsg, local_origin(grid, frames)), []
+    legs = legs_as_vehicles(frames, grid)
+    for vehicle in sorted({f.vehicle for f in legs}):
+        done.append(refiner.refine([f for f in legs if f.vehicle == vehicle], done, basemap))
+    placed = [p for s in done for p in s.placed]
+    assert len(done) == 3 and len(placed) == 18
+    assert all(p.stage == "fine" for p in placed)
+    whole = {p.frame.image: p for p in refiner.refine(frames, [], basemap).placed}
+    middle = np.array([799.5, 449.5])
+    apart = [p.camera.to_ground(middle) - whole[p.frame.image].camera.to_ground(middle) for p in placed if not p.weak]
+    assert np.median(np.hypot(*np.array(apart).T)) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "fov_deg"), [("sheffield_cross_800", 81.6), ("mirafiori_rtk", 45.4), ("jwcate_1200", None)]
+)
+def test_sparse_flights_are_refined_one_at_a_time(real_data, name, fov_deg):
+    frames = load([real_data(name)]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    solution = SwarmRefiner(grid.epsg, local_origin(grid, frames)).refine(frames, [], None)
+    assert len(solution.placed) == len(frames) and not any(p.weak for p in solution.placed)
+    if fov_deg is not None:
+        assert abs(solution.fov_deg - fov_deg) < max(0.4, 1.5 * solution.fov_sigma_deg)

@@ -20,6 +20,7 @@ from orthoswarm.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.swarm.flight import Flight, open_flight
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.group import local_origin
+from orthoswarm.swarm.legs import leads_one_way
 from orthoswarm.swarm.onmap import CoarseFit, coarse_fit
 from orthoswarm.swarm.passes import Options, from_flight, read_frame, relative
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
@@ -35,10 +36,7 @@ FEWEST = 10
 """Fewer pictures tell too little."""
 FEWEST_SPARSE, MOST_SPARSE = 4, 60
 """Photos that must be matched in pairs cost fifty times as much as those that can be followed."""
-ONE_WAY_COS = float(np.cos(np.radians(35.0)))
 HELD_DRIFT_M, HELD_BEND_M, HELD_LAG_S = 3.0, 0.3, 0.2
-OTHER_WAY_SHARE = 0.3
-"""Ways in other directions, as a share of the longest leg, from which on drift and tilt can be told apart."""
 ONE_WAY_SIGMA, MANY_WAYS_SIGMA = 0.025, 0.014
 """Error of a coarse placement on the map as a share of the height, measured (see above)."""
 _FOV_CHANGE, _HEIGHT_CHANGE, _TURN_RAD = 0.2, 0.2, float(np.radians(12.0))
@@ -99,9 +97,9 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         if len(frames) > MOST_SPARSE:
             raise OrthoSwarmError("its pictures cannot be followed from one to the next; they wait for the refinement")
         flight = open_sparse_flight(frames, grid, origin, read_frame)
-        one_way = _one_way(flight)
+        one_way = leads_one_way(flight.records.position, flight.leg)
     else:
-        one_way = _one_way(flight)
+        one_way = leads_one_way(flight.records.position, flight.leg)
         if one_way:
             _hold_drift(flight)
     surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else relative(flight)
@@ -117,21 +115,6 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(fit)), state.coarse_sigma_m)
     legs = _legs(state, fit, basemap is not None)
     return replace(to_solution(state, origin, None, coarse=True), legs=legs)
-
-
-def _one_way(flight: Flight) -> bool:
-    """Whether the legs lead in one direction, but for short ways between them."""
-    position, leg = flight.records.position, flight.leg
-    ways = []
-    for k in range(int(leg.max()) + 1 if len(leg) else 0):
-        members = np.flatnonzero(leg == k)
-        ways.append(position[members[-1], :2] - position[members[0], :2])
-    length = np.hypot(*np.array(ways).T) if ways else np.zeros(1)
-    if length.max() < 1e-6:
-        return True
-    longest = ways[int(length.argmax())] / length.max()
-    other = np.array(ways) @ longest < ONE_WAY_COS * length
-    return float(length[other].sum()) < OTHER_WAY_SHARE * float(length.max())
 
 
 def _hold_drift(flight: Flight) -> None:

@@ -11,6 +11,9 @@ Ints = NDArray[np.int32]
 
 REACH = 3
 """Frames before and after between which a bend is measured."""
+ONE_WAY_COS = float(np.cos(np.radians(35.0)))
+OTHER_WAY_SHARE = 0.3
+"""Ways in other directions, as a share of the longest leg, from which on drift and tilt can be told apart."""
 
 
 def split_legs(
@@ -67,3 +70,21 @@ def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
     if time_s is not None and np.isfinite(time_s).all():
         out[1:] |= np.diff(time_s) > 60.0
     return out
+
+
+def leads_one_way(position: Array, leg: Ints) -> bool:
+    """Whether the legs lead in one direction, but for short ways between them.
+
+    Args:
+        position: float64 (N, 2) or (N, 3) in flying order, metres. leg: int32 (N,), -1 outside legs.
+    """
+    ways = []
+    for k in range(int(leg.max()) + 1 if len(leg) else 0):
+        members = np.flatnonzero(leg == k)
+        ways.append(position[members[-1], :2] - position[members[0], :2])
+    length = np.hypot(*np.array(ways).T) if ways else np.zeros(1)
+    if length.max() < 1e-6:
+        return True
+    longest = ways[int(length.argmax())] / length.max()
+    other = np.array(ways) @ longest < ONE_WAY_COS * length
+    return float(length[other].sum()) < OTHER_WAY_SHARE * float(length.max())

@@ -20,7 +20,9 @@ SECOND_LOOKS = 5
 ACROSS_PX = 150
 """A picture's width in pixels of the small mosaics."""
 CONSENSUS_M = 6.0
-TRUSTED_RATIO = 0.85
+MANY, CLEAR_RATIO = 4, 0.7
+"""Fewer windows than this agree by chance on a map of other ground (5 of 26 maps of noise, the best ratio 0.78), so one
+of them must have a clear peak (right ones have 0.3 to 0.5)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float
     inlier = _consensus(matches)
     if inlier.sum() < (1 if len(matches) == 1 else 2) or inlier.mean() < 0.34:
         return None
-    if len(matches) == 1 and matches[0].ratio > 0.7:
+    if inlier.sum() < MANY and min(m.ratio for m, ok in zip(matches, inlier) if ok) > CLEAR_RATIO:
         return None
     return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.mean()))
 

@@ -17,6 +17,7 @@ from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
+from orthoswarm.swarm.legs import leads_one_way
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
@@ -35,6 +36,8 @@ TAKEOFF_LEVEL_M = 2.0
 """How well the takeoff level is known to be the level of the ground, one sigma."""
 TIE_SHARE = 0.5
 """Part of the ties' scatter that neighbouring ties have in common (terrain, map content), so that no number helps."""
+ONE_WAY_FOV_SIGMA_DEG = 5.0
+"""Of photos on one straight way: tilt, height and lens stand for each other (11 such legs of a suburb: 5.6 rms)."""
 MAP_FLOOR_PX = 0.13
 """What no residual tells (map content that stands above the ground everywhere), in pixels of the compared map."""
 
@@ -157,10 +160,13 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
 
 
 def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
-    """How far the field of view may be off because the takeoff spot need not be at the ground's middle level.
+    """How far the field of view may be off by what no picture tells.
 
-    Over flat ground straight down only f / h is observable; the more relief, the less the level is known.
+    The takeoff spot need not be at the ground's middle level: over flat ground straight down only f / h is observable;
+    the more relief, the less the level is known. Photos without heights on one straight way do not tell it at all.
     """
+    if flight.sparse and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
+        return ONE_WAY_FOV_SIGMA_DEG
     if not flight.calibration.trusted_height or not flight.records.has_height.any():
         return 0.0
     relief = 0.0 if surface.fit is None else surface.fit.sd_m

@@ -12,10 +12,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.carried import carry, sort_out
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
-from orthoswarm.placement import MapWindow, Solution, Terrain
+from orthoswarm.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
+from orthoswarm.recorded import recorded_cameras
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.group import Run, common_terrain, local_origin, neighbours_of, pooled_lean, serial
 from orthoswarm.swarm.levels import level_network
@@ -68,9 +70,24 @@ class SwarmRefiner:
         Raises:
             OrthoSwarmError: if nothing can be made of the frames.
         """
-        parts = split_units({frames[0].vehicle: frames} if frames else {})
-        if not parts:
+        if not frames:
             raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+        recorded = recorded_cameras(frames, LocalGrid(self.epsg))
+        kinds = sort_out(recorded.placed)
+        if kinds.fit:
+            solution = self._refined([p.frame for p in kinds.fit], neighbours, basemap)
+        else:
+            solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
+        odd = carry(kinds.odd, kinds.fit, solution.placed)
+        return replace(
+            solution,
+            placed=[*solution.placed, *odd],
+            dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
+            warnings=[*solution.warnings, *kinds.warnings],
+        )
+
+    def _refined(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        parts = split_units({frames[0].vehicle: frames})
         own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
         others = [state for n in neighbours for state in states_of(n)]
         everyone = [*own, *others]
@@ -83,6 +100,14 @@ class SwarmRefiner:
         terrain = _shifted(common_terrain([*done, *others]), self.origin)
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
+
+
+def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame], had_map: bool) -> Solution:
+    """A vehicle that stays where its receiver says: nothing was flown, so nothing tells the scale of its pictures."""
+    fov = float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan")
+    sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
+    legs = [Leg(vehicle, 0, len(placed) - 1, "failed" if had_map else "carried", 0.0, sigma)] if placed else []
+    return Solution(vehicle, list(placed), {}, legs, fov, float("nan"), None)
 
 
 def states_of(solution: Solution) -> list[VehicleState]:

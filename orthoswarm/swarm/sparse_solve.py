@@ -177,4 +177,5 @@ def _rescale_sigmas(adjustment: Adjustment) -> None:
 
 def heights_above_ground(adjustment: Adjustment) -> Array:
     """Height of each camera over the median of the points, float64 (N,)."""
-    return np.asarray(adjustment.rig.position[:, 2] - np.median(adjustment.points[:, 2]))
+    level = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
+    return np.asarray(adjustment.rig.position[:, 2] - level)
