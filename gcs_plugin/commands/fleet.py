@@ -110,6 +110,9 @@ def run(args: argparse.Namespace) -> int:
 
     if not 1 <= args.gcs_system <= 255:
         raise InputError(f"our system id cannot be {args.gcs_system}; give 1 to 255")
+    for name, value in (("--wait", args.wait), ("--seconds", getattr(args, "seconds", 0.0))):
+        if not value >= 0.0:
+            raise InputError(f"{name} {value:g} is no time; give seconds, 0 or more")
     systems = parse_systems(args.vehicle)
     prepared = _Prepared(args, systems)
     backend = open_backend(
