@@ -140,6 +140,19 @@ def test_cameras_without_a_leg_are_not_used(hilly):
     assert nothing.points.shape == (0, 3)
 
 
+def test_ground_beyond_the_ends_of_legs_is_measured_between_legs():
+    """GIVEN ground so far ahead of the legs that one picture of each sees it THEN pictures of other legs help."""
+    rig, leg = rig_of(legs=3, per_leg=4)
+    gray = Pictures(rig, hill)
+    at = np.c_[np.arange(0.0, 121.0, 4.0), np.full(31, -66.0)]
+    found = dense_ground(rig, gray, at, Terrain.flat(0.0), leg, SWEEP)
+    error = found.points[:, 2] - hill(found.points[:, :2])
+    assert len(error) > 8
+    assert np.abs(error).max() < 0.3
+    alone = dense_ground(rig, gray, at, Terrain.flat(0.0), np.where(leg == 1, 1, -1), SWEEP)
+    assert len(alone.points) == 0
+
+
 def test_featureless_ground_gives_nothing():
     rig, leg = rig_of(legs=1)
     gray = Pictures(rig, hill, np.full((1100, 1100), 130.0, np.float32))

@@ -65,6 +65,15 @@ def test_relief_is_followed_through_a_town(seed):
     assert abs(fit.median_m - np.median(relief(probe(30)))) < 0.4
 
 
+def test_more_tolerance_of_the_hold_out_gives_a_smoother_surface():
+    points, sigma = town(relief)
+    kappa = [
+        fit_terrain(points, sigma, BOUNDS, settings=FitSettings(held_out_se=k)).kappa for k in (0.0, 0.5, 1.0, 8.0)
+    ]
+    assert kappa == sorted(kappa, reverse=True)
+    assert kappa[-1] < kappa[0]
+
+
 def test_a_terrace_is_not_smoothed_away():
     fit = fit_terrain(*town(step), BOUNDS)
     xy = probe()

@@ -38,17 +38,18 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array]:
     """Ground points (K, 3) and their sigmas, one in each cell that shows its height."""
     rig = flight.rig()
     cell = CELL_M * _height(flight, surface) / USUAL_HEIGHT_M
-    cells = _cells(rig.position[:, :2], cell, _half_width(flight))
+    cells = _cells(rig.position[:, :2], cell, _reach(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0)
     found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg)
     return found.points, found.sigma_z
 
 
-def _half_width(flight: Flight) -> float:
-    """How far to the side of its path a vehicle's pictures reach on the ground, metres."""
+def _reach(flight: Flight) -> float:
+    """How far from below the camera a vehicle's pictures show the ground, to their corners, metres."""
     rig = flight.rig()
-    return float(0.5 * flight.pictures.size[0] / rig.lens[0, 0] * np.median(rig.position[:, 2]))
+    diagonal = float(np.hypot(*flight.pictures.size))
+    return float(0.5 * diagonal / rig.lens[0, 0] * np.median(rig.position[:, 2]))
 
 
 def _cells(path: Array, cell_m: float, reach_m: float) -> Array:

@@ -11,11 +11,15 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Terrain
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.state import VehicleState
+from orthoswarm.swarm.surface import FitSettings
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+
+DRAWN = FitSettings(held_out_se=1.0)
+"""The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
 
 
 class Run(Protocol):
@@ -78,5 +82,5 @@ def common_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     path = np.concatenate([s.flight.adjustment.rig.position for s in states])
     reach = 1.1 * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    fit = fit_terrain(points, sigma, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+    fit = fit_terrain(points, sigma, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), settings=DRAWN)
     return fit.rendering(float(np.median([s.surface.lift_m for s in states])))

@@ -1,10 +1,10 @@
-"""Ground points where tracks are missing: a vertical line locus through several pictures of one leg.
+"""Ground points where tracks are missing: a vertical line locus through several pictures.
 
 At a free position the picture that sees it from nearest above is the reference; partners fore and aft on the same
-leg are compared with it for every height. A patch of the reference is rectified on the local plane of the terrain,
-and so is a strip of each partner along its epipolar line on that plane: on it a change of height is a plain shift,
-so each picture is sampled once and the sweep is a correlation along the strip. Pictures are read one after the
-other along the legs and only a window of them is kept.
+leg are compared with it for every height, and where the leg ends too early pictures of other legs. A patch of the
+reference is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on
+that plane: on it a change of height is a plain shift, so each picture is sampled once and the sweep is a correlation
+along the strip. Pictures are read one after the other along the legs and only a window of them is kept.
 """
 
 from collections.abc import Callable, Sequence
@@ -105,7 +105,7 @@ def dense_ground(
     *,
     slots: int = 64,
 ) -> LocusPoints:
-    """Heights at free positions from correlation between pictures of one leg.
+    """Heights at free positions from correlation between pictures, of one leg where there are enough.
 
     Args:
         rig: cameras of one or several vehicles.

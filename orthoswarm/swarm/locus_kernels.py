@@ -9,6 +9,9 @@ from orthoswarm.kernels import kernel
 from orthoswarm.parabola import vertex
 from orthoswarm.swarm.rig import project_point
 
+ENOUGH = 3
+"""Partners of a reference below which other legs are asked for some."""
+
 
 @kernel
 def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped-def]
@@ -52,6 +55,43 @@ def choose(  # type: ignore[no-untyped-def]
                 if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
                     nearest, choice = abs(b - wished[w]), i
             partner[c, w] = choice
+        _fill_from_other_legs(
+            position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner[c]
+        )
+
+
+@kernel
+def _fill_from_other_legs(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner
+):
+    """Where the reference's own leg ends before ENOUGH partners are found, those of other legs that see best."""
+    count, reach = 0, 0.0
+    for w in range(len(wished)):
+        count += partner[w] >= 0
+        reach = max(reach, abs(wished[w]))
+    o = key[r]
+    while count < ENOUGH:
+        best, choice = np.inf, -1
+        for k in range(len(key)):
+            i = key[k]
+            if leg[k] == leg[r]:
+                continue
+            b = np.sqrt((position[i, 0] - position[o, 0]) ** 2 + (position[i, 1] - position[o, 1]) ** 2)
+            d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
+            if b < least or b > reach or d >= best:
+                continue
+            taken = False
+            for w in range(len(wished)):
+                taken = taken or partner[w] == i
+            if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                best, choice = d, i
+        if choice < 0:
+            return
+        for w in range(len(wished)):
+            if partner[w] < 0:
+                partner[w] = choice
+                break
+        count += 1
 
 
 @kernel

@@ -37,6 +37,8 @@ class FitSettings:
             data the surface goes on level instead of diving.
         flat_sd_m: relief of this standard deviation or less is taken for noise.
         render_flat_sd_m: the same for rendering, where following noise costs less than missing relief.
+        held_out_se: the smoothest surface is taken whose error at points left out is within so many standard errors
+            of the best.
     """
 
     step_m: float = 30.0
@@ -50,6 +52,7 @@ class FitSettings:
     level_ratio: float = 1.5
     flat_sd_m: float = 0.5
     render_flat_sd_m: float = 0.15
+    held_out_se: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +167,7 @@ class Surface:
         return z
 
     def choose_kappa(self) -> float:
-        """The smoothest surface whose error at points left out is within half a standard error of the best.
+        """The smoothest surface whose error at points left out is about that of the best (settings.held_out_se).
 
         Every fourth point is left out. The best itself would be too rough: rubble is rough and real, but no ground.
         """
@@ -185,7 +188,7 @@ class Surface:
             if min(mean[-2:]) > min(mean):  # rougher twice in vain
                 break
         best = int(np.argmin(mean))
-        limit = mean[best] + 0.5 * float(costs[best].std()) / np.sqrt(len(out))
+        limit = mean[best] + s.held_out_se * float(costs[best].std()) / np.sqrt(len(out))
         return KAPPAS[next(i for i, m in enumerate(mean) if m <= limit)]
 
 
