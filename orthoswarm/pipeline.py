@@ -101,6 +101,8 @@ class _State:
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     equation_5: dict[str, float] | None = None
+    undrawn: Mapping[str, str] = field(default_factory=dict)
+    fault: str | None = None
 
 
 def run(load: Load, out: Path, options: Options, workers: Workers, progress: Progress) -> dict[str, Any]:
@@ -118,7 +120,9 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
 
     Raises:
         InputError: if the inputs hold no picture with a position, or the basemap is of no use.
-        OrthoSwarmError: if nothing could be made.
+        OrthoSwarmError: if nothing could be made, or the refinement failed by a fault of the program: then the
+            real-time picture, the frames as recorded and the report with the fault stand, and no orthoimage that would
+            pass for a refined one.
     """
     return _Batch(out, options, workers, progress).run(load)
 
@@ -143,9 +147,16 @@ class _Batch:
             refinement = None
             if self.options.until != "realtime":
                 refinement = self.refine(state)
-                placed = self.pictures(state, refinement)
+                if state.fault is None:
+                    placed = self.pictures(state, refinement)
+                else:
+                    self.leave_out(state, state.undrawn, state.recorded.placed)
             report = self.finish(state, placed, refinement)
             self.space.complete()
+            if state.fault is not None:
+                raise OrthoSwarmError(
+                    f"{state.fault}; {REALTIME} stands, but there is no orthoimage: report this fault"
+                )
         return report
 
     # -- stages ---------------------------------------------------------------------------------------------------
@@ -191,8 +202,9 @@ class _Batch:
                 raise OrthoSwarmError(f"no picture could be drawn: {reason}")
             self.space.remember("realtime", (stats, stage))
         state.thumbnails, state.drawn = stats.thumbnails, (stats.drawn_m2, stats.covered_share)
+        state.undrawn = stats.rejected
         if self.options.until == "realtime":
-            self.leave_out(state, stats.rejected, placed)
+            self.leave_out(state, state.undrawn, placed)
         return [p for p in placed if p.frame.image not in stats.rejected]
 
     def refine(self, state: _State) -> _Refinement | None:
@@ -216,8 +228,8 @@ class _Batch:
                 return None
             except Exception as error:  # in the field a rough map is better than none; the fault is told in full
                 logging.getLogger(__name__).exception("the refinement failed")
-                fault = f"{type(error).__name__}: {error}"
-                state.warnings.append(f"the refinement failed ({fault}); the map is the real-time one")
+                state.fault = f"the refinement failed ({type(error).__name__}: {error})"
+                state.warnings.append(f"{state.fault}; the map is the real-time one")
                 return None
         for solutions in (refinement.coarse, refinement.fine):
             _append(solutions, carry(by_kind.odd, by_kind.fit, [p for s in solutions for p in s.placed]))
@@ -372,7 +384,7 @@ class _Batch:
     def finish(self, state: _State, placed: list[PlacedFrame], refinement: _Refinement | None) -> dict[str, Any]:
         """frames.jsonl, footprints and the report."""
         for name in PRODUCTS:  # of an earlier run with other options
-            if name not in self.made(refinement):
+            if name not in self.made(refinement, state.fault is not None):
                 (self.out / name).unlink(missing_ok=True)
         with self.clock.stage("final: report", len(placed)) as stage:
             stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
@@ -385,9 +397,9 @@ class _Batch:
         write_json(self.out / "report.json", report)
         return report
 
-    def made(self, refinement: _Refinement | None) -> set[str]:
+    def made(self, refinement: _Refinement | None, faulty: bool) -> set[str]:
         names = set(PRODUCTS)
-        if self.options.until != "fine":
+        if self.options.until != "fine" or faulty:
             names.discard(ORTHOIMAGE)
         if self.options.until == "realtime" or refinement is None:
             names.discard(COARSE)

@@ -232,6 +232,31 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, 
     assert not (tmp_path / "out" / ".work" / "scratch").exists()
 
 
+def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, tmp_path, monkeypatch, capsys):
+    from orthoswarm.swarm import refine
+
+    def fault(*_, **__):
+        raise ZeroDivisionError("by a bug")
+
+    _, _, folder = flight
+    out = tmp_path / "out"
+    monkeypatch.setattr(refine, "refine_all", fault)
+    for name in ("orthoimage.tif", "coarse.tif"):  # of an earlier run: they must not pass for this one's
+        out.mkdir(exist_ok=True)
+        (out / name).write_bytes(b"old")
+    command = ["mosaic", str(folder / "photos"), "--basemap", str(folder / "map.tif"), "--out", str(out), "--json"]
+    assert main([*command, "--workers", "1"]) == 1
+    told = capsys.readouterr()
+    assert "ZeroDivisionError: by a bug" in told.err and not told.out
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "coarse.tif"}
+    report = json.loads((out / "report.json").read_text())
+    assert any("ZeroDivisionError" in w for w in report["warnings"]) and report["refine"] == "none"
+    rows = rows_of(out)
+    assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"} and len(rows) == 33
+    with rasterio.open(out / "realtime.tif") as image:
+        assert image.count == 4
+
+
 def test_without_a_map_the_orthoimage_is_the_coarse_one(flight, tmp_path):
     scene, shots, folder = flight
     report = make(folder / "photos" / "a", tmp_path / "out")
