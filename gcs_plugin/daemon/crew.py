@@ -15,7 +15,7 @@ from orthoswarm.workers import single_threaded
 Result = TypeVar("Result")
 
 NICE: Final = 5
-LAST: Final = 15
+LAST: Final = 10
 """Priority of what may wait while anything else has work."""
 
 

@@ -86,7 +86,7 @@ class Drawer:
         self._queue = Waiting(_IN_MEMORY)
         self._waiting: set[int] = set()
         self._looked = 0.0
-        self._more = True
+        self._more, self._looking = True, False
         self._condition = threading.Condition()
         self._stop = False
         self._thread: threading.Thread | None = None
@@ -132,7 +132,7 @@ class Drawer:
         """Wait until nothing is left to draw; returns whether that is so."""
         end = time.monotonic() + timeout_s
         with self._condition:
-            while len(self._queue) or self._waiting or self._more:
+            while len(self._queue) or self._waiting or self._more or self._looking:
                 left = end - time.monotonic()
                 if left <= 0 or self._stop:
                     return False
@@ -176,7 +176,7 @@ class Drawer:
             self._events.publish("problem", text=problem)
         with self._condition:
             self._waiting = self._queue.seqs()
-            self._more = True
+            self._more, self._looking = True, False
             self._condition.wait(1.0)
 
     def _tell_overload(self) -> None:
@@ -207,11 +207,12 @@ class Drawer:
         with self._condition:
             if not self._more or len(self._queue) > _IN_MEMORY // 2:
                 return
-            self._more = False
-        rows = self._journal.rows(
-            f"SELECT {_COLUMNS} FROM frames WHERE drawn = 0 ORDER BY seq LIMIT ?", (_IN_MEMORY + len(self._waiting),)
-        )
+            self._more, self._looking = False, True
+        most = _IN_MEMORY + len(self._waiting) + 1
+        rows = self._journal.rows(f"SELECT {_COLUMNS} FROM frames WHERE drawn = 0 ORDER BY seq LIMIT ?", (most,))
         with self._condition:
+            self._looking = False
+            self._more = self._more or len(rows) == most
             for row in rows:
                 if row["seq"] not in self._waiting:
                     if len(self._queue) >= _IN_MEMORY:
