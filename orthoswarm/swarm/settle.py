@@ -178,20 +178,20 @@ def resettle(
     """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved)."""
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    surface = refit(flight, surface)  # the ground moved with its level; ties are compared on it where it is now
     return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)
 
 
 def _second_round(
     flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
 ) -> tuple[GroundModel, Ties, MapMatches]:
+    surface = refit(flight, surface)  # the points moved, with their level too: ties are compared on the ground as it is
     matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, 5.0))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
         if k in (0, 1):
             ties = weighed(ties, flight.adjustment.tie_residual)
-        if k % 2 == 0:
+        if k == rounds - 2:
             surface = refit(flight, surface)
     return surface, ties, matches
 
