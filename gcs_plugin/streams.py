@@ -48,6 +48,9 @@ def default_rates(pose_hz: float = 10.0) -> Rates:
             int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): 1.0,
             int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 1.0,
             int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS): pose_hz,
+            # A rangefinder that states its limits; a height from a coarse terrain map is worse than none.
+            int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
+            int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
         },
     )
 

@@ -16,6 +16,7 @@ from telemetry.rotations import camera_angles_deg, euler_ned, mounted_down_deg, 
 from telemetry.sample import Sample, checked
 
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
+_LEAST_HEIGHT_M = 0.5
 _EARLIEST_UTC_S = 946_684_800.0  # 2000-01-01: clocks before that were never set
 _DOWNWARD = 25
 _REBOOT_S = 10.0
@@ -24,7 +25,7 @@ TYPES = frozenset(
     {
         "SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "GIMBAL_DEVICE_ATTITUDE_STATUS",
         "MOUNT_ORIENTATION", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "CAMERA_TRIGGER",
-        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR",
+        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR", "HOME_POSITION",
     }
 )  # fmt: skip
 """Message types that say anything here."""
@@ -54,13 +55,14 @@ class MavlinkPoses:
     Attributes:
         utc_minus_boot_s: what to add to times since boot, None until the vehicle knows UTC.
         heading_deg: of the airframe, latest. has_gimbal: whether any gimbal reported.
-        reboots: how often the time since boot went back.
+        reboots: how often the time since boot went back. home_altitude_m: altitude of home over the sea.
     """
 
     utc_minus_boot_s: float | None = None
     heading_deg: float | None = None
     has_gimbal: bool = False
     reboots: int = 0
+    home_altitude_m: float | None = None
     _boot_s: float = field(default=0.0, repr=False)
 
     def feed(self, message: Any) -> Sample | CameraEvent | None:
@@ -142,6 +144,9 @@ class MavlinkPoses:
         self.has_gimbal = True
         return _camera(self._boot(m.time_boot_ms), euler_ned(yaw, m.pitch, m.roll))
 
+    def _home(self, m: Any) -> None:
+        self.home_altitude_m = m.altitude * 1e-3
+
     def _terrain(self, m: Any) -> Sample | None:
         return _above_ground(m.current_height) if m.loaded else None
 
@@ -168,9 +173,11 @@ class MavlinkPoses:
     def _captured(self, m: Any) -> CameraEvent | None:
         if m.capture_result == 0:
             return None
-        sample = Sample(
-            lat_deg=m.lat * 1e-7, lon_deg=m.lon * 1e-7, altitude_m=m.alt * 1e-3, height_m=m.relative_alt * 1e-3
-        )
+        sample = Sample(lat_deg=m.lat * 1e-7, lon_deg=m.lon * 1e-7, altitude_m=m.alt * 1e-3)
+        if m.relative_alt * 1e-3 > _LEAST_HEIGHT_M:  # PX4 says -1 m where it does not know the ground
+            sample.height_m = m.relative_alt * 1e-3
+        elif self.home_altitude_m is not None and sample.altitude_m is not None:
+            sample.height_m = sample.altitude_m - self.home_altitude_m
         if all(map(math.isfinite, m.q)) and any(m.q):
             rotation = quaternion_ned(*m.q)
             # PX4 sends the airframe's attitude here, a camera manager the camera's: only that looks down.
@@ -225,7 +232,7 @@ def _camera(boot_s: float, forward_ned: Any) -> Sample:
 
 
 def _above_ground(metres: float) -> Sample | None:
-    if not math.isfinite(metres) or not 0.5 < metres < 5000.0:
+    if not math.isfinite(metres) or not _LEAST_HEIGHT_M < metres < 5000.0:
         return None
     return Sample(height_m=float(metres), height_is_ground=True)
 
@@ -248,6 +255,7 @@ _HANDLERS: dict[str, Any] = {
     "TERRAIN_REPORT": MavlinkPoses._terrain,
     "RANGEFINDER": MavlinkPoses._rangefinder,
     "DISTANCE_SENSOR": MavlinkPoses._distance,
+    "HOME_POSITION": MavlinkPoses._home,
     "CAMERA_FEEDBACK": MavlinkPoses._feedback,
     "CAMERA_IMAGE_CAPTURED": MavlinkPoses._captured,
     "CAMERA_TRIGGER": MavlinkPoses._trigger,

@@ -495,6 +495,26 @@ def test_an_image_captured_report_with_a_camera_quaternion():
     assert poses.feed(captured([0.0] * 4, result=0)) is None
 
 
+def test_a_captured_picture_without_a_known_ground_gets_its_height_from_home_or_from_the_track():
+    """PX4 fills relative_alt with the distance to the ground, and with -1 m where it does not know that."""
+
+    def captured(boot_ms):
+        return mavlink.MAVLink_camera_image_captured_message(
+            boot_ms, 1_700_000_000_000_000 + 1000 * boot_ms, 1, int(47e7), int(8e7), 500_000, -1000,
+            quaternion(20.0, -5.0, 2.0), 5, 1, b"",
+        )  # fmt: skip
+
+    live = LivePoses("px4")
+    live.feed(mavlink.MAVLink_system_time_message(1_700_000_001_000_000, 1000))
+    for boot_ms in range(1000, 3000, 100):
+        live.feed(position(boot_ms, 47.0, 8.0))
+    event = live.feed(captured(2050))
+    assert event.sample.height_m == pytest.approx(live.at(1_700_000_002.05).height_m)
+    poses = MavlinkPoses()
+    poses.feed(mavlink.MAVLink_home_position_message(int(47e7), int(8e7), 440_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
+    assert poses.feed(captured(2050)).sample.height_m == pytest.approx(60.0)
+
+
 def test_positions_without_a_fix_and_not_a_number_are_left_out():
     live = LivePoses("n")
     live.feed(position(1000, 0.0, 0.0), 101.0)
