@@ -17,6 +17,10 @@ _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters
            "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
 
 
+MOST_BURIED = 0.05
+"""Part of the cameras that a DEM may bury: a few recorded heights can be wrong."""
+
+
 def read_dem(
     path: Path,
     epsg: int,
@@ -62,6 +66,29 @@ def read_dem(
         under = z if takeoff is None else absolute.height(np.asarray(takeoff, float).reshape(-1, 2))
         level_m = float(np.median(under))
     return Terrain(left, low, step, (z - level_m).astype(np.float32))
+
+
+def check_dem(path: Path, epsg: int, bounds: tuple[float, float, float, float], cameras: ArrayLike) -> None:
+    """Look at a DEM before the work begins.
+
+    Args:
+        path, epsg, bounds: see `read_dem`.
+        cameras: (N, 3) east, north and height above takeoff of those that recorded one (none is allowed).
+
+    Raises:
+        InputError: as `read_dem`, or if the ground would lie above cameras (heights in another unit, for instance).
+    """
+    at = np.asarray(cameras, float).reshape(-1, 3)
+    terrain = read_dem(path, epsg, bounds, takeoff=at[:, :2] if len(at) else None)
+    if not len(at):
+        return
+    under = terrain.height(at[:, :2])
+    buried = float((under > at[:, 2]).mean())
+    if buried > MOST_BURIED:
+        raise InputError(
+            f"by {Path(path).name} the ground lies above {buried:.0%} of the cameras (its heights below the flight "
+            f"span {under.max() - under.min():.0f} m); check that it is this area's and in metres"
+        )
 
 
 def _on_area(

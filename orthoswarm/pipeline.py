@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap
 from orthoswarm.carried import carry, sort_out
-from orthoswarm.dem import read_dem
+from orthoswarm.dem import check_dem, read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.partial import disk_error, written_whole
@@ -183,7 +183,8 @@ class _Batch:
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
             warnings += partial_cover(basemap, recorded.placed)
         if self.options.dem is not None:  # told now, not after the refinement
-            read_dem(self.options.dem, grid.epsg, placed_bounds(recorded.placed, 0.0, 0.0))
+            told = [p.camera.position for p in recorded.placed if p.frame.fix.height_m is not None]
+            check_dem(self.options.dem, grid.epsg, placed_bounds(recorded.placed, 0.0, 0.0), told)
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
         return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected)
 

@@ -80,6 +80,8 @@ def _by_content(fd: int, head: bytes, size: int) -> Container:
         return _webp(fd, size)
     if head[:4] in (b"II*\0", b"MM\0*"):
         return _tiff(fd)
+    if head[:4] in (b"II+\0", b"MM\0+"):
+        return _big_tiff(fd, head[:1] == b"I")
     if head[:2] == b"BM" and len(head) >= 26:
         width, height = struct.unpack_from("<ii", head, 18)
         return Container("bmp", abs(width), abs(height), exif.Exif())
@@ -197,6 +199,18 @@ def _webp(fd: int, size: int) -> Container:
     if not width or not height:
         raise NotAPicture("the WebP file is damaged; copy it again")
     return Container("webp", width, height, tags, packet)
+
+
+def _big_tiff(fd: int, little: bool) -> Container:
+    """A BigTIFF, whose offsets have 64 bits: a map if it is georeferenced; no camera writes such pictures."""
+    order = "<" if little else ">"
+    (first,) = struct.unpack(order + "Q", _read_at(fd, 8, 8))
+    (count,) = struct.unpack(order + "Q", _read_at(fd, first, 8))
+    entries = _read_at(fd, first + 8, 20 * min(count, _MAX_SEGMENTS))
+    tags = {struct.unpack_from(order + "H", entries, at)[0] for at in range(0, len(entries) - 19, 20)}
+    if exif.GEO_KEYS not in tags:
+        raise NotAPicture("a BigTIFF is no picture of a camera; save it as TIFF or JPEG")
+    return Container("tiff", 0, 0, exif.Exif(), georeferenced=True)
 
 
 def _tiff(fd: int) -> Container:

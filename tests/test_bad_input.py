@@ -264,3 +264,10 @@ def test_names_that_are_no_text_and_files_that_are_no_files(scene, tmp_path, mos
     reasons = {n: r["reason"] for n, r in rows.items() if r["stage"] == "rejected"}
     assert set(reasons) == expected & {"._DJI_0001.JPG", "copy.JPG", "gone.JPG", "pipe.JPG"}
     assert "hidden" in reasons["._DJI_0001.JPG"] and "DJI_0000.JPG" in reasons["copy.JPG"]
+
+
+def test_a_height_model_that_is_none_is_refused_before_the_work(scene, tmp_path, mosaic):
+    scene.fly(tmp_path / "photos", legs(count=1, photos=4))
+    (tmp_path / "dem.tif").write_text("heights")
+    code, _, _, said = mosaic(tmp_path / "photos", dem=tmp_path / "dem.tif")
+    assert code == 2 and "no readable height model" in said

@@ -6,6 +6,7 @@ import struct
 from pathlib import Path
 
 import pytest
+import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -194,6 +195,21 @@ def test_a_png_under_a_jpeg_name_is_read_by_content(tmp_path):
     path.write_bytes((tmp_path / "a.png").read_bytes())
     photo = read_photo(path)
     assert (photo.width, photo.height) == (30, 20)
+
+
+@pytest.mark.parametrize("endianness", ["LITTLE", "BIG"])
+def test_a_large_georeferenced_tiff_is_no_photo_and_a_plain_one_no_picture_of_a_camera(tmp_path, endianness):
+    path = tmp_path / "map.tif"
+    shape = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "uint8"}
+    place = {"crs": "EPSG:32632", "transform": rasterio.Affine(1, 0, 5e5, 0, -1, 5e6)}
+    with rasterio.open(path, "w", **shape, **place, BIGTIFF="YES", ENDIANNESS=endianness):
+        pass
+    assert path.read_bytes()[:4] in (b"II+\0", b"MM\0+")
+    assert read_photo(path) is None
+    data = path.read_bytes()
+    path.write_bytes(data.replace(struct.pack("<H" if endianness == "LITTLE" else ">H", 34735), b"\xf0\xf0"))
+    with pytest.raises(NotAPicture, match="BigTIFF"):
+        read_photo(path)
 
 
 def test_a_georeferenced_tiff_is_no_photo(real_data):

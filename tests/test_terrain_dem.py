@@ -5,7 +5,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from orthoswarm.dem import read_dem
+from orthoswarm.dem import check_dem, read_dem
 from orthoswarm.errors import InputError
 
 EPSG = 32632
@@ -143,3 +143,13 @@ def test_a_real_ground_model_is_read(real_data):
     middle = terrain.height(np.array([[0.5 * (b.left + b.right), 0.5 * (b.bottom + b.top)]]))
     assert np.isfinite(middle).all()
     assert abs(np.median(terrain.z)) < 1e-3
+
+
+def test_a_dem_in_another_unit_is_refused_before_it_buries_cameras(tmp_path):
+    cameras = np.c_[np.random.default_rng(5).uniform(BOUNDS[:2], BOUNDS[2:], (40, 2)), np.full(40, 90.0)]
+    z, transform = utm_dem()
+    check_dem(write(tmp_path / "dem.tif", z, transform=transform), EPSG, BOUNDS, cameras)
+    steep = write(tmp_path / "steep.tif", 300.0 + 30.0 * (z - 300.0), transform=transform)
+    with pytest.raises(InputError, match=r"steep\.tif the ground lies above \d+% of the cameras"):
+        check_dem(steep, EPSG, BOUNDS, cameras)
+    check_dem(steep, EPSG, BOUNDS, [])
