@@ -17,6 +17,7 @@ from telemetry.photos import PhotoTags
 
 Array = NDArray[np.float64]
 
+_ASTRAY_M = 100.0
 _FOV_GUESS_RAD = math.radians(70.0)
 
 
@@ -31,6 +32,7 @@ def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicl
         _distortion(photos),
         _accurate_positions(frames),
         *_times(frames, ground),
+        _astray(frames, ground),
         _standing(ground),
         _missing_numbers(frames),
         _spacing(frames, ground, legs),
@@ -109,6 +111,26 @@ def number_of(image: str) -> int | None:
     """The last number in a picture's name, None where there is none."""
     match = re.search(r"(\d{1,9})\D*$", image.rsplit("/", 1)[-1].rsplit(".", 1)[0])
     return int(match[1]) if match else None
+
+
+def _astray(frames: Sequence[Frame], ground: Array) -> Finding | None:
+    """Pictures that lie far from both neighbours, which lie near each other: their position is wrong."""
+    if len(ground) < 3:
+        return None
+    step = np.hypot(*np.diff(ground, axis=0).T)
+    across = np.hypot(*(ground[2:] - ground[:-2]).T)
+    least = np.minimum(step[:-1], step[1:])
+    far = np.flatnonzero((least > _ASTRAY_M) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)) + 1
+    if not len(far):
+        return None
+    away = float(least[far - 1].max())
+    metres = f"{away / 1000:.0f} km" if away > 10_000 else f"{away:.0f} m"
+    first = frames[int(far[0])].image
+    return Finding(
+        "position-astray",
+        f"{plural(len(far), 'picture')} lie up to {metres} away from the pictures before and after ({first} first); "
+        "their positions are wrong",
+    )
 
 
 def _standing(ground: Array) -> Finding | None:

@@ -212,6 +212,15 @@ def test_a_camera_that_keeps_its_heading_is_not_suspicious(tmp_path):
     assert not {"yaw-inconsistent", "yaw-jump", "yaw-ambiguous", "yaw-relative"} & codes(folder)
 
 
+def test_a_picture_far_from_its_neighbours_is_named_and_a_return_flight_is_not(tmp_path):
+    for i in range(8):
+        photo(tmp_path / "a" / f"P_{i}.JPG", 47.5 + 1e-4 * i + (1.0 if i == 4 else 0.0), 8.25, i)
+        photo(tmp_path / "b" / f"P_{i}.JPG", 47.5 + 1e-4 * min(i, 8 - i), 8.25, i)
+    found = {s.path: [str(f) for f in s.findings if f.code == "position-astray"] for s in survey([tmp_path]).sources}
+    assert "P_4.JPG" in found["a"][0] and "111 km" in found["a"][0]
+    assert found["b"] == []
+
+
 def test_heights_that_cannot_be_are_dropped(tmp_path):
     folder = flight(tmp_path / "f", [0], yaw=lambda c: c, height=lambda c: -3.0)
     assert all(f.fix.height_m is None for f in load([folder]).frames)
