@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap  # type: ignore[import-not-found]
+import pycolmap  # type: ignore[import-not-found,unused-ignore]
 
 FEATURES, IN_TIME, IN_SPACE, REACH_M = 1024, 10, 20, 150.0
 
