@@ -72,7 +72,7 @@ class Serial:
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
-        return (_tidily(function, _own(item)) for item in items)
+        return (_alone(function, item) for item in items)
 
     def usage(self) -> Usage:
         """See Workers."""
@@ -100,7 +100,7 @@ class Processes:
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         if self.count == 1:
-            yield from (_tidily(function, _own(item)) for item in items)
+            yield from (_alone(function, item) for item in items)
             return
         source = iter(items)
         queue: deque[Future[_Outcome[Result]]] = deque()
@@ -203,10 +203,15 @@ def _own(item: Item) -> Item:
     return copy
 
 
+def _alone(function: Callable[[Item], Result], item: Item) -> Result:
+    """Apply a function here as another process would: nothing is shared, and what is not pickled is let go."""
+    return _own(_tidily(function, _own(item)))
+
+
 def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Result]]":
     future: Future[_Outcome[Result]] = Future()
     try:
-        future.set_result(_Outcome(_tidily(function, _own(item)), os.getpid(), 0.0, 0.0))
+        future.set_result(_Outcome(_alone(function, item), os.getpid(), 0.0, 0.0))
     except Exception as error:
         future.set_exception(error)
     return future
