@@ -14,10 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from gcs_plugin.console import Client
 from gcs_plugin.packets import Framer
 
 _BUFFER: Final = 1 << 20
 _START_S: Final = 120.0
+_END_S: Final = 60.0
 
 
 class Feed:
@@ -101,6 +103,7 @@ class Child:
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True
         )
         self.url = self._address(workspace)
+        self._wait_until_it_answers(workspace)
         self.token = (workspace / "token").read_text(encoding="utf-8").strip()
 
     @property
@@ -108,15 +111,24 @@ class Child:
         """Whether it still runs."""
         return self._process.poll() is None
 
-    def close(self) -> None:
-        """End it as Ctrl-C does; what is under way goes on at the next start."""
+    def close(self, wait_s: float = 3.0) -> None:
+        """End it as Ctrl-C does; what is under way goes on at the next start.
+
+        Args:
+            wait_s: how long to wait for its end; MAVProxy stands still meanwhile. Then it ends by itself.
+        """
         if self.running:
             self._process.terminate()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(20.0)
-        if self.running:
+        ending = threading.Thread(target=self._end, name="daemon's end", daemon=True)
+        ending.start()
+        ending.join(wait_s)
+
+    def _end(self) -> None:
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait(10.0)
+            self._process.wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
         self._log.close()
@@ -128,10 +140,30 @@ class Child:
         for line in self._process.stdout:
             text = line.decode(errors="replace")
             if text.startswith("map: "):
-                threading.Thread(target=self._process.stdout.read, daemon=True).start()
+                threading.Thread(target=self._drain, daemon=True).start()
                 return text.split()[1].partition("#")[0].rstrip("/")
             if time.monotonic() > end:
                 break
-        self.close()
+        raise self._failed(workspace)
+
+    def _drain(self) -> None:
+        with contextlib.suppress(OSError, ValueError):  # closed at the end
+            while self._process.stdout is not None and self._process.stdout.read(4096):
+                pass
+
+    def _wait_until_it_answers(self, workspace: Path) -> None:
+        client, end = Client(self.url), time.monotonic() + _START_S
+        while True:
+            try:
+                client.ask("/healthz")
+                return
+            except RuntimeError:
+                if not self.running or time.monotonic() > end:
+                    raise self._failed(workspace) from None
+            time.sleep(0.1)
+
+    def _failed(self, workspace: Path) -> RuntimeError:
+        """End it; gives its last words."""
+        self.close(_END_S)
         last = (workspace / "serve.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-        raise RuntimeError(f"the daemon did not start: {last[0] if last else 'it said nothing'}")
+        return RuntimeError(f"the daemon did not start: {last[0] if last else 'it said nothing'}")

@@ -158,12 +158,10 @@ def test_a_real_flight_is_mapped_and_refined_from_the_twins_pictures(autopilot, 
             fly(served, name, pace)
             report = products(served, tmp_path / "w")
             code, said = camera.end()
-        print(said, report["frames"], [(x["name"], x["cpu_s"]) for x in report["stages"]])
         assert code == 0 and said["vehicles"][0]["pictures"] >= report["frames"]["used"] > 20
         reference = folder / "truth" / "reference.tif"
         mask = find_mask(reference, None)
         rough, fine = (evaluate_ortho(tmp_path / "w" / n, reference, mask) for n in ("realtime.tif", "orthoimage.tif"))
-        print(rough.figures(), fine.figures())
         assert fine.figures()["median_m"] < 1.0
         assert fine.figures()["median_m"] < 0.5 * rough.figures()["median_m"]
     finally:
