@@ -196,6 +196,7 @@ class Daemon:
                 self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
             if self.posted[pose.vehicle] == _FEW:
                 self.crew.warm_kernels()
+                self.background.warm_up()
         return seq, new
 
     def sortie(self, vehicle: str) -> int:

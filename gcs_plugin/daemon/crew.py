@@ -30,10 +30,14 @@ class Crew:
         self.count, self._nice = max(1, count), nice
         self._lock = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
-        self._closed = self._warm = False
+        self._closed = self._started = self._warm = False
 
     def warm_up(self) -> None:
-        """Start the processes and let them import what they will need."""
+        """Start the processes, once, and let them import what they will need."""
+        with self._lock:
+            if self._started or self._closed:
+                return
+            self._started = True
         for _ in range(self.count):
             self.submit(_import_all, 0)
 

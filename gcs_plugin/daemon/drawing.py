@@ -42,6 +42,7 @@ _LOOK_S: Final = 0.5
 _FEW: Final = 200
 _OTHER_GSD: Final = 3.0
 _FAR_M: Final = 100_000.0
+_SEEN_HEIGHTS: Final = 4.0  # nothing is drawn beyond 3.8 heights (`reach`)
 _COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"
 _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
@@ -333,6 +334,10 @@ class Drawer:
     def _with_room(self, camera: Camera) -> str | None:
         """Make sure that the layer holds what a camera sees; why not, if that cannot be."""
         assert self.area is not None
+        east, north, height = (float(v) for v in camera.position)
+        far = _SEEN_HEIGHTS * abs(height)
+        if self.area.holds((east - far, north - far, east + far, north + far)):
+            return None  # the usual case, without a look at the footprint
         if rejection(camera, 0.0, self.area.gsd_m) is not None:
             return None  # the mosaic will say so
         box = footprint_boxes([camera], 0.0, 0.0)[0]

@@ -195,7 +195,7 @@ def _finish(daemon: "Daemon", tell: Tell) -> None:
     def refined() -> bool:
         rows = daemon.completions()
         tell("refining", sum("version" in row for row in rows), len(rows))
-        failed = [job for job in daemon.jobs.all() if job.state == "failed"]
+        failed = [job for job in daemon.jobs.all() if job.state == "failed" and job.kind != "coarse"]
         if failed:
             raise OrthoSwarmError(f"the {failed[0].kind} of {failed[0].vehicle} failed: {failed[0].message}")
         return all("version" in row for row in rows) and not daemon.jobs.open()

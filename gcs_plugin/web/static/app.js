@@ -87,12 +87,12 @@ function drawVehicles() {
     const mission = row.mission || {};
     const facts = [row.state === "pictures" ? "" : row.state, row.mode, row.armed ? "armed" : "", row.battery == null ? "" : `${Math.round(row.battery * 100)} %`];
     const pictures = `${counts.frames || 0} pictures, ${counts.fine || 0} fine, ${counts.coarse || 0} coarse${counts.rejected ? `, ${counts.rejected} rejected` : ""}`;
-    const share = mission.items ? mission.item / mission.items : 0;
+    const share = mission.phase === "complete" ? 1 : mission.items ? mission.item / mission.items : 0;
     return make("div", { className: "card" },
       make("span", { className: "swatch", style: `background:${colour}` }), make("b", {}, row.name || row.id),
       make("span", { className: "quiet" }, facts.filter(Boolean).join(", ")),
       mission.items ? make("div", { className: `bar ${mission.phase === "complete" ? "done" : ""}`, title: `mission ${mission.phase}` }, make("i", { style: `width:${100 * share}%` })) : null,
-      mission.items ? make("p", { className: "quiet" }, `mission ${mission.phase}, item ${mission.item} of ${mission.items}`) : null,
+      mission.items ? make("p", { className: "quiet" }, mission.phase === "complete" ? "mission complete" : `mission ${mission.phase}, item ${mission.item} of ${mission.items}`) : null,
       make("p", { className: "quiet" }, `${pictures}; sortie ${row.sortie || 1}`),
       make("div", { className: "buttons" },
         ...(row.system ? ["start", "pause", "resume", "rtl"].map((verb) => make("button", { onclick: () => command(row.id, verb) }, verb)) : []),
@@ -112,13 +112,22 @@ const refine = attempt(async (vehicle) => {
   if (await confirmed(vehicle ? `Refine ${vehicle} now?` : "Refine all vehicles now?")) await post("/api/refine", vehicle ? { vehicle } : {});
 });
 
+function countLegs(features) {
+  const flying = features.filter((leg) => leg.properties.stage !== "fine");
+  const of = (state) => features.filter((leg) => leg.properties.state === state).length;
+  $("leg-count").textContent = features.length
+    ? `${features.length} legs, ${flying.length} of them in flight: ${of("matched")} matched, ${of("carried")} carried, ${of("failed")} failed` : "";
+}
+
 // -- jobs and exports ------------------------------------------------------------------------------------------------
 
 const jobs = new Map();
 const NAMES = { refine: "Refine", export: "Export", coarse: "Coarse" };
 
 function drawJobs() {
-  const latest = [...jobs.values()].sort((a, b) => b.id - a.id).slice(0, 12);
+  // Coarse maps in flight come and go by themselves: only what is under way, or went wrong, is worth a line.
+  const shown = [...jobs.values()].filter((job) => job.kind !== "coarse" || job.state === "running" || job.state === "failed");
+  const latest = shown.sort((a, b) => b.id - a.id).slice(0, 12);
   if (latest.length) {
     $("jobs").replaceChildren(...latest.map((job) => make("div", { className: "card" },
       make("b", {}, NAMES[job.kind] || job.kind), `${job.vehicle || ""}${job.sortie > 1 ? ` sortie ${job.sortie}` : ""} `,
@@ -231,6 +240,7 @@ const refresh = attempt(async () => {
   drawVehicles();
   drawJobs();
   view.show("legs", legs.features);
+  countLegs(legs.features);
   if (health.problems.length) complain(health.problems.join("; "));
 });
 
@@ -239,7 +249,7 @@ function heard(event) {
   else if (event.type === "frame" && event.outline) { outlines.set(event.vehicle, event.outline); later(); }
   else if (event.type === "vehicle") { vehicles.set(event.id, { ...vehicles.get(event.id), ...event }); view.placeVehicle(event); later(); }
   else if (event.type === "job") { jobs.set(event.id, event); drawJobs(); if (event.state === "done") later(); }
-  else if (event.type === "problem") complain(event.text);
+  else if (event.type === "problem" || event.type === "overload") complain(event.text);
   else later();
 }
 

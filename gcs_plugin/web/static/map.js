@@ -38,7 +38,8 @@ const STATE = ["match", ["get", "state"], "matched", "#2b8a3e", "carried", "#d97
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": ["get", "colour"], "fill-opacity": 0.12, "fill-outline-color": ["get", "colour"] }],
   ["trails", "line", { "line-color": ["get", "colour"], "line-width": 2, "line-opacity": 0.8 }],
-  ["legs", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.85 }],
+  ["legs", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.85 }, ["==", ["get", "stage"], "fine"]],
+  ["flying", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.9, "line-dasharray": [2, 1.2] }, ["!=", ["get", "stage"], "fine"], "legs"],
   ["plan", "line", { "line-color": ["coalesce", ["get", "colour"], "#16202a"], "line-width": ["match", ["get", "kind"], "leg", 3, 1.5] }],
   ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15, "fill-outline-color": "#1c64b0" }],
   ["corners", "circle", { "circle-radius": 6, "circle-color": "#fff", "circle-stroke-width": 2, "circle-stroke-color": "#1c64b0" }],
@@ -46,9 +47,9 @@ const OVERLAYS = [
 
 export const ready = new Promise((resolve) => {
   map.on("load", () => {
-    for (const [id, type, paint] of OVERLAYS) {
-      map.addSource(id, { type: "geojson", data: empty });
-      map.addLayer({ id, type, source: id, paint });
+    for (const [id, type, paint, filter, source] of OVERLAYS) {
+      if (!source) map.addSource(id, { type: "geojson", data: empty });
+      map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}) });
     }
     resolve();
   });
