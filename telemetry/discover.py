@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 from orthoswarm.errors import InputError
@@ -50,7 +51,13 @@ class Discovery:
 
     def name(self, path: Path) -> str:
         """A file's name in all products: relative to the root, forward slashes, writable as UTF-8."""
-        return _text(os.path.relpath(path, self.root))
+        folder = _relative(str(path.parent), str(self.root))
+        return _text(path.name if folder == os.curdir else os.path.join(folder, path.name))
+
+
+@lru_cache(maxsize=1024)
+def _relative(folder: str, root: str) -> str:
+    return os.path.relpath(folder, root)
 
 
 def _text(name: str) -> str:
@@ -87,11 +94,14 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     sorted_in: set[Path] = set()
     inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
     files = [*inside, *((path, False) for path in absolute if not path.is_dir())]
-    for file, walked in sorted(files, key=lambda entry: entry[0].is_symlink()):  # the file itself before links to it
+    real_folder = lru_cache(maxsize=None)(os.path.realpath)
+    links = [(file.is_symlink(), file, walked) for file, walked in files]
+    for is_link, file, walked in sorted(links, key=lambda entry: entry[0]):  # the file itself before links to it
         if walked and file.name.startswith("."):
             left_out[file] = "a hidden file; rename it if it is a photo to be mapped"
             continue
-        first = seen.setdefault(os.path.realpath(file), file)
+        real = os.path.realpath(file) if is_link else os.path.join(real_folder(str(file.parent)), file.name)
+        first = seen.setdefault(real, file)
         if first != file:
             left_out[file] = f"the same file as {first.name}, which is in the input already"
         elif file not in sorted_in:
