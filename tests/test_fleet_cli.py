@@ -8,10 +8,12 @@ import time
 import pytest
 
 from gcs_plugin import missionfiles
+from gcs_plugin.backends.base import late_start
 from gcs_plugin.cli import main
 from gcs_plugin.commands.fleet import parse_systems, read_plan_folder
 from gcs_plugin.links import UdpLink
 from gcs_plugin.mavlink import Autopilot
+from gcs_plugin.mission.exchange import Outcome
 from gcs_plugin.sim.swarm import SimSwarm, make_swarm
 from orthoswarm.errors import InputError
 from tests.test_mission_build import make_plan
@@ -222,3 +224,9 @@ def test_simulated_vehicles_end_by_themselves(capsys):
 def test_impossible_simulations_are_refused(words, capsys):
     assert main(["sim", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_start_that_came_too_late_for_its_plan_says_so():
+    flies = Outcome(True, "vehicle 2 flies its mission")
+    assert late_start(flies, 4.0) == flies
+    assert "12 s later than planned" in late_start(flies, 12.0).text and late_start(flies, 12.0).ok

@@ -90,3 +90,13 @@ class Backend(abc.ABC):
 
 
 ENDED = ("complete", "aborted")
+
+_LATE_S = 5.0
+
+
+def late_start(outcome: Outcome, late_s: float) -> Outcome:
+    """A start that came too late for a plan that keeps vehicles apart by time says so."""
+    if late_s <= _LATE_S:
+        return outcome
+    warning = f"it took off {late_s:.0f} s later than planned, so the plan's distances do not hold: watch it"
+    return Outcome(True, f"{outcome.text}, but {warning}")

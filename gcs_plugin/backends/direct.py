@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
+from gcs_plugin.backends.base import ENDED, Backend, Report, Verb, late_start
 from gcs_plugin.fleet import Fleet
 from gcs_plugin.fleetevents import FleetEvent
 from gcs_plugin.links import Link
@@ -17,16 +17,7 @@ from gcs_plugin.mission.items import Mission
 from gcs_plugin.streams import default_rates
 from orthoswarm.errors import OrthoSwarmError
 
-_LATE_S = 5.0
 _QUIET_S = 2.2  # two heartbeats: whoever has not been heard by then is not there
-
-
-def late_start(outcome: Outcome, late_s: float) -> Outcome:
-    """A start that came too late for a plan that keeps vehicles apart by time says so."""
-    if late_s <= 0.0:
-        return outcome
-    warning = f"it took off {late_s + _LATE_S:.0f} s later than planned, so the plan's distances do not hold: watch it"
-    return Outcome(True, f"{outcome.text}, but {warning}")
 
 
 class DirectBackend(Backend):
@@ -158,7 +149,7 @@ class DirectBackend(Backend):
                 except OrthoSwarmError as error:
                     outcomes[system] = Outcome(False, str(error))
             self.fleet.poll(0.05 if waiting else 0.2)
-            late = time.monotonic() - started - _LATE_S
+            late = time.monotonic() - started
             for system, job in jobs.items():
                 if job.outcome is not None and system not in outcomes:
                     timed = what == "start" and any(delays.values()) and job.outcome.ok

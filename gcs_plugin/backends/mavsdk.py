@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gcs_plugin.backends.base import ENDED, Backend, Report, Verb
+from gcs_plugin.backends.base import ENDED, Backend, Report, Verb, late_start
 from gcs_plugin.fleetevents import FleetEvent, mission_event
 from gcs_plugin.links import parse_address
 from gcs_plugin.mavlink import Autopilot, Message
@@ -159,9 +159,11 @@ class MavsdkBackend(Backend):
                 except OrthoSwarmError as error:
                     outcomes[system] = Outcome(False, str(error))
             self._pump(0.05)
+            late = time.monotonic() - began
             for system, job in jobs.items():
-                if job.outcome is not None:
-                    outcomes.setdefault(system, job.outcome)
+                if job.outcome is not None and system not in outcomes:
+                    timed = verb == "start" and any(delays.values()) and job.outcome.ok
+                    outcomes[system] = late_start(job.outcome, late - delays[system]) if timed else job.outcome
             report(verb, len(outcomes), len(delays))
         return outcomes
 
