@@ -94,6 +94,7 @@ def used(folder):
     return sum(f.stat().st_blocks * 512 for f in folder.rglob("*") if f.is_file())
 
 
+@pytest.mark.slow
 def test_a_mosaic_on_a_full_disk_says_so_and_goes_on_when_there_is_room(small_disk, photos):
     disk = small_disk(200)
     first = mosaic(photos, disk / "roomy")
@@ -153,6 +154,7 @@ def test_a_daemon_on_a_full_disk_refuses_pictures_and_takes_them_when_there_is_r
     assert not [p for p in (disk / "w").rglob("*") if p.suffix == ".part"]
 
 
+@pytest.mark.slow
 def test_a_folder_whose_daemon_has_no_room_is_read_when_there_is(small_disk, photos, tmp_path):
     disk, card = small_disk(110), tmp_path / "card"
     card.mkdir()

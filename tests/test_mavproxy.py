@@ -114,6 +114,7 @@ def init(mpstate):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
     lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))

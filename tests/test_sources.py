@@ -234,6 +234,7 @@ def timed(data: bytes, time_s: float) -> bytes:
     return out.getvalue()
 
 
+@pytest.mark.slow
 def test_a_card_read_after_landing_and_a_restart_gets_its_poses_from_the_link(tmp_path):
     """Photos that know their time only, and a video that knows when it began: the daemon's own log has the poses."""
     from tests.daemon_kit import Shot
