@@ -18,6 +18,8 @@ from telemetry.photos import PhotoTags
 Array = NDArray[np.float64]
 
 _ASTRAY_M = 100.0
+_LOW_SHARE = 0.4
+"""A picture taken below this part of the usual height shows too little ground to be followed."""
 _FOV_GUESS_RAD = math.radians(70.0)
 
 
@@ -37,6 +39,7 @@ def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicl
         _missing_numbers(frames),
         _spacing(frames, ground, legs),
         _one_height(frames),
+        _low(frames),
     ]
     return [Finding(f.code, f.message, vehicle, f.note) for f in found if f is not None]
 
@@ -196,3 +199,19 @@ def _one_height(frames: Sequence[Frame]) -> Finding | None:
 def courses_of(frames: Sequence[Frame]) -> Array:
     """Course over ground (N,) of frames in degrees, NaN in turns."""
     return courses_deg(track_of(frames))
+
+
+def _low(frames: Sequence[Frame]) -> Finding | None:
+    """A few pictures from far below the others: takeoff, landing, a look at something."""
+    heights = np.array([np.nan if f.fix.height_m is None else f.fix.height_m for f in frames])
+    if np.isnan(heights).mean() > 0.5:
+        return None
+    usual = float(np.nanmedian(heights))
+    low = np.flatnonzero(heights < _LOW_SHARE * usual)
+    if not 0 < len(low) <= 0.2 * len(frames):
+        return None
+    text = (
+        f"{plural(len(low), 'picture')} taken at {np.nanmin(heights):.0f} m, the others at {usual:.0f} m "
+        f"({frames[int(low[0])].image} first)"
+    )
+    return Finding("low", text)

@@ -293,3 +293,9 @@ def test_of_a_multispectral_camera_one_band_is_mapped(tmp_path):
     assert [f.image for f in result.frames] == [f"IMG_{i:04d}_1.jpg" for i in range(3)]
     assert len(result.rejected) == 6
     assert "spectral band" in result.rejected[0].reason
+
+
+def test_a_picture_from_far_below_the_others_is_named(tmp_path):
+    for i in range(8):
+        photo(tmp_path / f"p{i}.JPG", 47.5 + 1e-4 * i, second=2 * i, yaw=0.0, height=5.0 if i == 4 else 120.0)
+    assert any("1 picture taken at 5 m, the others at 120 m (p4.JPG first)" in w for w in load([tmp_path]).warnings)

@@ -46,6 +46,7 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         turning = flight.leg[a] != flight.leg[b]  # a straight line means nothing there
         believed = a == b or turning or gap < max(4.0, 0.3 * step)  # a == b: at an end
         adj.rig.position[i] = follows if believed else straight
+        adj.rig.position[i, 2] = follows[2]  # receivers err sideways; a height far from the others' is meant
         near = a if i - a <= b - i else b
         turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
         adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
