@@ -119,13 +119,14 @@ def serve(settings: "Settings") -> int:
             print(f"token: {token}", flush=True)
         else:
             print(f"token: in {settings.token_file or settings.workspace / 'token'}", flush=True)
+        server = uvicorn.Server(config)
 
-        class Server(uvicorn.Server):
-            def handle_exit(self, sig: int, frame: object) -> None:
-                """End at a signal, and do not raise it again: the daemon has to be closed, too."""
-                self.force_exit, self.should_exit = self.should_exit, True
+        def end(*_: object) -> None:
+            """End at a signal, at once at the second, and do not raise it again: the daemon has to be closed, too."""
+            server.force_exit, server.should_exit = bool(server.should_exit), True
 
-        Server(config).run(sockets=[listener])
+        server.handle_exit = end
+        server.run(sockets=[listener])
     if any(thread.name.startswith(STREAM_THREAD) for thread in threading.enumerate()):
         logging.shutdown()  # a dead stream keeps its reader inside a library; everything else is closed
         sys.stdout.flush()
