@@ -391,7 +391,12 @@ class _Batch:
             stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
             write_frames(self.out, stated, list(state.rejected.values()), state.grid, z)
             report = self.report(state, placed, refinement.fine if refinement else [], z)
-            write_page(self.out, report, stated, list(state.rejected.values()), state.basemap)
+            left_out = list(state.rejected.values())
+            try:
+                write_page(self.out, report, stated, left_out, state.basemap)
+            except InputError as error:  # a map that is damaged where only the report's pictures read it
+                report["warnings"].append(f"the report's pictures are without the map: {error}")
+                write_page(self.out, report, stated, left_out, None)
         wall, cpu, memory = self.clock.totals()
         report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
         report["stages"].append(stage_row(stage))

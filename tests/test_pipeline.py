@@ -328,3 +328,16 @@ def test_the_command_prints_one_json_document(flight, tmp_path, capsys):
     printed = capsys.readouterr()
     assert json.loads(printed.out)["frames"]["used"] == 16
     assert "reading photos" in printed.err
+
+
+def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone(flight, tmp_path, monkeypatch):
+    _, _, folder = flight
+
+    def damaged(*_):
+        raise InputError("the basemap map.tif is damaged; copy or export it again")
+
+    monkeypatch.setattr("orthoswarm.basemap.Basemap.rgb", damaged)
+    photos, out = folder / "photos" / "b", tmp_path / "out"
+    report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
+    assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])
+    assert {p.name for p in out.iterdir()} >= {"report.html", "report.json", "frames.jsonl"}
