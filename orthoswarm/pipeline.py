@@ -257,8 +257,11 @@ class _Batch:
         """coarse.tif and orthoimage.tif; gives the frames as last placed."""
         if refinement is None:
             placed = state.recorded.placed
-            with self.clock.stage("final: orthoimage", len(placed)):
-                stats = self.draw(ORTHOIMAGE, placed, Terrain.flat(), state)
+            name = ORTHOIMAGE if self.options.until == "fine" else COARSE
+            with self.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
+                stats = self.draw(name, placed, Terrain.flat(), state)
+            if name == ORTHOIMAGE:
+                self.copy_coarse(state)
             state.drawn = (stats.drawn_m2, stats.covered_share)
             self.leave_out(state, stats.rejected, placed)
             return [p for p in placed if p.frame.image not in state.rejected]
@@ -385,7 +388,7 @@ class _Batch:
     def finish(self, state: _State, placed: list[PlacedFrame], refinement: _Refinement | None) -> dict[str, Any]:
         """frames.jsonl, footprints and the report."""
         for name in PRODUCTS:  # of an earlier run with other options
-            if name not in self.made(refinement, state.fault is not None):
+            if name not in self.made(state.fault is not None):
                 (self.out / name).unlink(missing_ok=True)
         with self.clock.stage("final: report", len(placed)) as stage:
             stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
@@ -403,11 +406,11 @@ class _Batch:
         write_json(self.out / "report.json", report)
         return report
 
-    def made(self, refinement: _Refinement | None, faulty: bool) -> set[str]:
+    def made(self, faulty: bool) -> set[str]:
         names = set(PRODUCTS)
         if self.options.until != "fine" or faulty:
             names.discard(ORTHOIMAGE)
-        if self.options.until == "realtime" or refinement is None:
+        if self.options.until == "realtime" or faulty:
             names.discard(COARSE)
         return names
 

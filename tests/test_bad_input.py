@@ -119,6 +119,10 @@ def test_many_photos_of_one_spot(scene, basemap, tmp_path, mosaic):
     assert code == 0 and report["frames"]["used"] + report["frames"]["rejected"] == 40
     assert report["frames"]["used"] >= 1
     assert np.median(errors(scene, rows, shots)) < 12.0
+    out = tmp_path / "out"
+    assert (out / "coarse.tif").read_bytes() == (out / "orthoimage.tif").read_bytes()
+    assert mosaic(tmp_path / "photos", fov_min=80, until="coarse")[0] == 0
+    assert (out / "coarse.tif").exists() and not (out / "orthoimage.tif").exists()
 
 
 def test_a_frame_near_the_ground_among_high_ones(scene, basemap, tmp_path, mosaic):

@@ -16,6 +16,7 @@ from orthoswarm.export import cog
 from orthoswarm.extent import from_takeoff, ground_level
 from orthoswarm.pipeline import PRODUCTS, Options, run
 from orthoswarm.recorded import recorded_cameras
+from orthoswarm.report.page import write_page
 from orthoswarm.vehicles import legs_as_vehicles
 from orthoswarm.workers import Processes, Serial
 from orthoswarm.workspace import Workspace
@@ -333,10 +334,12 @@ def test_the_command_prints_one_json_document(flight, tmp_path, capsys):
 def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone(flight, tmp_path, monkeypatch):
     _, _, folder = flight
 
-    def damaged(*_):
-        raise InputError("the basemap map.tif is damaged; copy or export it again")
+    def page(out, report, placed, rejected, basemap):
+        if basemap is not None:
+            raise InputError("the basemap map.tif is damaged; copy or export it again")
+        write_page(out, report, placed, rejected, None)
 
-    monkeypatch.setattr("orthoswarm.basemap.Basemap.rgb", damaged)
+    monkeypatch.setattr("orthoswarm.pipeline.write_page", page)
     photos, out = folder / "photos" / "b", tmp_path / "out"
     report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
     assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])
