@@ -406,7 +406,8 @@ def _line(row: dict[str, Any]) -> str:
     program = PROGRAMS.get(row["program"])
     name = program.title if program else "true poses (the ceiling)"
     if program and program.packages and row.get("version"):
-        name += f" {row['version']}"
+        head, comma, rest = name.partition(",")
+        name = f"{head} {row['version']}{comma}{rest}"
     thin = f", 1 of {row['every']} photos" if row["every"] > 1 else ""
     used = row.get("used")
     figures = row if "median_m" in row else row.get("shape") or {}
