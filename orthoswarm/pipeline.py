@@ -23,7 +23,7 @@ from orthoswarm.dem import check_dem, read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.partial import disk_error, written_whole
-from orthoswarm.extent import drawn_window, from_takeoff, ground_level, partial_cover, placed_bounds
+from orthoswarm.extent import drawn_window, from_takeoff, ground_level, map_offset, partial_cover, placed_bounds
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
@@ -271,6 +271,7 @@ class _Batch:
             self.leave_out(state, reasons, state.recorded.placed)
             state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
         on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
+        state.warnings += map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
         with_map = state.basemap is not None and self.options.until == "fine"
         if with_map and not on_map:
             state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
