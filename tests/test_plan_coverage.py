@@ -351,3 +351,20 @@ def test_ways_around_zones_are_free_and_as_short_as_a_dense_search_finds(seed):
         first = np.hypot(*(others - p).T) + np.where(router.blocked(np.tile(p, (150, 1)), others), np.inf, 0)
         last = np.hypot(*(others - q).T) + np.where(router.blocked(others, np.tile(q, (150, 1))), np.inf, 0)
         assert length <= (first + last).min() + 1e-6
+
+
+def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep_the_endurance():
+    """Between many zones turns and detours are most of a flight, and the cut knows them only roughly."""
+
+    def zone(i, j):
+        radius, corners = 30 + (7 * i + 3 * j) % 20, 7 + (i + j) % 4
+        angles = 2.0 * np.pi * np.arange(corners) / corners
+        return np.stack([100 + 150 * i + radius * np.cos(angles), 100 + 150 * j + radius * np.sin(angles)], 1)
+
+    holes = [zone(i, j) for i in range(5) for j in range(5)]
+    area = make_area([on_globe([(0, 0), (800, 0), (800, 800), (0, 800)], holes)])
+    start = tuple(on_globe([(-50.0, -50.0)]).shell[0])
+    options = Options(starts=[start], endurance_s=660.0, clearance_m=10.0)
+    plan = plan_area(area, 4, 40.0, footprint(40.0, np.radians(60.0)), "columns", options)
+    assert plan.covered_share >= 0.999
+    assert max(sortie.time_s for vehicle in plan.vehicles for sortie in vehicle.sorties) <= 660.0

@@ -203,7 +203,7 @@ class Crew:
         """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
         options, limits, least = self._options, self._limits, self._least_leg_m
         top = options.separation.layers * options.separation.height_m
-        for _ in range(12):
+        for attempt in range(12):
             step = least
             if np.isfinite(limits.endurance_s):
                 step = min(max(limits.endurance_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
@@ -217,9 +217,11 @@ class Crew:
             longest, most = max(f.time_s(options.motion) for f in flights), max(f.items for f in flights)
             if longest <= options.endurance_s and most <= options.most_items:
                 return result
-            # The cut knows turns and detours only roughly: cut again a little shorter.
+            # The cut knows turns and detours only roughly: cut again a little shorter, and by more where that does not
+            # move the cut.
             fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
-            shorter = 0.995 * limits.endurance_s * min(1.0, options.endurance_s / longest)
+            hair = 0.995 - 0.005 * (1.6**attempt - 1.0)
+            shorter = hair * limits.endurance_s * min(1.0, options.endurance_s / longest)
             limits = replace(limits, endurance_s=shorter, most_legs=max(1, fewer))
         raise self._too_short(row, home[None])
 
