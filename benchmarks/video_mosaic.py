@@ -48,7 +48,7 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
         frame, fix = frames[number], frames[number].fix
         return Sample(
             frame.time_s, fix.lat_deg, fix.lon_deg, fix.height_m, fix.altitude_m, degrees(fix.yaw_rad),
-            degrees(fix.pitch_rad), degrees(fix.roll_rad), vehicle=frame.vehicle,
+            degrees(fix.pitch_rad), degrees(fix.roll_rad), degrees(fix.flight_yaw_rad), vehicle=frame.vehicle,
         )  # fmt: skip
 
     add_sei(plain, target, pose)
