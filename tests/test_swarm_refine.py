@@ -11,7 +11,7 @@ import pytest
 
 from orthoswarm.basemap import Basemap
 from orthoswarm.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.geo import GroundGrid, LocalGrid, area_epsg
 from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all, solo
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
@@ -233,3 +233,42 @@ def test_sparse_flights_are_refined_one_at_a_time(real_data, name, fov_deg):
     assert len(solution.placed) == len(frames) and not any(p.weak for p in solution.placed)
     if fov_deg is not None:
         assert abs(solution.fov_deg - fov_deg) < max(0.4, 1.5 * solution.fov_sigma_deg)
+
+
+class Blank:
+    """A map that shows nothing under a box (west, south, east, north)."""
+
+    def __init__(self, basemap, box):
+        self.epsg, self.native_gsd_m, self.bounds = basemap.epsg, basemap.native_gsd_m, basemap.bounds
+        self._basemap, self._box = basemap, box
+
+    def gray(self, bounds, gsd_m):
+        gray, valid = self._basemap.gray(bounds, gsd_m)
+        grid = GroundGrid.around(self.epsg, bounds, gsd_m)
+        at = grid.to_ground(np.stack(np.meshgrid(np.arange(grid.width), np.arange(grid.height)), -1))
+        west, south, east, north = self._box
+        inside = (at[..., 0] > west) & (at[..., 0] < east) & (at[..., 1] > south) & (at[..., 1] < north)
+        return np.where(inside, 0.0, gray).astype(np.float32), valid & ~inside
+
+
+def test_a_vehicle_over_a_hole_of_the_map_is_carried_by_its_mapped_neighbour(scene):
+    vehicles, grid, basemap, truth = scene
+    shift = np.array([14.0, -9.0])  # of the second vehicle's receiver
+    moved = []
+    for frame in vehicles["uav02"]:
+        fix = frame.fix
+        lat, lon = grid.to_geographic(grid.to_grid(fix.lat_deg, fix.lon_deg) + shift)
+        moved.append(replace(frame, fix=replace(fix, lat_deg=float(lat), lon_deg=float(lon))))
+    path = np.array([grid.to_grid(f.fix.lat_deg, f.fix.lon_deg) for f in vehicles["uav02"]])
+    box = (*(path.min(0) - 160.0), *(path.max(0) + 160.0))
+    refiner = SwarmRefiner(grid.epsg, local_origin(grid, vehicles["uav01"]))
+    first = refiner.refine(vehicles["uav01"], [], basemap)
+    alone = refiner.refine(moved, [], Blank(basemap, box))
+    assert {leg.state for leg in alone.legs} == {"failed"} and {p.stage for p in alone.placed} == {"coarse"}
+    assert np.median(errors(alone, truth, grid)) > 12.0
+    carried = refiner.refine(moved, [first], Blank(basemap, box))
+    assert {leg.state for leg in carried.legs} == {"carried"} and {p.stage for p in carried.placed} == {"fine"}
+    error = errors(carried, truth, grid)
+    sigma = np.array([p.sigma_m for p in carried.placed])
+    assert np.median(error) < 1.5 and (error < 3.0 * sigma).all() and sigma.max() < 3.0
+    assert any("neighbours carry it" in w for w in carried.warnings)

@@ -11,7 +11,7 @@ from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.priors import Priors
 from orthoswarm.swarm.rig import Rig, Tracks
 from orthoswarm.swarm.sights import one_per_cell
-from orthoswarm.swarm.state import VehicleState
+from orthoswarm.swarm.state import VehicleState, lies_on_map
 from orthoswarm.swarm.ties import link_legs
 
 Array = NDArray[np.float64]
@@ -24,11 +24,15 @@ MOST_HELD = 2
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Cameras of neighbours that may see a vehicle's ground, as they are: rig and how to read their pictures."""
+    """Cameras of neighbours that may see a vehicle's ground, as they are: rig and how to read their pictures.
+
+    `gray` gives one at working scale, `small` a reduced one.
+    """
 
     rig: Rig
     vehicle: NDArray[np.int32]
     gray: Callable[[int], Gray]
+    small: Callable[[int], Gray]
 
 
 def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | None:
@@ -40,7 +44,8 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     for other in others:
         xy = other.flight.adjustment.rig.position[: len(other.flight.frames), :2]
         near = np.flatnonzero(((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0))[::2]
-        if len(near) and other.on_map == state.on_map:
+        fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
+        if len(near) and fits:
             parts.append((other, near))
     if not parts:
         return None
@@ -54,11 +59,20 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     )
     vehicle = np.concatenate([np.full(len(near), k, np.int32) for k, (_, near) in enumerate(parts)])
     where = [(o, int(i)) for o, near in parts for i in near]
-    return Held(rig, vehicle, lambda j: where[j][0].flight.pictures.gray(where[j][1]))
+    return Held(
+        rig,
+        vehicle,
+        lambda j: where[j][0].flight.pictures.gray(where[j][1]),
+        lambda j: where[j][0].flight.pictures.small(where[j][1]),
+    )
 
 
-def link_to_held(flight: Flight, held: Held, gsd_m: float) -> int:
-    """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended."""
+def link_to_held(flight: Flight, held: Held, gsd_m: float, reach_px: int = 6) -> int:
+    """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended.
+
+    Args:
+        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
+    """
     adj = flight.adjustment
     n = len(adj.rig)
     joint = _joined(adj.rig, held.rig)
@@ -73,7 +87,7 @@ def link_to_held(flight: Flight, held: Held, gsd_m: float) -> int:
         return flight.pictures.gray(i) if i < n else held.gray(i - n)
 
     camera, point, uv, _ = link_legs(
-        joint, adj.points, chosen, seen.camera, leg, candidates, gray, gsd_m, most=MOST_HELD
+        joint, adj.points, chosen, seen.camera, leg, candidates, gray, gsd_m, most=MOST_HELD, reach=reach_px
     )
     if not len(camera):
         return 0

@@ -24,7 +24,7 @@ from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
-from orthoswarm.swarm.state import Stopwatch, VehicleState
+from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.swarm.ties import MapMatches
 from orthoswarm.swarm.weak import steady_weak
 
@@ -208,8 +208,11 @@ def second_pass(
     sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
-    if not state.on_map:
+    if not lies_on_map(state):
         state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours are no better than oneself
+    elif not state.on_map:
+        theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
+        state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
     release(flight)
     if not flight.sparse:
         steady_weak(flight, state.sigma_m)

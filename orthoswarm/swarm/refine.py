@@ -1,6 +1,7 @@
 """The default refiner: one vehicle is the unit, a batch is a loop over it (DESIGN.md section 4, RECIPE.md).
 
-Solo pass of each vehicle -> second pass on a common level with neighbours held -> one terrain.
+Solo pass of each vehicle -> those that the map does not show beside those that it does -> second pass on a common level
+with neighbours held -> one terrain.
 The map's lean is voted over the roofs of all vehicles for the report; ties are ground, which does not lean.
 """
 
@@ -18,12 +19,13 @@ from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.recorded import recorded_cameras
+from orthoswarm.swarm.beside import lay_beside
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.group import Run, common_terrain, local_origin, neighbours_of, pooled_lean, serial
 from orthoswarm.swarm.levels import level_network
 from orthoswarm.swarm.passes import Options, followed, matched, read_frame, second_pass, solo
 from orthoswarm.swarm.sparse_joint import open_sparse_flights
-from orthoswarm.swarm.state import Stopwatch, VehicleState, to_solution
+from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map, to_solution
 from orthoswarm.swarm.units import merge_units, split_units
 
 __all__ = [
@@ -90,13 +92,15 @@ class SwarmRefiner:
         parts = split_units({frames[0].vehicle: frames})
         own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
         others = [state for n in neighbours for state in states_of(n)]
+        own = lay_lost_beside(own, others, self.epsg, self.origin, serial)
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
-        done = []
-        for state, correction in zip(own, network.correction_m, strict=False):
-            item = (state, neighbours_of(state, everyone), float(correction) - anchor)
-            done.append(second_pass(item, basemap=basemap, origin=self.origin))
+        done = list(own)
+        for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # what carries before what is carried
+            beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
+            item = (own[k], beside, float(network.correction_m[k]) - anchor)
+            done[k] = second_pass(item, basemap=basemap, origin=self.origin)
         terrain = _shifted(common_terrain([*done, *others]), self.origin)
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
@@ -138,7 +142,7 @@ def refine_all(
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
     states = _first_passes(split_units(vehicles), basemap, grid, origin, options or Options(), run, progress)
     coarse = [to_solution(s, origin, None, coarse=True) for s in states]
-    states = _second_passes(states, basemap, origin, run, progress)
+    states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
     _level(states)
     terrain = _shifted(common_terrain(states), origin)
     lean = pooled_lean(states)
@@ -173,14 +177,44 @@ def _first_passes(
     return [state for state in states if state is not None]
 
 
+def lay_lost_beside(
+    states: list[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
+) -> list[VehicleState]:
+    """Vehicles that were not found on the map, beside those that were; then those beside them, and so on.
+
+    Args:
+        states: vehicles to place. others: more that may carry them, as they are.
+        epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
+
+    Returns:
+        The states in order, those that could be laid beside others `carried`.
+    """
+    out = list(states)
+    lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
+    task = partial(lay_beside, epsg=epsg, origin=origin)
+    while lost:
+        anchors = [s for s in [*out, *others] if lies_on_map(s)]
+        items = [(k, neighbours_of(out[k], anchors)) for k in lost]
+        items = [(k, near) for k, near in items if near]
+        for (k, _), state in zip(items, run(task, [(out[k], near) for k, near in items]), strict=True):
+            out[k] = state
+        still = [k for k in lost if not out[k].carried]
+        if len(still) == len(lost):
+            break
+        lost = still
+    return out
+
+
 def _second_passes(
     states: list[VehicleState],
     basemap: MapWindow | None,
+    epsg: int,
     origin: Array,
     run: Run,
     progress: Callable[[str, int, int], None] | None,
 ) -> list[VehicleState]:
     """All vehicles again, on a common level, each with its neighbours held as the solo pass left them."""
+    states = lay_lost_beside(states, [], epsg, origin, run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]
@@ -190,6 +224,14 @@ def _second_passes(
         out[k] = state
         if progress:
             progress("joint", done + 1, len(states))
+    carried = [k for k, s in enumerate(states) if lies_on_map(s) and not s.on_map]
+    # Beside neighbours that are done: their pictures hold it, and it cannot be better than they are.
+    items = [(states[k], neighbours_of(states[k], out), float(network.correction_m[k])) for k in carried]
+    for done, (k, state) in enumerate(zip(carried, run(task, items), strict=True)):
+        out[k] = state
+        if progress:
+            progress("joint", len(mapped) + done + 1, len(states))
+    mapped += carried
     # Without a map nobody is right: each vehicle is fitted to those before it, so that seams close without a dance.
     before: list[VehicleState] = []
     for k in sorted(set(range(len(states))) - set(mapped)):

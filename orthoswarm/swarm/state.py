@@ -32,7 +32,8 @@ class VehicleState:
             ground_shift: float64 (2,) what ground points were off by then.
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,).
-        on_map: True if it lies on the map; had_map: if there was one.
+        on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
+            were carry it.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -53,7 +54,13 @@ class VehicleState:
     timings: dict[str, float] = field(default_factory=dict)
     ground_shift: Array = field(default_factory=lambda: np.zeros(2))
     had_map: bool = False
+    carried: bool = False
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
+
+
+def lies_on_map(state: VehicleState) -> bool:
+    """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
+    return state.on_map or getattr(state, "carried", False)  # states that were kept by an earlier version lack it
 
 
 class Stopwatch:
@@ -81,7 +88,7 @@ def to_solution(
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
     rig = state.coarse if coarse else flight.adjustment.rig
-    stage: Stage = "coarse" if coarse or not state.on_map else "fine"
+    stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
     rig = full_resolution(rig, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
     weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else ENOUGH)
@@ -133,7 +140,7 @@ def leg_states(state: VehicleState) -> list[Leg]:
         agree = mine & (np.hypot(*residual.T) < 1.2) if len(residual) == len(mine) else mine
         share = float(agree.sum()) / max(int(mine.sum()), 1)
         matched = state.on_map and int(agree.sum()) >= LEG_TIES and share > 0.4
-        how: LegState = "matched" if matched else ("failed" if state.had_map and not state.on_map else "carried")
+        how: LegState = "matched" if matched else ("failed" if state.had_map and not lies_on_map(state) else "carried")
         sigma = float(np.median(state.sigma_m[members]))
         out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))
     return out
