@@ -279,7 +279,14 @@ class Daemon:
             self.jobs.add("refine", vehicle, sortie, trigger="late")
 
     def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
-        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""
+        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done.
+
+        Many that come after their vehicle was refined (over a slow link) have it refined again.
+        """
+        (count,) = self.journal.rows(LATE, {"vehicle": packed(vehicle), "sortie": sortie})
+        if silent and count["late"] >= FEWEST:
+            self.jobs.add("refine", vehicle, sortie, trigger="late")
+            return
         self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
 
     def _watch_what_came_before(self, watch: LegWatch) -> None:

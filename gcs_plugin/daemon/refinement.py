@@ -5,6 +5,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,8 @@ from orthoswarm.products import finite
 _REACH_M: Final = 400.0
 _DRAWN_S: Final = 3.0
 _QUIET_S: Final = 0.7
-_LATE_S: Final = 6.0
+_MOST_QUIET_S: Final = 3.0
+_LATE_S: Final = 15.0
 Tell = Callable[[float, str], None]
 
 
@@ -90,19 +92,21 @@ class Refinement:
     # -- the parts ------------------------------------------------------------------------------------------------
 
     def _wait_quiet(self, job: Job) -> None:
-        """Pictures that were on their way when the vehicle completed still belong to its sortie."""
-        end, last, since = time.monotonic() + _LATE_S, -1, time.monotonic()
+        """Pictures that were on their way when the vehicle completed still belong to its sortie.
+
+        They are thought to be all there when none has come for longer than they came apart before.
+        """
+        end = time.monotonic() + _LATE_S
         while time.monotonic() < end and not self.stopped():
-            row = self.journal.one(
-                "SELECT COUNT(*) AS n FROM frames WHERE vehicle = ? AND sortie = ?",
+            rows = self.journal.rows(
+                "SELECT arrived FROM frames WHERE vehicle = ? AND sortie = ? ORDER BY seq DESC LIMIT 8",
                 (packed(str(job.vehicle)), job.sortie),
             )
-            count = 0 if row is None else int(row["n"])
-            if count != last:
-                last, since = count, time.monotonic()
-            elif time.monotonic() - since > _QUIET_S:
+            came = [float(row["arrived"]) for row in rows]
+            apart = max((a - b for a, b in pairwise(came)), default=0.0)
+            if came and time.time() - came[0] > min(max(_QUIET_S, apart), _MOST_QUIET_S):
                 return
-            time.sleep(0.1)
+            time.sleep(0.05)
 
     def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
         """Solutions of others whose ground comes near."""

@@ -5,7 +5,8 @@ import { requestTile } from "/static/api.js";
 
 maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
 
-export const COLOURS = ["#1c64b0", "#b0281c", "#2b8a3e", "#8a3ec4", "#c2710c", "#0c8599", "#a61e4d", "#495057"];
+// No green, orange or red: those say how well a leg lies on the map.
+export const COLOURS = ["#1c64b0", "#8a3ec4", "#0c8599", "#d6409f", "#1b2a6b", "#6b4f2a", "#495057", "#4d7ea8"];
 const colours = new Map();
 export const colourOf = (vehicle) => {
   if (!colours.has(vehicle)) colours.set(vehicle, COLOURS[colours.size % COLOURS.length]);
@@ -38,7 +39,8 @@ const STATE = ["match", ["get", "state"], "matched", "#2b8a3e", "carried", "#d97
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": ["get", "colour"], "fill-opacity": 0.12, "fill-outline-color": ["get", "colour"] }],
   ["trails", "line", { "line-color": ["get", "colour"], "line-width": 2, "line-opacity": 0.8 }],
-  ["legs", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.85 }, ["==", ["get", "stage"], "fine"]],
+  ["legs", "line", { "line-color": "#fff", "line-width": 7, "line-opacity": 0.6 }],
+  ["refined", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.9 }, ["==", ["get", "stage"], "fine"], "legs"],
   ["flying", "line", { "line-color": STATE, "line-width": 4, "line-opacity": 0.9, "line-dasharray": [2, 1.2] }, ["!=", ["get", "stage"], "fine"], "legs"],
   ["plan", "line", { "line-color": ["coalesce", ["get", "colour"], "#16202a"], "line-width": ["match", ["get", "kind"], "leg", 3, 1.5] }],
   ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15, "fill-outline-color": "#1c64b0" }],
