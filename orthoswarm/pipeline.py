@@ -7,7 +7,6 @@ import logging
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
@@ -37,7 +36,7 @@ from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_ca
 from orthoswarm.report.page import write_page
 from orthoswarm.stages import Clock, Stage
 from orthoswarm.vehicles import legs_as_vehicles
-from orthoswarm.workers import Workers
+from orthoswarm.workers import Workers, trim_memory
 from orthoswarm.workspace import Workspace, run_key
 
 Array = NDArray[np.float64]
@@ -48,6 +47,7 @@ Load = Callable[[Progress], Ingest]
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
 
+_CANVAS_MB = 48.0
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
 PRODUCTS = (REALTIME, COARSE, ORTHOIMAGE, "frames.jsonl", "footprints.gpkg", "report.json", "report.html")
 
@@ -251,7 +251,10 @@ class _Batch:
         if self.options.refine == "paper":
             state.equation_5 = refined.equation_5()
         strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
-        return _Refinement(strip[0], strip[1], refined.terrain)
+        terrain = refined.terrain
+        del refined  # with the states of all vehicles
+        trim_memory()
+        return _Refinement(strip[0], strip[1], terrain)
 
     def pictures(self, state: _State, refinement: _Refinement | None) -> list[PlacedFrame]:
         """coarse.tif and orthoimage.tif; gives the frames as last placed."""
@@ -307,15 +310,20 @@ class _Batch:
             self.picture(state, COARSE, *coarse)
             self.picture(state, ORTHOIMAGE, *fine)
             return
-        with self.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage, ExitStack() as open_until_done:
-            layers = []
-            for name, (placed, terrain) in ((COARSE, coarse), (ORTHOIMAGE, fine)):
-                canvas = open_until_done.enter_context(self.canvas(name, placed, terrain or Terrain.flat(), state))
-                layers.append(Layer(placed, terrain or Terrain.flat(), canvas, state.gains))
-            drawn = partial(self.progress, "drawing orthoimage")
-            stats = render_layers(layers, run=self.workers.map, progress=drawn)
-            for name, layer in zip((COARSE, ORTHOIMAGE), layers, strict=True):
-                self.write(layer.canvas, name)
+        coarse_ground, fine_ground = coarse[1] or Terrain.flat(), fine[1] or Terrain.flat()
+        with (
+            self.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage,
+            self.canvas(ORTHOIMAGE, fine[0], fine_ground, state) as second,
+        ):
+            with self.canvas(COARSE, coarse[0], coarse_ground, state) as first:
+                layers = [
+                    Layer(coarse[0], coarse_ground, first, state.gains),
+                    Layer(fine[0], fine_ground, second, state.gains),
+                ]
+                drawn = partial(self.progress, "drawing orthoimage")
+                stats = render_layers(layers, run=self.workers.map, progress=drawn)
+                self.write(first, COARSE)
+            self.write(second, ORTHOIMAGE)
         self.space.clear_scratch()
         state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
         self.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
@@ -362,7 +370,7 @@ class _Batch:
             reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
             raise OrthoSwarmError(f"no picture can be drawn: {reason}")
         grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
-        return Canvas.create(self.space.scratch(name.removesuffix(".tif")), grid, plane="frame")
+        return Canvas.create(self.space.scratch(name.removesuffix(".tif")), grid, plane="frame", memory_mb=_CANVAS_MB)
 
     def write(self, canvas: Canvas, name: str) -> None:
         """Write a canvas as a COG."""
