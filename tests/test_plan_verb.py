@@ -263,7 +263,7 @@ def test_a_failure_while_writing_leaves_the_old_plan(area, tmp_path, monkeypatch
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(planfiles.Path, "write_bytes", full)
+    monkeypatch.setattr(planfiles.os, "fsync", full)
     assert plan(area, "--vehicles", 3, *FLAGS, "--out", out) == 2
     monkeypatch.undo()
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before
