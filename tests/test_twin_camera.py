@@ -70,7 +70,8 @@ def real(address):
 
 
 PLACES = [
-    pytest.param((simulated, Autopilot.ARDUPILOT), id="simulated-ardupilot"),
+    # minutes of flight; both run with -m slow
+    pytest.param((simulated, Autopilot.ARDUPILOT), id="simulated-ardupilot", marks=pytest.mark.slow),
     pytest.param((simulated, Autopilot.PX4), id="simulated-px4", marks=pytest.mark.slow),
     *[
         pytest.param((real, address), id=f"sitl-{number}", marks=pytest.mark.sitl)
