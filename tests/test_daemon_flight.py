@@ -80,8 +80,9 @@ def test_completion_starts_the_refinement_while_the_others_fly(flown):
     time.sleep(1.5)
     fly(served, "v2", number)
     jobs = served.until("/api/jobs", lambda rows: any(r["kind"] == "refine" and r["state"] == "done" for r in rows))
-    assert jobs[0]["vehicle"] == "v1"
-    assert jobs[0]["detail"]["trigger"] == "complete"
+    first = next(job for job in jobs if job["kind"] == "refine")
+    assert first["vehicle"] == "v1"
+    assert first["detail"]["trigger"] == "complete"
     done = served.until("/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows))
     assert [row["vehicle"] for row in done] == ["v1", "v2"]
     assert done[0]["still_flying"] == ["v2"]

@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -67,7 +68,9 @@ def test_a_lost_link_is_opened_again_until_stopped(marked):
     url = f"tcp://127.0.0.1:{server.getsockname()[1]}"
     for picture in open_stream(url, every_m=20.0, stop=stop, on_state=states.append):
         pictures.append(picture)
-        if len(served) == 2 and picture.sample.lat_deg > pose(30).lat_deg:
+        lat = [p.sample.lat_deg for p in pictures]
+        again = any(after < before for before, after in pairwise(lat))  # the same flight once more
+        if again and lat[-1] > pose(30).lat_deg:
             stop.set()
     thread.join()
     server.close()
