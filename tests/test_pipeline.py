@@ -12,6 +12,7 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli import main
+from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export import cog
 from orthoswarm.extent import from_takeoff, ground_level, map_offset
@@ -358,3 +359,22 @@ def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone
     report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
     assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])
     assert {p.name for p in out.iterdir()} >= {"report.html", "report.json", "frames.jsonl"}
+
+
+def test_a_large_area_is_compared_with_the_map_in_parts(flight, mapped, monkeypatch):
+    from orthoswarm.report import page
+    from orthoswarm.report.pictures import MapView, product_bounds, product_picture, view_grid
+
+    best = mapped[0] / "orthoimage.tif"
+    bounds = product_bounds(best)
+    basemap = Basemap.open(flight[2] / "map.tif", flight[0].grid.epsg, bounds)
+    ortho = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 400, 0.3))
+    there = MapView.read(basemap, ortho.grid)
+    whole = page._shifts(best, ortho, there, basemap, 0.3)
+    monkeypatch.setattr(page, "_FINE_M", 0.6)
+    monkeypatch.setattr(page, "_PART_PX", 160)
+    coarse = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 100, 0.3))
+    assert coarse.grid.gsd_m > 0.6
+    parts = page._shifts(best, coarse, MapView.read(basemap, coarse.grid), basemap, 0.3)
+    assert len(whole.at) > 3 and len(parts.at) > 3
+    assert np.median(parts.size_m) < np.median(whole.size_m) + 0.3

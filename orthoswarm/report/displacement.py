@@ -1,5 +1,6 @@
 """How far the orthoimage lies from the map, block by block, as a user would see it by flickering the two."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,12 @@ class Moved:
     at: Array
     shift: Array
     blocks: int
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Moved]") -> "Moved":
+        """What several parts of the map show, together."""
+        at, shift = ([np.zeros((0, 2)), *(getattr(p, name) for p in parts)] for name in ("at", "shift"))
+        return cls(np.concatenate(at), np.concatenate(shift), sum(p.blocks for p in parts))
 
     @property
     def size_m(self) -> Array:

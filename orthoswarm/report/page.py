@@ -1,5 +1,6 @@
 """report.html: the state of the map in words, its pictures, and the numbers behind them."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from orthoswarm import __version__
 from orthoswarm.basemap import Basemap
 from orthoswarm.frame import Rejection
+from orthoswarm.geo import GroundGrid
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.placement import PlacedFrame
 from orthoswarm.products import write_text
@@ -39,6 +41,7 @@ _STAGES = (
     ("coarse.tif", "Coarse", "pictures adjusted to each other"),
     (ORTHOIMAGE, "Fine", "settled on the pre-disaster map"),
 )
+_FINE_M, _PART_PX = 1.2, 640
 _EDGE = (255, 214, 0)
 _ARROW = (208, 30, 60)
 _LEGS = {"matched": (0, 140, 90), "carried": (240, 150, 0), "failed": (208, 30, 60)}
@@ -73,7 +76,6 @@ def write_page(
     Raises:
         OrthoSwarmError: if the disk is full.
     """
-    import cv2
     import jinja2
 
     best = next((out / name for name, _, _ in reversed(_STAGES) if (out / name).exists()), None)
@@ -92,8 +94,7 @@ def write_page(
         ortho = product_picture(best, view_grid(report["epsg"], product_bounds(best), 2000, least))
         there = None if basemap is None else MapView.read(basemap, ortho.grid)
         if basemap is not None and there is not None:
-            gray = cv2.cvtColor(ortho.rgb, cv2.COLOR_RGB2GRAY)
-            shifts = moved(gray, ortho.seen, there.gray, there.valid, there.grid)
+            shifts = _shifts(best, ortho, there, basemap, least)
             values["edges"] = _edge_crops(best, ortho, there, basemap)
         values |= _pictures(out, ortho, report, placed, there, shifts)
     values["verdict"] = _verdict(report, placed, shifts)
@@ -102,6 +103,32 @@ def write_page(
     values["times"] = charts.times(report["stages"])
     values["legs"] = _leg_summary(report)
     write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
+
+
+def _shifts(best: Path, ortho: Picture, there: MapView, basemap: Basemap, least: float) -> Moved:
+    """Where blocks of the map are found in the orthoimage; of a large area in nine parts of it.
+
+    Pixels of some metres would compare roofs, which lean, and not roads.
+    """
+    if ortho.grid.gsd_m <= _FINE_M:
+        return _moved(ortho, there)
+    west, south, east, north = ortho.grid.bounds
+    gsd = max(least, 0.5 * _FINE_M)
+    half = 0.5 * _PART_PX * gsd
+    parts = []
+    for i, j in itertools.product((1, 3, 5), repeat=2):
+        x, y = west + i / 6 * (east - west), south + j / 6 * (north - south)
+        grid = GroundGrid(ortho.grid.epsg, x - half, y + half, gsd, _PART_PX, _PART_PX)
+        part, its_map = product_picture(best, grid), MapView.read(basemap, grid)
+        if its_map is not None and part.seen.any():
+            parts.append(_moved(part, its_map))
+    return Moved.joined(parts)
+
+
+def _moved(ortho: Picture, there: MapView) -> Moved:
+    import cv2
+
+    return moved(cv2.cvtColor(ortho.rgb, cv2.COLOR_RGB2GRAY), ortho.seen, there.gray, there.valid, there.grid)
 
 
 def _pictures(
