@@ -181,49 +181,41 @@ def strip_and_map(
     return Strip(gray, valid, ground, known, reach, gsd_m, (grid.west - bounds[0], grid.north - bounds[3]))
 
 
-def register(
-    rig: Rig,
-    index: NDArray[np.integer],
-    small: Callable[[int], Gray],
-    basemap: MapWindow,
-    origin: Array,
-    ground_z: float,
-    reach_m: float = 60.0,
-    gsd_m: float = 2.0,
-) -> Match | None:
-    """Find the mosaic of some consecutive pictures on the map by its edges; None where there is nothing to find."""
-    strip = strip_and_map(rig, index, small, basemap, origin, ground_z, reach_m, gsd_m)
-    if strip is None:
-        return None
+Found = tuple[float, float, float, float]
+"""Column and row of a shift in pixels of a strip, peak, and ratio of second peak to peak."""
+
+
+def by_edges(strip: Strip) -> Found | None:
+    """Where a strip lies on its map, by their edges; None where there is nothing to find."""
     moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), 0.7), strip.valid)
     fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), 0.7), strip.known)
-    if np.count_nonzero(moving) < 400:
-        return None
-    dc, dr, peak, ratio = correlate(moving, fixed, strip.reach)
-    return Match(int(index[0]), int(index[-1]), _metres(strip, dc, dr), peak, ratio)
+    return None if np.count_nonzero(moving) < 400 else correlate(moving, fixed, strip.reach)
 
 
-def _metres(strip: Strip, columns: float, rows: float) -> tuple[float, float]:
-    return strip.offset[0] + columns * strip.gsd_m, strip.offset[1] - rows * strip.gsd_m
+def by_learning(strip: Strip) -> Found | None:
+    """The same by learned matching, some seconds a strip: the second opinion where edges find no agreement."""
+    from orthoswarm.matchers.opinion import second_opinion
+
+    shift = second_opinion(strip.gray, strip.valid, strip.ground, strip.known, strip.reach)
+    return None if shift is None else (float(shift[0]), float(shift[1]), 1.0, 0.0)
 
 
-def register_learned(
+def register(
     rig: Rig,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
     basemap: MapWindow,
     origin: Array,
     ground_z: float,
-    reach_m: float,
-    gsd_m: float,
+    reach_m: float = 60.0,
+    gsd_m: float = 2.0,
+    find: Callable[[Strip], Found | None] = by_edges,
 ) -> Match | None:
-    """The same by learned matching, some seconds a strip: the second opinion where edges find no agreement."""
-    from orthoswarm.matchers.opinion import second_opinion
-
+    """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""
     strip = strip_and_map(rig, index, picture, basemap, origin, ground_z, reach_m, gsd_m)
-    if strip is None:
+    found = None if strip is None else find(strip)
+    if strip is None or found is None:
         return None
-    shift = second_opinion(strip.gray, strip.valid, strip.ground, strip.known, strip.reach)
-    if shift is None:
-        return None
-    return Match(int(index[0]), int(index[-1]), _metres(strip, float(shift[0]), float(shift[1])), 1.0, 0.0)
+    columns, rows, peak, ratio = found
+    shift = strip.offset[0] + columns * strip.gsd_m, strip.offset[1] - rows * strip.gsd_m
+    return Match(int(index[0]), int(index[-1]), shift, peak, ratio)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.maptiles import TiledMap
 from orthoswarm.placement import MapWindow
-from orthoswarm.swarm.coarse import Match, register, register_learned
+from orthoswarm.swarm.coarse import Match, by_learning, register
 from orthoswarm.swarm.flight import Flight
 
 Array = NDArray[np.float64]
@@ -73,7 +73,8 @@ def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: floa
     matches = [
         m
         for index in chosen
-        if (m := register_learned(rig, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd)) is not None
+        if (m := register(rig, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd, by_learning))
+        is not None
     ]
     if len(matches) < 2:
         return None
