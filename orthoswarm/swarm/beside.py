@@ -99,7 +99,7 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
         return state
     flight = out.flight
     mosaic = HeldMosaic(held, epsg, origin)
-    fit = coarse_fit(flight, mosaic, origin) or coarse_fit(flight, mosaic, origin, 150.0)
+    fit = coarse_fit(flight, mosaic, origin)
     if fit is None:
         return state
     shift_cameras(flight, fit.correction)

@@ -107,7 +107,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     state = from_flight(flight, surface, origin, None, watch)
     fit = None
     if basemap is not None:
-        fit = coarse_fit(flight, basemap, origin) or coarse_fit(flight, basemap, origin, 150.0)
+        fit = coarse_fit(flight, basemap, origin)
     if fit is not None:
         height = float(np.median(flight.rig().position[:, 2]))
         share = ONE_WAY_SIGMA if one_way else MANY_WAYS_SIGMA

@@ -17,6 +17,7 @@ WINDOW = 25
 SPARSE_WINDOW = 3
 SECOND_LOOK_PICTURES = 16
 SECOND_LOOKS = 5
+REACHES_M = (60.0, 150.0)
 ACROSS_PX = 150
 """A picture's width in pixels of the small mosaics."""
 CONSENSUS_M = 6.0
@@ -40,17 +41,22 @@ class CoarseFit:
     confidence: float
 
 
-def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 60.0) -> CoarseFit | None:
-    """Register windows of each leg; None where no consensus is found."""
+def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """Register windows of each leg near their records, then farther off; None where no consensus is found."""
     rig = flight.rig()
     width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
     gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
+    tiles = TiledMap(basemap, gsd)
+    return next((f for reach in REACHES_M if (f := _fit_within(reach, flight, tiles, origin, gsd)) is not None), None)
+
+
+def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+    rig = flight.rig()
     windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
-    basemap = TiledMap(basemap, gsd)
     matches = [
         m
         for index in windows
-        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd)) is not None
+        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m)) is not None
     ]
     if not matches:
         return None

@@ -139,7 +139,7 @@ def relative(flight: Flight) -> GroundModel:
 
 def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
     flight = state.flight
-    fit = coarse_fit(flight, basemap, origin) or coarse_fit(flight, basemap, origin, 150.0)
+    fit = coarse_fit(flight, basemap, origin)
     if fit is None:
         fit = second_look(flight, basemap, origin)
     watch.lap("coarse registration")
