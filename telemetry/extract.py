@@ -16,7 +16,7 @@ from telemetry.picks import Candidate, Picker
 from telemetry.picturecache import Kept, Taken, key_of, recall, remember
 from telemetry.poses import Pose, Poses
 from telemetry.sample import Sample
-from telemetry.video import VideoScan, demux, open_video, scan
+from telemetry.video import VideoScan, demux, open_video, parked, scan
 
 JPEG_QUALITY = 95
 _ZOOM_STEP = 0.03
@@ -70,25 +70,26 @@ def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tupl
         context = stream.codec_context
         context.thread_type = "AUTO"
         context.flags |= int(Flags.copy_opaque)
-        number, index = 0, 0
-        for packet in demux(container, [stream]):
-            if packet.size:
-                packet.opaque = index
-                index += 1
-            try:
-                frames = packet.decode()
-            except (av.error.FFmpegError, ValueError):
-                if counter is not None:
-                    counter[0] += 1
-                continue
-            for frame in frames:
-                own = frame.opaque if isinstance(frame.opaque, int) else None
-                if own is None and frame.pts is not None:
-                    own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
-                if own is not None and rank is not None and own < len(rank):
-                    number = max(number, rank[own])  # pictures that were lost keep their numbers
-                yield number, own, frame
-                number += 1
+        with parked(context):
+            number, index = 0, 0
+            for packet in demux(container, [stream]):
+                if packet.size:
+                    packet.opaque = index
+                    index += 1
+                try:
+                    frames = packet.decode()
+                except (av.error.FFmpegError, ValueError):
+                    if counter is not None:
+                        counter[0] += 1
+                    continue
+                for frame in frames:
+                    own = frame.opaque if isinstance(frame.opaque, int) else None
+                    if own is None and frame.pts is not None:
+                        own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
+                    if own is not None and rank is not None and own < len(rank):
+                        number = max(number, rank[own])  # pictures that were lost keep their numbers
+                    yield number, own, frame
+                    number += 1
 
 
 def _presentation_rank(found: VideoScan) -> list[int] | None:

@@ -19,7 +19,7 @@ from telemetry.extract import to_rgb
 from telemetry.picks import Candidate, Picker
 from telemetry.sample import Sample
 from telemetry.timeline import Timeline
-from telemetry.video import NotAVideo, open_video
+from telemetry.video import NotAVideo, open_video, parked
 
 _HELD_S = 0.5
 _KEPT_SAMPLES = 64
@@ -131,34 +131,35 @@ def _read(
     beside: deque[Sample] = deque(maxlen=_KEPT_SAMPLES)
     source = container.demux(*wanted)
     now_s = 0.0
-    while not stop.is_set():
-        try:
-            packet = next(source)
-            is_video = packet.stream is stream
-            if packet.size and packet.pts is not None:
-                seconds = float(packet.pts * packet.time_base)
-                now_s = seconds if is_video else now_s
-            else:
-                seconds = now_s
-            if not is_video:
-                beside.extend(
-                    replace(p.sample, time_s=seconds)
-                    for p in klv.packets(bytes(packet))
-                    if p.sample is not None and p.sample.has_position
+    with parked(context):
+        while not stop.is_set():
+            try:
+                packet = next(source)
+                is_video = packet.stream is stream
+                if packet.size and packet.pts is not None:
+                    seconds = float(packet.pts * packet.time_base)
+                    now_s = seconds if is_video else now_s
+                else:
+                    seconds = now_s
+                if not is_video:
+                    beside.extend(
+                        replace(p.sample, time_s=seconds)
+                        for p in klv.packets(bytes(packet))
+                        if p.sample is not None and p.sample.has_position
+                    )
+                    continue
+                packet.opaque = (
+                    None if form is None or not packet.size else sei.read(bitstream.sei_messages(bytes(packet), form))
                 )
+                frames = packet.decode()
+            except StopIteration:
+                return
+            except (av.error.InvalidDataError, ValueError):
                 continue
-            packet.opaque = (
-                None if form is None or not packet.size else sei.read(bitstream.sei_messages(bytes(packet), form))
-            )
-            frames = packet.decode()
-        except StopIteration:
-            return
-        except (av.error.InvalidDataError, ValueError):
-            continue
-        except (av.error.FFmpegError, OSError) as error:
-            raise _Lost(str(getattr(error, "strerror", None) or error).lower()) from None
-        for frame in frames:
-            yield from _offer(frame, beside, picker, next(numbers), now_s, clock)
+            except (av.error.FFmpegError, OSError) as error:
+                raise _Lost(str(getattr(error, "strerror", None) or error).lower()) from None
+            for frame in frames:
+                yield from _offer(frame, beside, picker, next(numbers), now_s, clock)
 
 
 def _offer(

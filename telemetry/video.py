@@ -5,6 +5,7 @@ subtitle track. `telemetry.poses` makes one pose for each picture of it.
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,20 @@ def open_video(path: Path | str, **options: Any) -> Any:
         container.close()
         raise NotAVideo("the file holds no pictures; name a video")
     return container
+
+
+@contextmanager
+def parked(context: Any) -> Iterator[None]:
+    """Empty a decoder that carries `opaque` objects before it is freed.
+
+    PyAV frees such an object with the interpreter's lock held, in whichever thread lets go of it last, and frees a
+    decoder, which waits for the decoder's threads, holding the same lock: neither would ever end. Emptied, the threads
+    hold nothing more.
+    """
+    try:
+        yield
+    finally:
+        context.flush_buffers()
 
 
 def _reason(error: Exception) -> str:
