@@ -82,7 +82,7 @@ def open_stream(
     attempt = 0
     while not stop.is_set():
         try:
-            with open_video(url, timeout=timeout_s, options=_options(url, options)) as container:
+            with open_video(url, timeout=timeout_s, options=_options(url, timeout_s, options)) as container:
                 attempt = 0
                 if on_state is not None:
                     on_state("open")
@@ -106,9 +106,11 @@ class _Lost(Exception):
     """The link broke."""
 
 
-def _options(url: str, given: Mapping[str, str] | None) -> dict[str, str]:
+def _options(url: str, timeout_s: float, given: Mapping[str, str] | None) -> dict[str, str]:
     # Not "nobuffer": it throws away what was read while probing, and with it the first key picture.
     options = {"flags": "low_delay", "analyzeduration": "1000000", "probesize": "1000000"}
+    if "://" in url:  # PyAV's own timeout is off while streams are looked for
+        options["rw_timeout"] = str(round(timeout_s * 1e6))
     if url.startswith("rtsp"):
         options["rtsp_transport"] = "tcp"
     elif url.startswith("udp"):

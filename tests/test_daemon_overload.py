@@ -85,16 +85,23 @@ def test_a_full_queue_lets_go_of_what_shows_least():
     assert queue.put(pending(5, 1.0)).seq == 5
 
 
+def wait_until(done):
+    end = time.monotonic() + 60
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr("gcs_plugin.daemon.drawing._IN_MEMORY", 12)
     monkeypatch.setattr("gcs_plugin.daemon.drawing._LATE_S", 0.2)
     monkeypatch.setattr("gcs_plugin.daemon.drawing._LOOK_S", 0.05)
-    slow = threading.Event()
+    in_time, may_read = threading.Event(), threading.Semaphore(0)
     read = __import__("orthoswarm.picture", fromlist=["read_rgba"]).read_rgba
 
     def slowly(path):
-        if not slow.is_set():
-            time.sleep(0.05)
+        if not in_time.is_set():
+            assert may_read.acquire(timeout=120)
         return read(path)
 
     monkeypatch.setattr("gcs_plugin.daemon.drawing.read_rgba", slowly)
@@ -116,12 +123,14 @@ def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path, monkeypatch)
             time.time(), 1,
         )  # fmt: skip
         assert drawer.backlog <= 12
-    end = time.monotonic() + 60
-    while not drawer.overload:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+        if k % 15 == 14:  # two of each place are drawn before those of the next come, however fast the machine is
+            may_read.release(2)
+            wait_until(lambda place=k // 15: drawer.drawn >= 2 * (place + 1))
+    may_read.release()
+    wait_until(lambda: drawer.overload or may_read.release())
     assert "safe on the disk" in drawer.overload
-    slow.set()
+    in_time.set()
+    may_read.release(100)
     assert drawer.wait_idle(60)
     drawer.close()
     rows = journal.rows("SELECT seq, drawn, reason FROM frames")

@@ -4,6 +4,7 @@ import socket
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,7 +43,7 @@ def test_a_stream_over_tcp(marked):
         with connection:
             connection.sendall(marked.read_bytes())
 
-    thread = threading.Thread(target=serve)
+    thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     url = f"tcp://127.0.0.1:{server.getsockname()[1]}"
     pictures = list(open_stream(url, all_pictures=True, reconnect=False))
@@ -53,18 +54,18 @@ def test_a_stream_over_tcp(marked):
 
 def test_a_lost_link_is_opened_again_until_stopped(marked):
     server = socket.create_server(("127.0.0.1", 0))
-    served = []
+    server.settimeout(0.2)
 
     def serve() -> None:
-        for _ in range(2):
-            connection, _ = server.accept()
-            with connection:
-                connection.sendall(marked.read_bytes())
-            served.append(1)
+        while not stop.is_set():
+            with suppress(TimeoutError, ConnectionError):
+                connection, _ = server.accept()
+                with connection:
+                    connection.sendall(marked.read_bytes())
 
-    thread = threading.Thread(target=serve)
-    thread.start()
     stop, states, pictures = threading.Event(), [], []
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
     url = f"tcp://127.0.0.1:{server.getsockname()[1]}"
     for picture in open_stream(url, every_m=20.0, stop=stop, on_state=states.append):
         pictures.append(picture)
@@ -95,7 +96,7 @@ def test_a_stream_over_udp(marked):
                     if stop.wait(0.002):
                         return
 
-    thread = threading.Thread(target=send)
+    thread = threading.Thread(target=send, daemon=True)
     thread.start()
     pictures = []
     for picture in open_stream(f"udp://127.0.0.1:{port}", all_pictures=True, stop=stop, reconnect=False):
