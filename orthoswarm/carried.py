@@ -18,6 +18,7 @@ FEWEST = 3
 _NEIGHBOURS = 5
 _EXTRA_SIGMA_M = 2.0
 _SPOT_SHARE = 0.05
+_WANDER_SHARE, _WANDER_STEPS, _WANDER_FEWEST = 0.3, 0.9, 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +62,27 @@ def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
 
 
 def hovering(recorded: Sequence[PlacedFrame]) -> set[str]:
-    """Vehicles with several pictures that were all taken at one spot."""
+    """Vehicles with several pictures, in order of time, that were all taken at one spot."""
     members: dict[str, list[PlacedFrame]] = {}
     for p in recorded:
         members.setdefault(p.frame.vehicle, []).append(p)
     out = set()
     for vehicle, own in members.items():
         positions = np.array([p.camera.position for p in own])
-        spread = np.subtract(*np.percentile(positions, [95, 5], axis=0))
-        if len(own) > FEWEST and np.hypot(*spread[:2]) < _SPOT_SHARE * float(np.median(positions[:, 2])):
+        if len(own) > FEWEST and _stands(positions):
             out.add(vehicle)
     return out
+
+
+def _stands(positions: NDArray[np.float64]) -> bool:
+    """Whether a path (N, 3) is one spot, or a receiver's noise about one: steps as long as the whole is wide."""
+    spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
+    height = float(np.median(positions[:, 2]))
+    if spread < _SPOT_SHARE * height:
+        return True
+    wide = float(np.sqrt(((positions[:, :2] - positions[:, :2].mean(0)) ** 2).sum(1).mean()))
+    steps = float(np.sqrt((np.diff(positions[:, :2], axis=0) ** 2).sum(1).mean()))
+    return len(positions) >= _WANDER_FEWEST and spread < _WANDER_SHARE * height and steps > _WANDER_STEPS * wide
 
 
 def carry(

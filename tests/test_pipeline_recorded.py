@@ -111,3 +111,10 @@ def test_pictures_of_one_spot_are_known():
     frames = [frame(i, 0.3 * (i % 2), 0.2 * (i % 3)) for i in range(9)]
     frames += [frame(i, 0, 20.0 * i, vehicle="b") for i in range(9)] + [frame(0, 50, 50, vehicle="c")]
     assert hovering(recorded_cameras(frames, GRID).placed) == {"a"}
+
+
+def test_a_receiver_that_wanders_about_one_spot_is_no_flight():
+    rng = np.random.default_rng(4)
+    frames = [frame(i, *rng.normal(0.0, 2.0, 2)) for i in range(20)]
+    frames += [frame(i, 0.0, 0.8 * i, vehicle="b") for i in range(20)]  # slow, but it flies
+    assert hovering(recorded_cameras(frames, GRID).placed) == {"a"}

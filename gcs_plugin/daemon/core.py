@@ -18,9 +18,9 @@ from gcs_plugin.daemon.events import Events
 from gcs_plugin.daemon.flock import Flock, completion_rows, note_completion
 from gcs_plugin.daemon.ground import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.jobs import Job, Jobs
-from gcs_plugin.daemon.journal import LATE, Change, Journal, add_frame, packed, unpacked
+from gcs_plugin.daemon.journal import Change, Journal, add_frame, late_frames, packed, unpacked
 from gcs_plugin.daemon.layers import NAMES, Area, Layer
-from gcs_plugin.daemon.legwatch import FEWEST, LegWatch
+from gcs_plugin.daemon.legwatch import LegWatch
 from gcs_plugin.daemon.plans import Plans
 from gcs_plugin.daemon.pose import PostedPose, frame_of
 from gcs_plugin.daemon.press import Press
@@ -92,7 +92,7 @@ class Daemon:
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
         )
         self.jobs.on_end(self._after_job)
-        self.legwatch = LegWatch(self._leg_over) if settings.coarse else None
+        self.legwatch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
         self.plans = Plans(folder / "plans")
         self.flock: Flock | None = None
@@ -120,9 +120,8 @@ class Daemon:
         self.drawer.start()
         self.jobs.start()
         threading.Thread(target=self.crew.warm_up, daemon=True).start()
-        if self.legwatch is not None:
-            self._watch_what_came_before(self.legwatch)
-            self.legwatch.start()
+        self._watch_what_came_before()
+        self.legwatch.start()
         if self.flock is not None:
             self.flock.start()
         for source in self.sources:
@@ -132,8 +131,7 @@ class Daemon:
         """Stop; what is under way goes on at the next start."""
         self.jobs.give_up()
         self._close_sources()
-        if self.legwatch is not None:
-            self.legwatch.close()
+        self.legwatch.close()
         if self.flock is not None:
             self.flock.close()
         self.crew.close()
@@ -192,8 +190,7 @@ class Daemon:
             sortie = self.sortie(pose.vehicle)
             self.posted[pose.vehicle] += 1
             self.drawer.add(seq, frame, time.time(), sortie)
-            if self.legwatch is not None:
-                self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+            self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
             if self.posted[pose.vehicle] == _FEW:
                 self.crew.warm_kernels()
                 self.background.warm_up()
@@ -273,24 +270,26 @@ class Daemon:
 
     def _card_read(self, vehicle: str) -> None:
         """A card was read after landing: a sortie that was complete before is refined with what its camera kept."""
-        sortie = self.sortie(vehicle)
-        (count,) = self.journal.rows(LATE, {"vehicle": packed(vehicle), "sortie": sortie})
-        if count["late"] >= FEWEST or 0 < count["late"] == count["frames"]:
+        self._refine_late(vehicle, self.sortie(vehicle))
+
+    def _refine_late(self, vehicle: str, sortie: int) -> None:
+        """Pictures that came after their vehicle was refined (over a slow link) are laid beside the others."""
+        waits = self.journal.one(
+            "SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = ? AND sortie = ? AND state = 'queued'",
+            (packed(vehicle), sortie),
+        )
+        if waits is None and late_frames(self.journal, vehicle, sortie):
             self.jobs.add("refine", vehicle, sortie, trigger="late")
 
     def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
-        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done.
+        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""
+        if self.settings.coarse:
+            self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
 
-        Many that come after their vehicle was refined (over a slow link) have it refined again.
-        """
-        (count,) = self.journal.rows(LATE, {"vehicle": packed(vehicle), "sortie": sortie})
-        if silent and count["late"] >= FEWEST:
-            self.jobs.add("refine", vehicle, sortie, trigger="late")
-            return
-        self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
-
-    def _watch_what_came_before(self, watch: LegWatch) -> None:
-        """Pictures that no leg was made of before the last end of the daemon."""
+    def _watch_what_came_before(self) -> None:
+        """Pictures of which nothing was made before the last end of the daemon."""
+        for row in self.journal.rows("SELECT DISTINCT vehicle, sortie FROM completions"):
+            self._refine_late(unpacked(row["vehicle"]), int(row["sortie"]))
         rows = self.journal.rows(
             "SELECT vehicle, sortie, time, arrived, pose FROM frames WHERE stage = 'realtime' AND reason IS NULL"
             " AND NOT EXISTS (SELECT 1 FROM completions c WHERE c.vehicle = frames.vehicle"
@@ -299,7 +298,7 @@ class Daemon:
         for row in rows:
             pose = json.loads(row["pose"])
             time_s = row["arrived"] if row["time"] is None else row["time"]
-            watch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
+            self.legwatch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
 
     def _make_way(self, vehicle: str, layer: str | None) -> None:
         """A refinement begins, or needs a layer: coarse work stands aside."""
@@ -319,7 +318,7 @@ class Daemon:
             self.jobs.add("export", formats=["cog", "gpkg"])
 
     def _note_refined(self, job: Job) -> None:
-        if job.state != "done" or job.vehicle is None:
+        if job.state != "done" or job.vehicle is None or "published_s" not in job.detail or "beside" in job.detail:
             return
         facts = {
             "refine_started_s": job.detail["refine_started_s"], "refine_ended_s": job.detail["published_s"],

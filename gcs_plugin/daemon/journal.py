@@ -255,13 +255,20 @@ class Drawn:
     thumbnail: bytes | None = None
 
 
-LATE: Final = """
-SELECT COUNT(*) AS frames, COALESCE(SUM(arrived > COALESCE((SELECT MAX(started) FROM jobs
-    WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie), 0)), 0) AS late
-FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
-    AND EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
+_LATE: Final = """
+SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
+    AND arrived > COALESCE((SELECT MAX(COALESCE(json_extract(detail, '$.refine_started_s'), started)) FROM jobs
+        WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie AND id != :job), 0)
+    AND (EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
+        OR EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie
+            AND detail LIKE '%"trigger": "lost"%'))
 """
-"""Frames of a sortie that is complete (0 of another one), and how many of them its last refinement has not seen."""
+
+
+def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0) -> int:
+    """How many frames of a sortie its last refinement, other than a job's, has not seen; 0 while it is flown."""
+    row = journal.rows(_LATE, {"vehicle": packed(vehicle), "sortie": sortie, "job": job})[0]
+    return int(row["late"])
 
 
 def frames_drawn(results: Iterable[Drawn]) -> Change:

@@ -1,4 +1,7 @@
-"""Notices, while vehicles fly, when a leg is over, and asks for its coarse map; cheap enough for every frame."""
+"""Notices, while vehicles fly, when a leg is over, and asks for its coarse map; cheap enough for every frame.
+
+It notices, too, when a vehicle falls silent: that may be the end of a leg, and of pictures that came late.
+"""
 
 import logging
 import threading
@@ -36,10 +39,11 @@ class LegWatch:
 
     Args:
         ask: called with vehicle, sortie and whether it has fallen silent, when legs are over.
+        silent: called with vehicle and sortie when no picture has come for 8 s, however few came before.
     """
 
-    def __init__(self, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self, ask: Ask, silent: Callable[[str, int], None] = lambda vehicle, sortie: None) -> None:
+        self._ask, self._silent = ask, silent
         self._lock = threading.Lock()
         self._paths: dict[tuple[str, int], _Path] = {}
         self._stop = threading.Event()
@@ -70,7 +74,7 @@ class LegWatch:
                 due = [
                     (key, path)
                     for key, path in self._paths.items()
-                    if len(path.times) >= FEWEST and (path.dirty or 0 < path.heard < now - _SILENT_S)
+                    if (path.dirty and len(path.times) >= FEWEST) or 0 < path.heard < now - _SILENT_S
                 ]
             for key, path in due:
                 try:
@@ -86,7 +90,11 @@ class LegWatch:
             silent = now - path.heard > _SILENT_S
             path.dirty = False
             if silent:
-                path.heard = 0.0  # asked once
+                path.heard = 0.0  # told once
+        if silent:
+            self._silent(*key)
+        if len(times) < FEWEST:
+            return
         lat, lon = np.array(places).T
         north = (lat - lat[0]) * _METRES_A_DEGREE
         east = (lon - lon[0]) * _METRES_A_DEGREE * np.cos(np.radians(lat[0]))

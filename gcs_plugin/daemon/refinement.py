@@ -12,12 +12,12 @@ from typing import Any, Final
 from gcs_plugin.daemon.crew import Crew
 from gcs_plugin.daemon.drawing import Drawer, frame_of_row
 from gcs_plugin.daemon.jobs import Job, new_job
-from gcs_plugin.daemon.journal import Change, Journal, packed
+from gcs_plugin.daemon.journal import Change, Journal, late_frames, packed
 from gcs_plugin.daemon.kept import Bytes, thumbnail_of
 from gcs_plugin.daemon.layers import Bounds, new_name
 from gcs_plugin.daemon.press import Press
 from gcs_plugin.daemon.store import PictureStore
-from gcs_plugin.daemon.work import Solved, SolveTask, joined, near, solve
+from gcs_plugin.daemon.work import Solved, SolveTask, joined, lay_beside, near, solve
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.products import finite
@@ -27,6 +27,8 @@ _DRAWN_S: Final = 3.0
 _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
+_AGAIN: Final = 10
+"""So many pictures that came late have their vehicle refined again; fewer are laid beside its refined ones."""
 Tell = Callable[[float, str], None]
 
 
@@ -59,35 +61,49 @@ class Refinement:
         if job.detail.get("trigger") == "complete":
             self._wait_quiet(job)
         self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
+        if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
+            return _nothing_came(job)
         job.detail["refine_started_s"] = time.time()
         area = self.press.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
-        tell(0.05, f"refining {len(frames)} pictures")
+        before = self._beside(job, len(frames))
+        tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
         target = self.press.kept / f"{new_name('solution')}.pickle"
-        others = self._neighbours(job, near(frames, area.epsg))
-        solved = self.crew.run(
-            solve, SolveTask(frames, area.epsg, area.origin, self.basemap, thumbnails, others, target)
-        )
-        layer = "fine" if self.basemap is not None else "coarse"
+        task = SolveTask(
+            frames, area.epsg, area.origin, self.basemap, thumbnails, self._neighbours(job, near(frames, area.epsg)),
+            target, None if before is None else self.press.kept / before["path"],
+        )  # fmt: skip
+        solved = self.crew.run(solve if before is None else lay_beside, task)
+        if before is not None:
+            job.detail["beside"] = len(solved.stages)
+            if not solved.stages and not solved.dropped:
+                target.unlink(missing_ok=True)
+                return _nothing_came(job)
+        job.detail |= {
+            "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
+            "warnings": solved.warnings,
+        }  # fmt: skip
+        self._show(job, tell, target, solved, before)
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return lambda db: None
+
+    def _show(self, job: Job, tell: Tell, target: Path, solved: Solved, before: Any) -> None:
+        """Draw and publish what was solved."""
+        vehicle, layer = str(job.vehicle), "fine" if self.basemap is not None else "coarse"
+        job.detail["layer"] = layer
         self.make_way(vehicle, layer)
         with self.press.turn(layer):
             tell(0.7, "drawing")
-            job.detail |= {
-                "layer": layer, "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3),
-                "solve_s": round(solved.wall_s, 3),
-            }  # fmt: skip
-            before = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
-            changed = solved.changed if before is None else joined([solved.changed, before[1]])
-            versions = self.press.print(
+            shown = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
+            changed = solved.changed
+            if before is None and shown is not None:  # it leaves where it was
+                changed = joined([changed, shown[1]])
+            job.detail["version_before"], job.detail["version"] = self.press.print(
                 layer, self.crew, (vehicle, job.sortie), target, changed,
-                lambda rejected: self._publish(job, layer, target, solved, rejected),
+                lambda rejected: self._publish(job, layer, target, solved, rejected, before),
             )  # fmt: skip
-        job.detail |= {
-            "version_before": versions[0], "version": versions[1], "published_s": time.time(),
-            "seconds": round(time.monotonic() - began, 3),
-        }  # fmt: skip
+        job.detail["published_s"] = time.time()
         self.on_published(layer, job)
-        return lambda db: None
 
     # -- the parts ------------------------------------------------------------------------------------------------
 
@@ -108,6 +124,16 @@ class Refinement:
                 return
             time.sleep(0.05)
 
+    def _beside(self, job: Job, count: int) -> Any:
+        """The kept refinement beside which late pictures are laid; None if all are to be refined."""
+        if job.detail.get("trigger") != "late":
+            return None
+        row = self.journal.one(
+            "SELECT * FROM solutions WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
+        )
+        refined = None if row is None else json.loads(row["detail"]).get("refined")
+        return row if refined is not None and count - refined < _AGAIN else None
+
     def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
         """Solutions of others whose ground comes near."""
         mine = (packed(str(job.vehicle)), job.sortie)
@@ -117,7 +143,9 @@ class Refinement:
             if (row["vehicle"], row["sortie"]) != mine and apart_m(json.loads(row["detail"])["bounds"], box) < _REACH_M
         ]
 
-    def _publish(self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str]) -> Change:
+    def _publish(
+        self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str], before: Any
+    ) -> Change:
         vehicle = packed(str(job.vehicle))
         dropped = {**solved.dropped, **rejected}
         placed = [
@@ -126,7 +154,10 @@ class Refinement:
             if image not in dropped
         ]
         lost = [(why, vehicle, job.sortie, packed(image)) for image, why in dropped.items()]
-        detail = json.dumps(detail_of(solved, solved.legs) | {"layer": layer})
+        if before is None:
+            detail = json.dumps(detail_of(solved, solved.legs) | {"layer": layer, "refined": len(placed)})
+        else:
+            detail = json.dumps(json.loads(before["detail"]) | {"bounds": solved.bounds})
         old = self.journal.one("SELECT path FROM solutions WHERE vehicle=? AND sortie=?", (vehicle, job.sortie))
         then = None
         if self.basemap is not None:  # the coarse layer shows all of the sortie, too
@@ -150,6 +181,11 @@ class Refinement:
         if old is not None:
             self.press.retire(self.press.kept / old["path"])
         return change
+
+
+def _nothing_came(job: Job) -> Change:
+    job.detail["note"] = "nothing came late"
+    return lambda db: None
 
 
 def sortie_frames(

@@ -29,7 +29,7 @@ class SolveTask:
         frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
         thumbnails: image -> uint8 (12, 16, 3).
         neighbours: kept sorties nearby, held as they are. target: where the new one goes.
-        before: in flight, what was kept of the sortie's earlier legs.
+        before: in flight, what was kept of the sortie's earlier legs; for late pictures, of its refinement.
     """
 
     frames: list[Frame]
@@ -95,6 +95,26 @@ def solve(task: SolveTask) -> Solved:
     return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
 
 
+def lay_beside(task: SolveTask) -> Solved:
+    """Lay pictures that came late beside the others of their sortie, which was refined without them."""
+    from orthoswarm.swarm.late import lay_late
+    from orthoswarm.swarm.passes import read_frame
+
+    assert task.before is not None
+    watch = _Watch()
+    before = load_kept(task.before)
+    refined = before.solution
+    known = {p.frame.image for p in refined.placed} | set(refined.dropped)
+    placed, dropped = lay_late([f for f in task.frames if f.image not in known], refined, task.epsg, read_frame)
+    whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
+    thumbnails = before.thumbnails | task.thumbnails
+    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], before.gains)
+    kept = Kept(whole, thumbnails, gains)
+    kept.write(task.target)
+    new = replace(whole, placed=placed, dropped=dropped, legs=[])
+    return watch.solved(new, [], kept, seen(placed, kept.terrain))
+
+
 def place(task: SolveTask) -> Solved:
     """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
 
@@ -134,6 +154,8 @@ def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
     source, origin, target = task
     fine = load_kept(source)
     solution = coarse_of(fine.solution, np.array(origin))
+    there = {p.frame.image for p in solution.placed}
+    solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # laid beside the others
     kept = replace(fine, solution=solution)
     kept.write(target)
     return watch.solved(replace(solution, legs=[]), [], kept, seen(solution.placed, kept.terrain))

@@ -13,10 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.carried import hovering
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Leg, LegState, MapWindow, Solution
+from orthoswarm.recorded import recorded_cameras
 from orthoswarm.swarm.flight import Flight, open_flight
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.group import local_origin
@@ -64,6 +66,8 @@ def place_in_flight(
     Raises:
         OrthoSwarmError: the pictures do not hold together (yet); the sentence says why.
     """
+    if frames and hovering(recorded_cameras(frames, LocalGrid(epsg)).placed):
+        raise OrthoSwarmError("all its pictures were taken at one spot; they stay as they were recorded")
     units = split_units({frames[0].vehicle: frames} if frames else {})
     found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= FEWEST_SPARSE]
     if not found:
@@ -75,8 +79,10 @@ def coarse_of(solution: Solution, origin: Array) -> Solution:
     """The coarse placement that a refined solution began from, on the map where that was found.
 
     Raises:
-        OrthoSwarmError: the solution has no state.
+        OrthoSwarmError: the solution has no state, as that of a vehicle that stood at one spot.
     """
+    if solution.state is None:
+        raise OrthoSwarmError(f"{solution.vehicle} stays where its receiver says; there is no other coarse placement")
     states = solution.state if isinstance(solution.state, list) else [solution.state]
     if not all(isinstance(state, VehicleState) for state in states):
         raise OrthoSwarmError(f"nothing is known of how {solution.vehicle} was refined; refine it again")

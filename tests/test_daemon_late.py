@@ -1,0 +1,167 @@
+"""Pictures that come after their vehicle was refined, and a vehicle that stood at one spot."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.core import Daemon
+from gcs_plugin.daemon.jobs import new_job
+from gcs_plugin.daemon.journal import packed
+from gcs_plugin.daemon.kept import load_kept
+from gcs_plugin.daemon.legwatch import LegWatch
+from gcs_plugin.daemon.pose import parse_pose
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.warmup import made_up_flight, made_up_ground, write_map
+from orthoswarm.geo import LocalGrid
+
+GRID = LocalGrid(32631)
+OFF_M = np.array([2.0, -2.2])
+LIMIT_S = 300.0
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Frames as taken, and the map's file."""
+    folder = tmp_path_factory.mktemp("flight")
+    ground = made_up_ground()
+    write_map(ground, folder / "map.tif")
+    return made_up_flight(ground, folder, "v1"), folder / "map.tif"
+
+
+@pytest.fixture
+def daemon(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.legwatch._SILENT_S", 0.5)
+    monkeypatch.setattr("gcs_plugin.daemon.legwatch._LOOK_S", 0.1)
+    settings = Settings(tmp_path / "w", basemap=flight[1], coarse=False)
+    settings.workspace.mkdir()
+    with Daemon(settings) as daemon:
+        yield daemon
+
+
+def post(daemon, frames, off_m=OFF_M):
+    """Send frames with records that are off."""
+    for frame in frames:
+        lat, lon = (float(v) for v in GRID.to_geographic(truth(frame) + off_m))
+        pose = {
+            "vehicle": frame.vehicle, "image": frame.image, "time": frame.time_s, "lat_deg": lat, "lon_deg": lon,
+            "height_m": frame.fix.height_m, "yaw_deg": float(np.degrees(frame.fix.yaw_rad)), "pitch_deg": -90.0,
+            "roll_deg": 0.0,
+        }  # fmt: skip
+        daemon.add_picture(parse_pose(pose), frame.path.read_bytes())
+
+
+def truth(frame):
+    return GRID.to_grid(frame.fix.lat_deg, frame.fix.lon_deg)
+
+
+def complete(daemon, vehicle="v1"):
+    """What the flock writes when a vehicle reports that its mission is complete."""
+
+    def change(db):
+        db.execute("INSERT INTO completions (vehicle, sortie, detail) VALUES (?, 1, '{}')", (packed(vehicle),))
+        new_job("refine", vehicle, 1, {"trigger": "complete"})(db)
+
+    daemon.journal.write(change)
+    daemon.jobs.wake()
+
+
+def after_job(daemon, count):
+    """Wait until so many refinements have ended and nothing is left to do; gives the refinements."""
+    end = time.monotonic() + LIMIT_S
+    while True:
+        jobs = [job for job in daemon.jobs.all() if job.kind == "refine"]
+        if len(jobs) >= count and not daemon.jobs.open() and all(job.ended for job in jobs):
+            return jobs
+        assert time.monotonic() < end, [job.document() for job in daemon.jobs.all()]
+        time.sleep(0.05)
+
+
+def stages(daemon):
+    return {row["image"]: row["stage"] for row in daemon.frames()}
+
+
+def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_them(daemon, flight):
+    frames, _ = flight
+    late = [frames[k] for k in (5, 15, 16)]
+    first = [f for f in frames[:20] if f not in late]
+    post(daemon, first)
+    complete(daemon)
+    (refined,) = after_job(daemon, 1)
+    assert refined.state == "done", refined.message
+    assert refined.detail["frames"] == 17
+    note = daemon.completions()
+    post(daemon, late)
+    _, beside = after_job(daemon, 2)
+    assert (beside.state, beside.detail["trigger"], beside.detail["beside"]) == ("done", "late", 3), beside.message
+    assert set(stages(daemon).values()) == {"fine"}
+    assert daemon.completions() == note  # what the completion led to stays as it was
+    row = daemon.journal.one("SELECT path FROM solutions")
+    placed = {
+        p.frame.image: p for p in load_kept(daemon.settings.workspace / "solutions" / row["path"]).solution.placed
+    }
+    assert len(placed) == 20
+    for frame in late:
+        one = placed[frame.image]
+        assert np.hypot(*(one.camera.to_ground([119.5, 89.5]) - truth(frame))) < 0.5
+        assert one.sigma_m < 1.5
+        assert not one.weak
+    post(daemon, frames[20:])  # with the three they are more than a handful
+    *_, again = after_job(daemon, 3)
+    assert again.state == "done", again.message
+    assert "beside" not in again.detail
+    assert again.detail["frames"] == 28
+    assert set(stages(daemon).values()) == {"fine"}
+    assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+
+
+def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.legwatch._SILENT_S", 3600.0)  # it ends before it has noticed
+    frames, basemap = flight
+    settings = Settings(tmp_path / "w", basemap=basemap, coarse=False)
+    settings.workspace.mkdir()
+    with Daemon(settings) as daemon:
+        post(daemon, frames[:16])
+        complete(daemon)
+        after_job(daemon, 1)
+        post(daemon, frames[16:18])
+    with Daemon(settings) as daemon:
+        _, beside = after_job(daemon, 2)
+        assert beside.detail["beside"] == 2
+    with Daemon(settings) as daemon:
+        assert len(after_job(daemon, 2)) == 2  # not again
+
+
+def test_a_vehicle_that_stood_at_one_spot_stays_as_recorded_and_says_so(daemon, flight):
+    frames, _ = flight
+    rng = np.random.default_rng(3)
+    for k in range(12):  # one view, and a receiver that wanders about it
+        post(daemon, [replace(frames[7], image=f"{k}.jpg", time_s=1e9 + k)], rng.normal(0.0, 1.0, 2))
+    complete(daemon)
+    (job,) = after_job(daemon, 1)
+    assert job.state == "done", job.message
+    assert job.attempts == 1
+    assert job.detail["warnings"] == ["v1: all pictures were taken at one spot; they are placed as recorded"]
+    assert set(stages(daemon).values()) == {"realtime"}
+    (coarse,) = [job for job in daemon.jobs.all() if job.kind == "coarse"]
+    assert "stays where its receiver says" in coarse.detail["note"]
+    assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+
+
+def test_silence_is_told_however_few_pictures_came(monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.legwatch._LOOK_S", 0.02)
+    monkeypatch.setattr("gcs_plugin.daemon.legwatch._SILENT_S", 0.2)
+    asked, silent = [], []
+    watch = LegWatch(lambda *values: asked.append(values), lambda *values: silent.append(values))
+    watch.start()
+    for count in (1, 2):
+        watch.add("v1", 1, 1e9 + count, 48.0, 11.0)
+        end = time.monotonic() + 30
+        while len(silent) < count:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    time.sleep(0.5)
+    watch.close()
+    assert silent == [("v1", 1)] * 2  # once for each silence
+    assert asked == []
