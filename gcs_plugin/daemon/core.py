@@ -172,13 +172,14 @@ class Daemon:
             InputError: the file is no picture.
             OrthoSwarmError: the disk is full or gone; nothing was kept.
         """
+        came = time.time()
         key = frame_key(pose.vehicle, pose.image)
         known = self.journal.one("SELECT seq FROM frames WHERE key = ?", (key,))
         if known is not None:
             return int(known["seq"]), False
         width, height, suffix = picture_size(data)
         require_space(self.settings.workspace, len(data))
-        time_s = time.time() if pose.time_s is None else pose.time_s
+        time_s = came if pose.time_s is None else pose.time_s
         path = self.store.put(key, suffix, data)
         change = add_frame(key, pose.vehicle, pose.image, time_s, path, (width, height), pose.values)
         seq, new = self.journal.write(change)
@@ -189,7 +190,7 @@ class Daemon:
             )  # fmt: skip
             sortie = self.sortie(pose.vehicle)
             self.posted[pose.vehicle] += 1
-            self.drawer.add(seq, frame, time.time(), sortie)
+            self.drawer.add(seq, frame, came, sortie)
             self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
             if self.posted[pose.vehicle] == _FEW:
                 self.crew.warm_kernels()

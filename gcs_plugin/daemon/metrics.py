@@ -7,7 +7,7 @@ from gcs_plugin.daemon.core import Daemon
 from gcs_plugin.daemon.usage import resident_mb
 from orthoswarm import __version__
 
-_QUANTILES: Final = (0.5, 0.9, 0.99)
+_QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
 
 def prometheus(daemon: Daemon) -> str:
