@@ -52,7 +52,7 @@ def test_the_map_appears_as_pictures_come(page):
     for shot in line(6, "falcon <b>"):
         served.send(shot)
     page.wait_for_selector(".card:has-text('falcon <b>')")  # a name is a text, not a piece of the page
-    page.wait_for_function("document.querySelector('[data-layer=realtime]:not(.off)')")
+    page.wait_for_selector("[data-layer=realtime]:not(.off)")
     for _ in range(60):
         if colours(page) > before + 0.004:
             break
@@ -60,7 +60,10 @@ def test_the_map_appears_as_pictures_come(page):
     assert colours(page) > before + 0.004
     shown = colours(page)
     page.locator("[data-layer=realtime] input[type=checkbox]").uncheck()
-    page.wait_for_timeout(1500)
+    for _ in range(60):
+        if colours(page) < shown - 0.004:
+            break
+        page.wait_for_timeout(500)
     assert colours(page) < shown - 0.004
     page.click("text=refine now")
     page.click("#confirm >> text=Yes")
@@ -85,7 +88,23 @@ def test_an_area_is_drawn_and_planned(page):
     page.click("#confirm >> text=Yes")
     page.wait_for_selector("#problem:not([hidden])")
     assert "links" in page.inner_text("#problem")
+    page.wait_for_timeout(2500)  # what follows meanwhile does not take it away
+    page.click("#dismiss")
+    page.wait_for_selector("#problem", state="hidden")
+    before_and_after_reach_as_far_as_the_panel(page)
     it_fits_a_tablet_held_upright(page)
+
+
+def before_and_after_reach_as_far_as_the_panel(page):
+    page.check("#swipe-on")
+    slider, panel = page.locator("#swipe").bounding_box(), page.locator("#panel").bounding_box()
+    assert 0 <= panel["x"] - (slider["x"] + slider["width"]) < 40
+    for share in (0, 250, 1000):
+        page.locator("#swipe").fill(str(share))
+        line = page.locator("#divider").bounding_box()["x"]
+        assert abs(line - slider["width"] * share / 1000) < 5
+    page.uncheck("#swipe-on")
+    page.wait_for_selector("#divider", state="hidden")
 
 
 def it_fits_a_tablet_held_upright(page):

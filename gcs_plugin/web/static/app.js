@@ -15,19 +15,28 @@ const make = (tag, attributes = {}, ...children) => {
   return element;
 };
 
-function complain(text) {
-  $("problem").textContent = text;
-  $("problem").hidden = !text;
+// What went wrong with a command stays until the next one, or until it is dismissed; what is wrong with the daemon, as
+// long as it is so.
+let failed = "";
+let wrong = "";
+
+function tellProblems() {
+  $("problem").querySelector("span").textContent = [failed, wrong].filter(Boolean).join("; ");
+  $("problem").hidden = !failed && !wrong;
+  $("dismiss").hidden = !failed;
 }
 
 const attempt = (work) => async (...values) => {
   try {
-    complain("");
+    failed = "";
     return await work(...values);
   } catch (error) {
-    complain(error.message);
+    failed = error.message;
+  } finally {
+    tellProblems();
   }
 };
+$("dismiss").onclick = () => { failed = ""; tellProblems(); };
 
 function confirmed(question) {
   const dialog = $("confirm");
@@ -86,14 +95,15 @@ function drawVehicles() {
     const counts = row.frames || {};
     const mission = row.mission || {};
     const facts = [row.state === "pictures" ? "" : row.state, row.mode, row.armed ? "armed" : "", row.battery == null ? "" : `${Math.round(row.battery * 100)} %`];
-    const pictures = `${counts.frames || 0} pictures, ${counts.fine || 0} fine, ${counts.coarse || 0} coarse${counts.rejected ? `, ${counts.rejected} rejected` : ""}`;
+    const pictures = [`${counts.frames || 0} pictures`, ...[["refined", counts.fine], ["coarse", counts.coarse], ["rejected", counts.rejected]].filter(([, n]) => n).map(([what, n]) => `${n} ${what}`)].join(", ");
     const share = mission.phase === "complete" ? 1 : mission.items ? mission.item / mission.items : 0;
     return make("div", { className: "card" },
       make("span", { className: "swatch", style: `background:${colour}` }), make("b", {}, row.name || row.id),
       make("span", { className: "quiet" }, facts.filter(Boolean).join(", ")),
       mission.items ? make("div", { className: `bar ${mission.phase === "complete" ? "done" : ""}`, title: `mission ${mission.phase}` }, make("i", { style: `width:${100 * share}%` })) : null,
       mission.items ? make("p", { className: "quiet" }, mission.phase === "complete" ? "mission complete" : `mission ${mission.phase}, item ${mission.item} of ${mission.items}`) : null,
-      make("p", { className: "quiet" }, `${pictures}; sortie ${row.sortie || 1}`),
+      make("p", { className: "quiet" }, `${pictures}${row.sortie > 1 ? `; sortie ${row.sortie}` : ""}`),
+      refinedAfter(row.id) ? make("p", { className: "quiet" }, refinedAfter(row.id)) : null,
       make("div", { className: "buttons" },
         ...(row.system ? ["start", "pause", "resume", "rtl"].map((verb) => make("button", { onclick: () => command(row.id, verb) }, verb)) : []),
         make("button", { onclick: () => refine(row.id) }, "refine now")));
@@ -103,6 +113,13 @@ function drawVehicles() {
     type: "Feature", properties: { colour: view.colourOf(row.id) }, geometry: { type: "LineString", coordinates: row.trail } })));
   view.show("footprints", [...outlines].map(([vehicle, ring]) => ({
     type: "Feature", properties: { colour: view.colourOf(vehicle) }, geometry: { type: "Polygon", coordinates: [[...ring, ring[0]]] } })));
+}
+
+// How long it took from COMPLETE to the refined pixels on the map.
+let completions = [];
+function refinedAfter(vehicle) {
+  const last = completions.filter((row) => row.vehicle === vehicle && row.refine_ended_s).pop();
+  return last ? `refined on the map ${(last.refine_ended_s - last.complete_s).toFixed(1)} s after COMPLETE` : "";
 }
 
 const command = attempt(async (vehicle, verb) => {
@@ -131,7 +148,7 @@ function drawJobs() {
   if (latest.length) {
     $("jobs").replaceChildren(...latest.map((job) => make("div", { className: "card" },
       make("b", {}, NAMES[job.kind] || job.kind), `${job.vehicle || ""}${job.sortie > 1 ? ` sortie ${job.sortie}` : ""} `,
-      make("span", { className: "quiet" }, [job.state, job.message, job.detail.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", ")),
+      make("span", { className: "quiet" }, [job.state, job.message, ...(job.detail.warnings || []), job.detail.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", ")),
       make("div", { className: `bar ${job.state}` }, make("i", { style: `width:${100 * job.progress}%` })))));
   }
   const made = [...jobs.values()].filter((job) => job.detail.files).pop();
@@ -160,7 +177,8 @@ function drawArea() {
   view.show("corners", corners.map((point) => ({ type: "Feature", properties: {}, geometry: { type: "Point", coordinates: point } })));
   view.show("area", corners.length > 2 ? [{ type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: [[...corners, corners[0]]] } }] : []);
   $("make").disabled = corners.length < 3;
-  $("plan-hint").textContent = drawing ? `Tap the corners on the map (${corners.length} so far), then plan.` : "Draw the area that is to be mapped.";
+  $("plan-hint").textContent = drawing ? `Tap the corners on the map (${corners.length} so far), then plan.`
+    : plan ? "Look at the lines, upload the missions, then start." : corners.length > 2 ? "The area is drawn: plan it." : "Draw the area that is to be mapped.";
   $("draw").textContent = drawing ? "Done" : "Draw area";
 }
 
@@ -199,6 +217,7 @@ $("plan-form").onsubmit = attempt(async (event) => {
 });
 
 function drawPlan() {
+  drawArea();
   const minutes = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.round(seconds % 60)).padStart(2, "0")}`;
   $("plan-result").replaceChildren(
     make("p", {}, `${(100 * plan.covered_share).toFixed(1)} % covered in ${minutes(plan.makespan_s)} min, lines ${plan.spacing_m.toFixed(0)} m apart`),
@@ -231,31 +250,38 @@ const startAll = attempt(async () => {
 let soon = null;
 const later = () => { if (!soon) soon = setTimeout(() => { soon = null; refresh(); }, 1500); };
 
-const refresh = attempt(async () => {
-  const [layers, rows, work, legs, health] = await Promise.all(
-    ["/api/layers", "/api/vehicles", "/api/jobs", "/api/legs", "/healthz"].map(get));
-  drawLayers(layers);
-  for (const row of rows) vehicles.set(row.id, row);
-  for (const job of work) jobs.set(job.id, job);
-  drawVehicles();
-  drawJobs();
-  view.show("legs", legs.features);
-  countLegs(legs.features);
-  if (health.problems.length) complain(health.problems.join("; "));
-});
+async function refresh() {
+  try {
+    const [layers, rows, work, legs, health, done] = await Promise.all(
+      ["/api/layers", "/api/vehicles", "/api/jobs", "/api/legs", "/healthz", "/api/completions"].map(get));
+    completions = done;
+    drawLayers(layers);
+    for (const row of rows) vehicles.set(row.id, row);
+    for (const job of work) jobs.set(job.id, job);
+    drawVehicles();
+    drawJobs();
+    view.show("legs", legs.features);
+    countLegs(legs.features);
+    wrong = health.problems.join("; ");
+  } catch (error) {
+    wrong = error instanceof TypeError ? "the daemon does not answer; is it running?" : error.message;
+  }
+  tellProblems();
+}
 
 function heard(event) {
   if (event.type === "layer") { view.setVersion(event.layer, event.version); later(); }
   else if (event.type === "frame" && event.outline) { outlines.set(event.vehicle, event.outline); later(); }
   else if (event.type === "vehicle") { vehicles.set(event.id, { ...vehicles.get(event.id), ...event }); view.placeVehicle(event); later(); }
   else if (event.type === "job") { jobs.set(event.id, event); drawJobs(); if (event.state === "done") later(); }
-  else if (event.type === "problem" || event.type === "overload") complain(event.text);
+  else if (event.type === "problem" || event.type === "overload") { wrong = event.text; tellProblems(); }
   else later();
 }
 
 $("fold").onclick = () => $("panel").classList.toggle("folded");
 $("fit").onclick = () => bounds && view.fit(bounds);
 $("refine-all").onclick = () => refine();
+$("overlays-on").onchange = (event) => view.setOverlays(event.target.checked);
 $("swipe-on").onchange = (event) => view.setSwipe(event.target.checked);
 $("token").value = token();
 $("token").onchange = (event) => { setToken(event.target.value); refresh(); };

@@ -86,9 +86,12 @@ export const setOpacity = (name, share) => {
   map.setLayoutProperty(name, "visibility", share > 0 ? "visible" : "none");
 };
 
+// Width at the right that the panel covers, as the style says.
+const covered = () => parseFloat(getComputedStyle(document.getElementById("maps")).getPropertyValue("--free") || "360");
+
 export function fit(bounds) {
   const [west, south, east, north] = bounds;
-  const right = window.innerWidth > 760 ? 360 : 30;
+  const right = 30 + covered();
   map.fitBounds([[west, south], [east, north]], { padding: { top: 30, bottom: 50, left: 30, right }, duration: 0, maxZoom: 20 });
 }
 
@@ -114,22 +117,41 @@ export function placeVehicle(row) {
   element.classList.toggle("lost", row.state === "lost");
 }
 
+// -- what lies over the layers -----------------------------------------------------------------------------------------
+
+const OVER = ["footprints", "trails", "legs", "refined", "flying"];
+
+export function setOverlays(on) {
+  for (const id of OVER) map.setLayoutProperty(id, "visibility", on ? "visible" : "none");
+}
+
+map.on("click", (event) => {
+  const legs = map.getLayer("refined") ? map.queryRenderedFeatures(event.point, { layers: ["refined", "flying"] }) : [];
+  if (!legs.length || map.getCanvas().style.cursor === "crosshair") return;
+  const { vehicle, sortie, leg, state, stage, sigma_m: sigma } = legs[0].properties;
+  const flown = Number(sortie) > 1 ? `, sortie ${sortie}` : "";
+  const off = sigma == null ? "" : `; its ground is thought to be ${Number(sigma).toFixed(2)} m off (one sigma)`;
+  new maplibregl.Popup().setLngLat(event.lngLat).setText(`${vehicle}${flown}, leg ${leg}: ${state}${stage === "fine" ? "" : ", in flight"}${off}`).addTo(map);
+});
+
 // -- before and after ------------------------------------------------------------------------------------------------
 
 let before = null;
 const clip = () => {
-  const share = Number(document.getElementById("swipe").value) / 1000;
-  document.getElementById("before").style.clipPath = `inset(0 ${100 - share * 100}% 0 0)`;
+  const box = document.getElementById("swipe").getBoundingClientRect();
+  const at = (box.width * Number(document.getElementById("swipe").value)) / 1000;
+  document.getElementById("before").style.clipPath = `inset(0 calc(100% - ${at}px) 0 0)`;
+  document.getElementById("divider").style.left = `${at}px`;
 };
 
 export function setSwipe(on) {
-  document.getElementById("before").hidden = !on;
-  document.getElementById("swipe").hidden = !on;
+  for (const id of ["before", "divider", "swipe"]) document.getElementById(id).hidden = !on;
   if (!on) return;
   if (!before) {
     before = new maplibregl.Map({ ...options("before", ["basemap"]), interactive: false });
     map.on("move", () => before.jumpTo({ center: map.getCenter(), zoom: map.getZoom(), bearing: map.getBearing() }));
     document.getElementById("swipe").addEventListener("input", clip);
+    new ResizeObserver(clip).observe(document.getElementById("swipe"));
   }
   before.jumpTo({ center: map.getCenter(), zoom: map.getZoom() });
   before.resize();
