@@ -8,6 +8,7 @@ compared at places that lie alike in both.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ Bytes = NDArray[np.uint8]
 _TILE = 512
 _CELLS_ACROSS = 64
 _MAX_CELLS = 2_000_000
+_AT_ONCE = 65_536
 _SAMPLE_SIGMA = 0.15  # of the log ratio of two thumbnails at one place: parallax, shadows, moving things
 _VEHICLE_SIGMA = 0.30
 _FRAME_SIGMA = 0.06
@@ -165,9 +167,14 @@ def _log_ratios(
     ratio, usable = np.zeros((len(meetings.a), 3), np.float32), np.zeros(len(meetings.a), bool)
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
-    ground = np.nan_to_num(meetings.ground)
-    place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
-    _compare(meetings.a, meetings.b, place, position, rotation, shots.lens, shots.size, small, ratio, usable)
+    for first in range(0, len(ratio), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        ground = np.nan_to_num(meetings.ground[some])
+        place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
+        _compare(
+            meetings.a[some], meetings.b[some], place, position, rotation, shots.lens, shots.size, small,
+            ratio[some], usable[some],
+        )  # fmt: skip
     return ratio, usable & np.asarray(np.isfinite(meetings.ground).all(axis=1))
 
 
@@ -209,24 +216,36 @@ def _solve(
 
     Frames that are fixed (N,) have log_held (N, 3) and no part in the unknowns.
     """
-    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
     n = len(vehicle)
     prior = np.r_[np.full(vehicles, _VEHICLE_SIGMA**-2), np.full(n, _FRAME_SIGMA**-2)]
-    rows = np.arange(len(a))
-    one_a, one_b = (np.where(fixed[side], 0.0, 1.0) for side in (a, b))
-    ratio = ratio + np.where(fixed[a, None], log_held[a], 0.0) - np.where(fixed[b, None], log_held[b], 0.0)
-    design = coo_array(
-        (
-            np.concatenate([one_a, -one_b, one_a, -one_b]),
-            (np.tile(rows, 4), np.concatenate([vehicles + a, vehicles + b, vehicle[a], vehicle[b]])),
-        ),
-        shape=(len(a), vehicles + n),
-    ).tocsr()
+    ratio = ratio + (np.where(fixed[a, None], log_held[a], 0.0) - np.where(fixed[b, None], log_held[b], 0.0))
+    # Weights differ from sample to sample, unknowns do not: two frames meet in some ten samples, which are summed.
+    pairs, of_pair = np.unique(a.astype(np.int64) * n + b, return_inverse=True)
+    design = _pair_design(pairs // n, pairs % n, vehicle, vehicles, fixed)
+    free = np.where(fixed, 0.0, 1.0)[:, None]
     x = np.zeros((vehicles + n, 3))
     for _ in range(_ROUNDS):
-        error2 = ((design @ x + ratio) ** 2).mean(1) / _SAMPLE_SIGMA**2
-        weighted = design.T * ((1.0 + error2 / 9.0) ** -2 / _SAMPLE_SIGMA**2)
-        x = splu((weighted @ design + diags_array(prior)).tocsc()).solve(-(weighted @ ratio))
+        own = (x[vehicle] + x[vehicles:]) * free
+        error2 = np.square(own[a] - own[b] + ratio).mean(1) / _SAMPLE_SIGMA**2
+        weight = (1.0 + error2 / 9.0) ** -2 / _SAMPLE_SIGMA**2
+        summed = np.bincount(of_pair, weight, len(pairs))
+        weighted = np.stack([np.bincount(of_pair, weight * ratio[:, k], len(pairs)) for k in range(3)], 1)
+        normal = (design.T * summed) @ design + diags_array(prior)
+        x = splu(normal.tocsc()).solve(-(design.T @ weighted))
     return x[:vehicles], x[vehicles:]
+
+
+def _pair_design(
+    a: NDArray[np.int64], b: NDArray[np.int64], vehicle: NDArray[np.intp], vehicles: int, fixed: NDArray[np.bool_]
+) -> Any:
+    """g_a - g_b of pairs of frames (P,) as a sparse matrix (P, V + N); frames that are fixed have no part in it."""
+    from scipy.sparse import coo_array
+
+    rows = np.arange(len(a))
+    one_a, one_b = (np.where(fixed[side], 0.0, 1.0) for side in (a, b))
+    columns = np.concatenate([vehicles + a, vehicles + b, vehicle[a], vehicle[b]])
+    values = np.concatenate([one_a, -one_b, one_a, -one_b])
+    return coo_array((values, (np.tile(rows, 4), columns)), shape=(len(a), vehicles + len(vehicle))).tocsr()
