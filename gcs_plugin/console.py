@@ -52,7 +52,7 @@ class Client:
             raise RuntimeError(_detail(error)) from None
         except (OSError, ValueError) as error:
             raise RuntimeError(
-                f"the daemon at {self.url} does not answer ({error}); start it, or say connect"
+                f"the daemon at {self.url} does not answer ({error}); say serve to start one, or connect to another"
             ) from None
 
 
@@ -61,6 +61,14 @@ def _detail(error: urllib.error.HTTPError) -> str:
         return str(json.loads(error.read())["detail"])
     except (OSError, ValueError, KeyError, TypeError):
         return f"the daemon answered {error.code}"
+
+
+def _vehicle(row: dict[str, Any]) -> str:
+    """A vehicle in a line: its mode, how many pictures there are, and how far they are placed."""
+    counts: dict[str, int] = row.get("frames") or {}
+    named = (("fine", "refined"), ("coarse", "coarse"), ("rejected", "rejected"))
+    pictures = [f"{counts.get('frames', 0)} pictures", *(f"{counts[k]} {text}" for k, text in named if counts.get(k))]
+    return f"{row['id']}: {row.get('mode') or row['state']}, sortie {row.get('sortie')}, {', '.join(pictures)}"
 
 
 class Commands:
@@ -112,10 +120,7 @@ class Commands:
 
     def vehicles(self, _: list[str]) -> list[str]:
         """A line a vehicle."""
-        return [
-            f"{row['id']}: {row.get('mode') or row['state']}, sortie {row.get('sortie')}, {row.get('frames')}"
-            for row in self.client.ask("/api/vehicles")
-        ]
+        return [_vehicle(row) for row in self.client.ask("/api/vehicles")]
 
     def layers(self, _: list[str]) -> list[str]:
         """A line a layer."""

@@ -4,8 +4,9 @@
     orthoswarm connect WORKSPACE           or use one that runs (`orthoswarm serve --link udpin:127.0.0.1:14551`),
     orthoswarm feed 127.0.0.1:14551        and feed it
 
-MAVProxy holds the links. Commands go to the daemon over HTTP, in a thread: an upload needs MAVProxy's main loop to pass
-packets meanwhile, and a fault here never touches the console's own work.
+What runs, and what to type next, is said when the module is loaded. MAVProxy holds the links. Commands go to the daemon
+over HTTP, in a thread: an upload needs MAVProxy's main loop to pass packets meanwhile, and a fault here never touches
+the console's own work.
 """
 
 import queue
@@ -21,6 +22,12 @@ from gcs_plugin.console import Client, Commands
 from gcs_plugin.mavfeed import Child, Feed
 
 _VERBS: Final = "<status|vehicles|plan|upload|start|pause|rtl|refine|layers|export|web|connect|serve|feed>"
+_START_ONE: Final = (
+    "'orthoswarm serve WORKSPACE [--basemap MAP]' starts one and feeds it, 'orthoswarm connect URL TOKEN' takes another"
+)
+_FEED_IT: Final = (
+    "vehicles' packets do not go to it yet: 'orthoswarm feed 127.0.0.1:PORT', where it has --link udpin:127.0.0.1:PORT"
+)
 _DRAW_S: Final = 3.0
 
 
@@ -76,7 +83,19 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
 
     # -- in threads of our own ---------------------------------------------------------------------------------------
 
+    def _greeting(self) -> str:
+        """What runs, and what to type next."""
+        client = self.commands.client
+        try:
+            client.ask("/healthz")
+        except RuntimeError:
+            return f"orthoswarm: no daemon runs at {client.url}; {_START_ONE}"
+        return (
+            f"orthoswarm: a daemon runs at {client.url}; 'orthoswarm connect WORKSPACE' lets you command it; {_FEED_IT}"
+        )
+
     def _work(self) -> None:
+        print(self._greeting())
         while (words := self._typed.get()) is not None:
             try:
                 for line in self._run(words):
@@ -89,7 +108,10 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
             return self._serve(words[1:])
         if words[:1] == ["feed"]:
             return self._feed(words[1:])
-        return self.commands.run(words)
+        lines = self.commands.run(words)
+        if words[:1] == ["connect"] and self.feed is None and lines and lines[0].startswith("daemon "):
+            lines.append(_FEED_IT)
+        return [f"{line}|serve|feed" if line.startswith("usage: orthoswarm status") else line for line in lines]
 
     def _serve(self, words: list[str]) -> list[str]:
         """`serve [WORKSPACE] [FLAGS of orthoswarm serve]`."""

@@ -1,6 +1,8 @@
 """The console's commands against a real daemon, and the MAVProxy module where MAVProxy is installed."""
 
 import json
+import re
+import time
 import types
 
 import pytest
@@ -26,7 +28,7 @@ def commands(served):
 
 def test_state_is_told_in_lines(commands):
     assert "1 vehicles, 8 pictures" in commands.run(["status"])[0]
-    assert commands.run(["vehicles"])[0].startswith("v1:")
+    assert re.fullmatch("v1: .*, sortie 1, 8 pictures.*", commands.run(["vehicles"])[0])
     assert any(text.startswith("realtime: ") and "empty" not in text for text in commands.run(["layers"]))
     assert commands.run(["web"])[0].startswith("http://127.0.0.1:")
 
@@ -54,14 +56,39 @@ def test_a_daemon_that_is_not_there_is_told(tmp_path):
     assert "does not answer" in Commands(Client("http://127.0.0.1:9")).run(["status"])[0]
 
 
-def test_the_mavproxy_module_loads():
-    pytest.importorskip("MAVProxy")
-    from gcs_plugin import mavproxy
-
-    state = types.SimpleNamespace(
+def mavproxy_state():
+    return types.SimpleNamespace(
         command_map={}, completions={}, completion_functions={}, public_modules={}, map_functions={}, multi_instance={},
         instance_count={}, modules=[], aliases={},
     )  # fmt: skip
+
+
+def said(capsys, text, limit_s=60.0):
+    """Wait until something was printed."""
+    end, out = time.monotonic() + limit_s, ""
+    while text not in out:
+        assert time.monotonic() < end, out
+        time.sleep(0.01)
+        out += capsys.readouterr().out
+    return out
+
+
+@pytest.mark.parametrize("running", [True, False])
+def test_the_mavproxy_module_says_what_runs_and_what_to_type(served, running, monkeypatch, capsys):
+    pytest.importorskip("MAVProxy")
+    from gcs_plugin import mavproxy
+
+    client = Client(served.url if running else "http://127.0.0.1:9")
+    monkeypatch.setattr(mavproxy, "Client", lambda: client)
+    state = mavproxy_state()
     module = mavproxy.init(state)
     assert "orthoswarm" in state.command_map
+    assert "orthoswarm connect" in said(capsys, "a daemon runs at" if running else "no daemon runs at")
     module.typed([])
+    assert "serve|feed" in said(capsys, "usage: orthoswarm")
+    if running:
+        module.typed(["connect", served.url, served.token])
+        said(capsys, "orthoswarm feed")
+    else:
+        module.typed(["refine"])
+        said(capsys, "say serve to start one")

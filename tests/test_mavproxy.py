@@ -126,6 +126,7 @@ def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
         try:
             proxy.wait("Loaded module gcs_plugin.mavproxy")
             proxy.type("orthoswarm status", "does not answer")
+            assert any("'orthoswarm serve WORKSPACE" in line for line in proxy.said)  # what to do, before one asks
             url = proxy.type("orthoswarm serve ws --port 0 --fov-min 65", r"the daemon runs: (\S+)/")[1]
             token = (tmp_path / "ws" / "token").read_text().strip()
             served = cameras.served = Served(proxy.process, url, token)

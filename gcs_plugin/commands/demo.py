@@ -79,4 +79,5 @@ def _tell(report: dict[str, object], out: Path) -> None:
         flying = ", ".join(row["still_flying"]) or "nobody"
         print(f"{row['vehicle']} completed; refined on the map {seconds:.1f} s later; still flying: {flying}")
     print(f"median error: {realtime['median_m']:.2f} m in real time, {accuracy['median_m']:.2f} m refined")
-    print(f"the map: {out / 'orthoimage.tif'}")
+    print(f"the map: {out / 'orthoimage.tif'}, what it took: {out / 'report.html'}")
+    print(f"the page again: orthoswarm serve --workspace {out} --basemap {out / 'twin' / 'basemap.tif'}")

@@ -34,6 +34,8 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.workers import single_threaded
 
     single_threaded()
+    import sys
+
     from gcs_plugin.daemon.settings import FILE, TEMPLATE
     from orthoswarm.errors import InputError
     from orthoswarm.export.partial import disk_error
@@ -48,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
                 raise InputError(f"{path} is there already; edit it")
             path.write_text(TEMPLATE, encoding="utf-8")
             print(path)
+            print(f"edit it, then: orthoswarm serve --workspace {args.workspace}", file=sys.stderr)
             return 0
     except OSError as error:
         raise disk_error(error, args.workspace) from None
