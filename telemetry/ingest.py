@@ -123,9 +123,8 @@ def _photo_folder(
     source = SourceInfo(folder.path.name if name == "." else name, "photos")
     groups: dict[str, list[PhotoTags]] = {}
     seen = 0
-    for path, photo in zip(
-        folder.pictures, read_photos(folder.pictures, workers=options.workers, progress=advance), strict=True
-    ):
+    tags = read_photos(folder.pictures, workers=options.workers, run=options.run, progress=advance)
+    for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
             continue
         seen += 1

@@ -3,9 +3,10 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from orthoswarm.frame import Frame, Rejection
 from telemetry.discover import Discovery, natural_key
@@ -26,6 +27,7 @@ class LoadOptions:
         cache: folder for pictures taken from videos; None makes one under the system's temporary folder.
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.
+        run: maps a function over items in processes, for many photos; None reads them in threads.
         decode: False to look at the metadata of videos only, without taking pictures (for `inspect`).
     """
 
@@ -35,6 +37,7 @@ class LoadOptions:
     exclude: tuple[Path, ...] = ()
     workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
     decode: bool = True
+    run: Callable[..., Iterator[Any]] | None = None
 
 
 @dataclass(slots=True)

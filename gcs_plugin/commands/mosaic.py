@@ -69,7 +69,10 @@ def run(args: argparse.Namespace) -> int:
     )
 
     def load(progress: pipeline.Progress) -> Ingest:
-        reading = telemetry.LoadOptions(args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,))
+        reading = telemetry.LoadOptions(
+            args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,),
+            run=None if args.cluster else pool.map,
+        )  # fmt: skip
         return telemetry.load(args.inputs, progress=progress, options=reading)
 
     if args.out.is_file():
@@ -79,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         from orthoswarm.cluster import Cluster
 
         args.out.mkdir(parents=True, exist_ok=True)
-        pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap) if p is not None])
+        pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
     else:
         pool = workers(args.workers)
     try:
