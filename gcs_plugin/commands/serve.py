@@ -117,6 +117,7 @@ def serve(settings: "Settings") -> int:
         )  # fmt: skip
         shown = f"[{settings.bind}]" if ":" in settings.bind else settings.bind
         address = f"http://{shown}:{port}/"
+        listener.listen(config.backlog)  # whoever reads the address may come at once, and waits until it is served
         print(f"map: {address}{'#token=' + token if new else ''}", flush=True)
         if new:
             print(f"token: {token}", flush=True)
