@@ -1,6 +1,8 @@
 """An outside height model: a GeoTIFF of any CRS as terrain of the area, relative to the takeoff level."""
 
 import warnings
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +17,104 @@ Array = NDArray[np.float64]
 _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
            "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 0.3048006096012192,
            "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
-
+_MOST_NODES = 4_000_000
+_FINEST_M = 2.0
 
 MOST_BURIED = 0.05
 """Part of the cameras that a DEM may bury: a few recorded heights can be wrong."""
+LEAST_COVER = 0.02
+"""A DEM with heights on less of the area than this is of another place."""
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class KnownGround:
+    """Heights of a DEM in a window.
+
+    Attributes:
+        terrain: heights over the model's zero; smoothly filled where the DEM has none.
+        known: bool (rows, columns), nodes where it has.
+    """
+
+    terrain: Terrain
+    known: NDArray[np.bool_]
+
+    def knows(self, east_north: Array) -> NDArray[np.bool_]:
+        """Whether the DEM has heights all around positions (M, 2)."""
+        t = self.terrain
+        c, r = (east_north[..., 0] - t.west) / t.step_m, (east_north[..., 1] - t.south) / t.step_m
+        rows, columns = self.known.shape
+        inside = (c >= 0) & (r >= 0) & (c <= columns - 1) & (r <= rows - 1)
+        share = Terrain(t.west, t.south, t.step_m, self.known.astype(np.float32)).height(east_north)
+        return np.asarray(inside & (share > 0.999))
+
+
+@dataclass(frozen=True, slots=True)
+class HeightModel:
+    """A DEM that was looked at: where it lies and what counts as zero. Heights are read where and when they are needed.
+
+    It is small, so that a task for another process can carry it; the file must lie at the same path there.
+
+    Attributes:
+        path: the file. epsg: CRS of the area.
+        zero_m: height in the DEM's own datum that counts as 0: the ground in the middle below the cameras.
+        cover: share of the area on which it has heights.
+    """
+
+    path: Path
+    epsg: int
+    zero_m: float
+    cover: float
+
+    @classmethod
+    def open(cls, path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> "HeightModel":
+        """Look at a DEM before the work begins.
+
+        Args:
+            path: a GeoTIFF (or anything that GDAL reads) with a CRS. epsg: CRS of the area.
+            bounds: west, south, east, north of the area.
+            cameras: (N, 3) east, north and height above takeoff; NaN for an unknown height.
+
+        Raises:
+            InputError: if it cannot be read, has no CRS, no heights on the area, or buries cameras.
+        """
+        ground = _window(path, epsg, bounds, _MOST_NODES)
+        cover = float(ground.known.mean())
+        if cover < LEAST_COVER:
+            raise InputError(_no_cover(path, epsg, bounds, cover))
+        at = np.asarray(cameras, float).reshape(-1, 3)
+        at = at[ground.knows(at[:, :2])]
+        below = ground.terrain.height(at[:, :2]) if len(at) else ground.terrain.z[ground.known].astype(np.float64)
+        zero = float(np.median(below))
+        if len(at):
+            _refuse_buried(path, below - zero, at[:, 2])
+        return cls(Path(path).absolute(), epsg, zero, cover)
+
+    def window(self, bounds: Bounds, most_nodes: int = 250_000) -> KnownGround:
+        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many."""
+        return _window_over(self, bounds, most_nodes)
+
+
+@lru_cache(maxsize=6)
+def _window_over(model: HeightModel, bounds: Bounds, most_nodes: int) -> KnownGround:
+    ground = _window(model.path, model.epsg, bounds, most_nodes)
+    t = ground.terrain
+    return KnownGround(Terrain(t.west, t.south, t.step_m, t.z - np.float32(model.zero_m)), ground.known)
+
+
+def _window(path: Path, epsg: int, bounds: Bounds, most_nodes: int) -> KnownGround:
+    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+    z, left, low, step = _on_area(Path(path), epsg, bounds, None, max(_FINEST_M, float(np.sqrt(area / most_nodes))))
+    known = np.isfinite(z)
+    z = _filled(z, known) if known.any() else np.zeros(z.shape)
+    return KnownGround(Terrain(left, low, step, z.astype(np.float32)), known)
 
 
 def read_dem(
     path: Path,
     epsg: int,
-    bounds: tuple[float, float, float, float],
+    bounds: Bounds,
     *,
     takeoff: ArrayLike | None = None,
     level_m: float | None = None,
@@ -56,10 +146,7 @@ def read_dem(
     z, left, low, step = _on_area(Path(path), epsg, bounds, step_m)
     known = np.isfinite(z)
     if known.mean() < least_cover:
-        raise InputError(
-            f"{Path(path).name} has heights for only {100 * known.mean():.0f} % of the area of the flight "
-            f"(EPSG:{epsg}, east {west:.0f} to {east:.0f}, north {south:.0f} to {north:.0f}); give a DEM that covers it"
-        )
+        raise InputError(_no_cover(path, epsg, bounds, float(known.mean())))
     z = _filled(z, known)
     absolute = Terrain(left, low, step, z.astype(np.float32))
     if level_m is None:
@@ -68,7 +155,26 @@ def read_dem(
     return Terrain(left, low, step, (z - level_m).astype(np.float32))
 
 
-def check_dem(path: Path, epsg: int, bounds: tuple[float, float, float, float], cameras: ArrayLike) -> None:
+def _no_cover(path: Path, epsg: int, bounds: Bounds, cover: float) -> str:
+    west, south, east, north = bounds
+    return (
+        f"{Path(path).name} has heights for only {100 * cover:.0f} % of the area of the flight "
+        f"(EPSG:{epsg}, east {west:.0f} to {east:.0f}, north {south:.0f} to {north:.0f}); give a DEM that covers it"
+    )
+
+
+def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
+    """Refuse ground (N,) above cameras (N,), both over takeoff; NaN where a camera's height is not known."""
+    told = np.isfinite(cameras)
+    if told.any() and float((ground > cameras)[told].mean()) > MOST_BURIED:
+        raise InputError(
+            f"by {Path(path).name} the ground lies above {float((ground > cameras)[told].mean()):.0%} of the cameras "
+            f"(its heights below the flight span {ground.max() - ground.min():.0f} m); check that it is this area's "
+            "and in metres"
+        )
+
+
+def check_dem(path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> None:
     """Look at a DEM before the work begins.
 
     Args:
@@ -82,17 +188,11 @@ def check_dem(path: Path, epsg: int, bounds: tuple[float, float, float, float], 
     terrain = read_dem(path, epsg, bounds, takeoff=at[:, :2] if len(at) else None)
     if not len(at):
         return
-    under = terrain.height(at[:, :2])
-    buried = float((under > at[:, 2]).mean())
-    if buried > MOST_BURIED:
-        raise InputError(
-            f"by {Path(path).name} the ground lies above {buried:.0%} of the cameras (its heights below the flight "
-            f"span {under.max() - under.min():.0f} m); check that it is this area's and in metres"
-        )
+    _refuse_buried(path, terrain.height(at[:, :2]), at[:, 2])
 
 
 def _on_area(
-    path: Path, epsg: int, bounds: tuple[float, float, float, float], step_m: float | None
+    path: Path, epsg: int, bounds: Bounds, step_m: float | None, finest_m: float = _FINEST_M
 ) -> tuple[Array, float, float, float]:
     """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step."""
     import rasterio
@@ -116,7 +216,7 @@ def _on_area(
             raise InputError(f"{name} is a picture ({dataset.count} bands of 8 bit), not heights; give a DEM by --dem")
         try:
             west, south, east, north = bounds
-            step = step_m or _own_step(dataset, epsg, bounds)
+            step = step_m or _own_step(dataset, epsg, bounds, finest_m)
             left, low = float(np.floor(west / step) * step), float(np.floor(south / step) * step)
             columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
             # a pixel about every node: its centre is the node
@@ -152,7 +252,7 @@ def _nodata(dataset: Any) -> float | None:
     return lowest if lowest < -1000.0 else None
 
 
-def _pixel_m(dataset: Any, epsg: int, bounds: tuple[float, float, float, float]) -> float:
+def _pixel_m(dataset: Any, epsg: int, bounds: Bounds) -> float:
     """Side of the DEM's own pixel in metres, about the area's middle."""
     from rasterio.warp import transform
 
@@ -164,9 +264,9 @@ def _pixel_m(dataset: Any, epsg: int, bounds: tuple[float, float, float, float])
     return 100.0 / float(np.sqrt(area)) if np.isfinite(area) and area > 0 else 1.0
 
 
-def _own_step(dataset: Any, epsg: int, bounds: tuple[float, float, float, float]) -> float:
+def _own_step(dataset: Any, epsg: int, bounds: Bounds, finest_m: float) -> float:
     area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
-    return float(max(2.0, round(_pixel_m(dataset, epsg, bounds), 1), np.sqrt(area / 4e6)))
+    return float(max(finest_m, round(_pixel_m(dataset, epsg, bounds), 1), np.sqrt(area / _MOST_NODES)))
 
 
 def _filled(z: Array, known: NDArray[np.bool_]) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.basemap import Basemap
 from orthoswarm.carried import carry, sort_out
-from orthoswarm.dem import check_dem, read_dem
+from orthoswarm.dem import HeightModel, check_dem, read_dem
 from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.partial import disk_error, written_whole
@@ -32,7 +32,7 @@ from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.render import Layer, RenderStats, render, render_layers
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
-from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras
+from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
 from orthoswarm.report.page import write_page
 from orthoswarm.stages import Clock, Stage
 from orthoswarm.vehicles import legs_as_vehicles
@@ -77,11 +77,12 @@ class Options:
 
 @dataclass(slots=True)
 class _Refinement:
-    """What the refiner made: cameras before and after the map, the ground, and the stages' times."""
+    """What the refiner made: cameras before and after the map, the ground, and what concerns all vehicles."""
 
     coarse: list[Solution]
     fine: list[Solution]
     terrain: Terrain | None
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -93,6 +94,7 @@ class _State:
     recorded: Recorded
     gsd_m: float
     basemap: Basemap | None
+    dem: HeightModel | None = None
     warnings: list[str] = field(default_factory=list)
     rejected: dict[str, Rejection] = field(default_factory=dict)
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
@@ -182,11 +184,19 @@ class _Batch:
             near = placed_bounds(recorded.placed, 0.0, 0.0)
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
             warnings += partial_cover(basemap, recorded.placed)
-        if self.options.dem is not None:  # told now, not after the refinement
-            told = [p.camera.position for p in recorded.placed if p.frame.fix.height_m is not None]
-            check_dem(self.options.dem, grid.epsg, placed_bounds(recorded.placed, 0.0, 0.0), told)
+        dem = None if self.options.dem is None else self.height_model(self.options.dem, grid, recorded)
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-        return _State(ingest, grid, recorded, gsd, basemap, warnings, rejected)
+        return _State(ingest, grid, recorded, gsd, basemap, dem, warnings, rejected)
+
+    def height_model(self, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:
+        """The outside height model for the refiner that uses one; a useless one is told now, not after hours."""
+        bounds = placed_bounds(recorded.placed, 0.0, 0.0)
+        at = np.array([p.camera.position for p in recorded.placed])
+        told = np.array([p.frame.fix.height_m is not None for p in recorded.placed])
+        if self.options.refine != "swarm":
+            check_dem(path, grid.epsg, bounds, at[told])
+            return None
+        return HeightModel.open(path, grid.epsg, bounds, np.column_stack([at[:, :2], np.where(told, at[:, 2], np.nan)]))
 
     def realtime(self, state: _State) -> list[PlacedFrame]:
         """The picture from recorded poses; the frames that it holds."""
@@ -220,7 +230,7 @@ class _Batch:
             self.clock.stages += known[1]
             return known[0]
         outer = Clock(self.workers.usage)
-        frames = [p.frame for p in by_kind.fit]
+        frames = told_of_lone_ones(by_kind.fit)
         with outer.stage("refine", len(frames)) as stage:
             try:
                 refinement = self.call_refiner(frames, state)
@@ -247,14 +257,18 @@ class _Batch:
             vehicles.setdefault(frame.vehicle, []).append(frame)
         basemap = state.basemap if self.options.until == "fine" else None
         run = self.space.remembering("vehicle", self.workers.map)
-        refined = refine(vehicles, basemap, state.grid, run=run, progress=self.progress)
+        if state.dem is not None:
+            options = import_module("orthoswarm.swarm.refine").Options(dem=state.dem)
+            refined = refine(vehicles, basemap, state.grid, options, run=run, progress=self.progress)
+        else:
+            refined = refine(vehicles, basemap, state.grid, run=run, progress=self.progress)
         if self.options.refine == "paper":
             state.equation_5 = refined.equation_5()
         strip = [[replace(s, state=None) for s in solutions] for solutions in (refined.coarse, refined.fine)]
-        terrain = refined.terrain
+        terrain, warnings = refined.terrain, list(getattr(refined, "warnings", []))
         del refined  # with the states of all vehicles
         trim_memory()
-        return _Refinement(strip[0], strip[1], terrain)
+        return _Refinement(strip[0], strip[1], terrain, warnings)
 
     def pictures(self, state: _State, refinement: _Refinement | None) -> list[PlacedFrame]:
         """coarse.tif and orthoimage.tif; gives the frames as last placed."""
@@ -269,6 +283,7 @@ class _Batch:
             self.leave_out(state, stats.rejected, placed)
             return [p for p in placed if p.frame.image not in state.rejected]
         terrain = state.terrain = self.ground(state, refinement)
+        state.warnings += refinement.warnings
         for solution in refinement.fine:
             reasons = dict(solution.dropped)
             self.leave_out(state, reasons, state.recorded.placed)
@@ -296,7 +311,7 @@ class _Batch:
 
     def ground(self, state: _State, refinement: _Refinement) -> Terrain | None:
         """The ground under the pictures: found from them, or an outside height model brought to their level."""
-        if self.options.dem is None:
+        if self.options.dem is None or state.dem is not None:  # the refiner has used it
             return refinement.terrain
         fine = [p for s in refinement.fine for p in s.placed]
         level = ground_level(fine, refinement.terrain)

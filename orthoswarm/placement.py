@@ -80,7 +80,7 @@ class Terrain:
         r = np.clip((p[..., 1] - self.south) / self.step_m, 0.0, rows - 1.000001)
         ci, ri = c.astype(np.intp), r.astype(np.intp)
         fc, fr = c - ci, r - ri
-        z = self.z.astype(np.float64, copy=False)
+        z = self.z  # a float32 height times a float64 share is float64: the whole grid need not be converted
         low = z[ri, ci] * (1 - fc) + z[ri, ci + 1] * fc
         high = z[ri + 1, ci] * (1 - fc) + z[ri + 1, ci + 1] * fc
         return np.asarray(low * (1 - fr) + high * fr)

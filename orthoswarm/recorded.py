@@ -6,7 +6,7 @@ no angles are known, yaw from the course flown where there is none. What was ass
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,17 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
             for frame, camera in zip(own, cameras, strict=True)
         ]
     return Recorded(placed, rejected, warnings)
+
+
+def told_of_lone_ones(placed: Sequence[PlacedFrame]) -> list[Frame]:
+    """Frames of recorded cameras; that of a vehicle with a single one has the assumed field of view as its hint.
+
+    A flight tells its field of view by its own pictures, one photo cannot.
+    """
+    count = Counter(p.frame.vehicle for p in placed)
+    return [
+        replace(p.frame, fov_hint_rad=p.camera.lens.fov_rad) if count[p.frame.vehicle] == 1 else p.frame for p in placed
+    ]
 
 
 def _vehicle(

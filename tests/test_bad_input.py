@@ -106,10 +106,17 @@ def test_one_photo_is_mapped(scene, basemap, tmp_path, mosaic):
     for using in (None, basemap):
         code, rows, report, _ = mosaic(tmp_path / "photos", basemap=using, fov_min=82)
         assert code == 0 and report["frames"]["used"] == 1
-        # one photo does not tell its field of view: 75 degrees are assumed for 82, 10.2 m at the corners
-        assert errors(scene, rows, [shot]).max() < 10.5
+        # one photo does not tell its field of view: what the flag says stays
+        assert rows["DJI_0000.JPG"]["fov_deg"] == pytest.approx(82.0, abs=0.1)
+        assert errors(scene, rows, [shot]).max() < 0.5
         with rasterio.open(tmp_path / "out" / "orthoimage.tif") as image:
             assert (image.read(4) > 0).sum() * image.res[0] ** 2 > 5000
+
+
+def test_one_photo_without_a_flag_has_the_field_of_view_of_the_quick_picture(scene, tmp_path, mosaic):
+    scene.fly(tmp_path / "photos", [Shot(10, 5, yaw=30)])
+    rows = mosaic(tmp_path / "photos")[1]
+    assert rows["DJI_0000.JPG"]["fov_deg"] == pytest.approx(70.0, abs=0.1)
 
 
 def test_many_photos_of_one_spot(scene, basemap, tmp_path, mosaic):
@@ -276,3 +283,20 @@ def test_a_height_model_that_is_none_is_refused_before_the_work(scene, tmp_path,
     (tmp_path / "dem.tif").write_text("heights")
     code, _, _, said = mosaic(tmp_path / "photos", dem=tmp_path / "dem.tif")
     assert code == 2 and "no readable height model" in said
+
+
+@pytest.mark.parametrize(
+    ("east_m", "crs", "height", "says"),
+    [(0.0, None, 400.0, "no CRS"), (9000.0, "area", 400.0, "covers"), (0.0, "area", -9999.0, "covers")],
+    ids=["without a CRS", "of another place", "without a height"],
+)
+def test_a_height_model_that_tells_nothing_is_one_clear_error(scene, tmp_path, mosaic, east_m, crs, height, says):
+    scene.fly(tmp_path / "photos", legs(count=1, photos=4))
+    west, north = np.add(scene.middle, (east_m - 400.0, 400.0))
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", driver="GTiff", width=160, height=160, count=1, dtype="float32", nodata=-9999.0,
+        crs=None if crs is None else f"EPSG:{scene.grid.epsg}", transform=rasterio.Affine(5, 0, west, 0, -5, north),
+    ) as dataset:  # fmt: skip
+        dataset.write(np.full((160, 160), height, np.float32), 1)
+    code, _, _, said = mosaic(tmp_path / "photos", dem=tmp_path / "dem.tif")
+    assert code == 2 and says in said.strip().splitlines()[-1]

@@ -5,7 +5,7 @@ the flow (a yaw tag that flips) are turned.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ from orthoswarm.swarm.records import Records
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
+FLOW_SIGMA = 0.03
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -29,6 +31,7 @@ class Calibration:
         trusted_height: False where the recorded height had to be replaced.
         pairs: pairs of pictures that gave an answer.
         warnings: findings in plain words.
+        spread: robust relative sigma of the pairs' answers, infinite where there are too few.
     """
 
     focal_px: float
@@ -37,6 +40,12 @@ class Calibration:
     trusted_height: bool
     pairs: int
     warnings: list[str]
+    spread: float = float("inf")
+
+    @property
+    def focal_sigma(self) -> float:
+        """How well the flow tells the focal length, one relative sigma (receivers drift and lag by some percent)."""
+        return float(np.hypot(FLOW_SIGMA, self.spread / np.sqrt(max(self.pairs, 1))))
 
 
 def calibrate(
@@ -71,8 +80,10 @@ def calibrate(
         return Calibration(f0, h0, np.zeros(len(leg)), usable, len(ratios), [])
     r, owner = np.array(ratios), np.array(owners)
     offset, warnings = _heading(records, leg, r, owner)
-    scale = float(np.median(np.abs(r)))
-    return _with_scale(f0, h0, scale, usable, width, offset, len(r), warnings)
+    factor = np.abs(r)
+    scale = float(np.median(factor))
+    found = _with_scale(f0, h0, scale, usable, width, offset, len(r), warnings)
+    return replace(found, spread=1.4826 * float(np.median(np.abs(factor / scale - 1.0))))
 
 
 def _with_scale(

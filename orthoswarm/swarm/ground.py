@@ -1,12 +1,13 @@
 """The ground under one vehicle during its adjustment: fitted to the points, used as their height prior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.placement import Terrain
 from orthoswarm.swarm.adjust import Adjustment, Ground
+from orthoswarm.swarm.given import Given, GivenFit, fit_given
 from orthoswarm.swarm.surface import FitSettings
 from orthoswarm.swarm.terrain import TerrainFit, fit_terrain
 
@@ -18,19 +19,24 @@ class GroundModel:
     """Ground as it is believed now.
 
     Attributes:
-        fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`).
+        fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`, or has
+            the given shape).
         level_m: height that the middle of the ground should have (0: the takeoff level).
         lift_m: ground between the points over the fitted surface (corners sit on raised things, so it is negative).
+        given: shape of the ground from outside, None to find it from the points.
+        contradicted_m: how far the ground is from the shape that was given but is not used any more, median.
     """
 
-    fit: TerrainFit | None = None
+    fit: TerrainFit | GivenFit | None = None
     level_m: float = 0.0
     lift_m: float = 0.0
+    given: Given | None = None
+    contradicted_m: float = 0.0
 
     def height(self, xy: Array) -> Array:
         """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""
         if self.fit is None:
-            return np.full(len(xy), self.level_m)
+            return self._begun(xy)
         return np.asarray(self.terrain().height(xy))
 
     def terrain(self) -> Terrain:
@@ -40,10 +46,14 @@ class GroundModel:
     def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> Ground:
         """The height prior of points (P, 3)."""
         if self.fit is None:
-            expected = np.full(len(points), self.level_m)
+            expected = self._begun(points[:, :2])
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
         return Ground(expected, sigma_m, 20.0, c)
+
+    def _begun(self, xy: Array) -> Array:
+        level = np.full(len(xy), self.level_m)
+        return level if self.given is None else level + self.given.height(xy)
 
 
 def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:
@@ -75,5 +85,9 @@ def fit_surface(
     reach = 0.9 * float(np.median(adjustment.rig.position[:, 2])) * 1.2
     low, high = position.min(0) - reach, position.max(0) + reach
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    fit = fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings)
-    return GroundModel(fit, before.level_m, before.lift_m)
+    if before.given is not None:
+        fit, off = fit_given(before.given, points, sigma, bounds, kappa=kappa, settings=settings)
+        if fit is not None:
+            return replace(before, fit=fit)
+        before = replace(before, given=None, contradicted_m=off)  # for good: its level is another than the points' own
+    return replace(before, fit=fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings))

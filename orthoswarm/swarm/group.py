@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Terrain
+from orthoswarm.swarm.given import Given, fit_given
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.state import VehicleState
 from orthoswarm.swarm.surface import FitSettings
@@ -18,6 +19,12 @@ from orthoswarm.swarm.ties import MapMatches, vote_lean
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
+DIFFERS_M = 0.2
+"""What is left over a height model is worth a word from here on."""
+DRAWN_NODES = 4_000_000
+"""Nodes of the ground that pictures are drawn on; tasks get the part that they need."""
+WHOLE = 0.97
+"""A height model that covers more than this of the area covers it."""
 DRAWN = FitSettings(held_out_se=1.0)
 """The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
 
@@ -70,17 +77,50 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
 
 
-def common_terrain(states: Sequence[VehicleState]) -> Terrain | None:
-    """One surface over all vehicles for rendering, in the local frame; None where there are too few points."""
+def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -> tuple[Terrain | None, list[str]]:
+    """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
+
+    A given shape of the ground is brought to their level; where the points contradict it, a warning says so.
+    """
     if not states:
-        return None
+        return None, []
     own = [ground_points(s.flight.adjustment) for s in states]
     points = np.concatenate([p for p, _ in own] + [s.dense[0] for s in states])
     sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
     if len(points) < 60:
-        return states[0].surface.terrain()
+        return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.rig.position for s in states])
     reach = 1.1 * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    fit = fit_terrain(points, sigma, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), settings=DRAWN)
-    return fit.rendering(float(np.median([s.surface.lift_m for s in states])))
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    lift = float(np.median([s.surface.lift_m for s in states]))
+    fit, off = None, 0.0
+    if given is not None:
+        fit, off = fit_given(given, points, sigma, bounds, settings=DRAWN, most_nodes=DRAWN_NODES)
+    drawn = fit or fit_terrain(points, sigma, bounds, settings=DRAWN)
+    return drawn.rendering(lift), _doubts(given, fit is None, off, states) if given is not None else []
+
+
+def _doubts(given: Given, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
+    """What has to be said of a height model."""
+    name = given.model.path.name
+    if unused:
+        return [
+            f"{name} contradicts the pictures (their ground differs from it by {off_m:.1f} m in the median), so the "
+            "ground found from them is used; check the file"
+        ]
+    out = []
+    doubted = [s for s in states if s.surface.contradicted_m > 0.0]
+    if doubted:
+        who = ", ".join(sorted({s.vehicle for s in doubted}))
+        off = max(s.surface.contradicted_m for s in doubted)
+        out.append(f"{name} contradicts the pictures of {who} by {off:.1f} m in the median; check it")
+    elif off_m > DIFFERS_M:
+        out.append(
+            f"the ground differs from {name} by {off_m:.1f} m in the median: it is coarse, old or displaced; the "
+            "pictures are followed where they differ from it"
+        )
+    if given.model.cover < WHOLE:
+        share = given.model.cover
+        out.append(f"{name} has heights on {share:.0%} of the area; elsewhere the ground is found from the pictures")
+    return out

@@ -21,6 +21,9 @@ from orthoswarm.swarm.rig import HEIGHT, WIDTH, F, Rig
 Array = NDArray[np.float64]
 Gray = Callable[[int], NDArray[np.uint8]]
 
+STEEPEST = 1.5
+"""Ground is no steeper for a patch: a given height model has walls, and no patch is a plane across one."""
+
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
@@ -187,7 +190,7 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
     z = terrain.height(cells)
     ge = (terrain.height(cells + e) - terrain.height(cells - e)) / (2 * reach)
     gn = (terrain.height(cells + n) - terrain.height(cells - n)) / (2 * reach)
-    return np.stack([z, ge, gn], 1)
+    return np.stack([z, np.clip(ge, -STEEPEST, STEEPEST), np.clip(gn, -STEEPEST, STEEPEST)], 1)
 
 
 def _sweep_in_windows(

@@ -138,6 +138,8 @@ def _rectify(  # type: ignore[no-untyped-def]
             first += 1
         while first <= last and not _inside(last, half_u, um, ua, ub, vm, va, vb, rows, columns):
             last -= 1
+        if _leaves(first, last, half_u, um, ua, ub, columns) or _leaves(first, last, half_u, vm, va, vb, rows):
+            return 1, 0
         for i in range(first, last + 1):
             s = (i - half_u) / half_u
             uu, vv = um + s * (ua + s * ub), vm + s * (va + s * vb)
@@ -155,6 +157,18 @@ def _inside(i, half_u, um, ua, ub, vm, va, vb, rows, columns):  # type: ignore[n
     s = (i - half_u) / half_u
     u, v = um + s * (ua + s * ub), vm + s * (va + s * vb)
     return u >= 0.0 and v >= 0.0 and u < columns - 1.0 and v < rows - 1.0
+
+
+@kernel
+def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-untyped-def]
+    """True where a row that begins and ends in the picture bends out of it in between (on a cliff)."""
+    if bend == 0.0:
+        return False
+    s = -0.5 * slope / bend
+    if not (first - half_u <= s * half_u <= last - half_u):
+        return False
+    extreme = middle + 0.5 * s * slope
+    return not (extreme >= 0.0 and extreme < size - 1.0)
 
 
 @kernel

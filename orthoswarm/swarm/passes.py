@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.camera import fov_rad
+from orthoswarm.dem import HeightModel
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
+from orthoswarm.swarm.given import Given
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.legs import leads_one_way
@@ -22,7 +24,8 @@ from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
-from orthoswarm.swarm.sigma import frame_sigmas
+from orthoswarm.swarm.sigma import frame_sigmas, unexplained
+from orthoswarm.swarm.snapshot import Snapshot
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.swarm.ties import MapMatches
@@ -38,6 +41,16 @@ TIE_SHARE = 0.5
 """Part of the ties' scatter that neighbouring ties have in common (terrain, map content), so that no number helps."""
 ONE_WAY_FOV_SIGMA_DEG = 5.0
 """Of photos on one straight way: tilt, height and lens stand for each other (11 such legs of a suburb: 5.6 rms)."""
+SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
+"""Robust scales of the steps without a map, from far off; WARY is for a start that is known to be near."""
+WARY = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
+FLOW_PAIRS = 6
+RUNAWAY, RUNAWAY_SIGMAS = 0.15, 5.0
+"""A focal length that leaves what the flow of so many pairs told by this share and so many sigmas is not believed."""
+FOV_SIGMAS, FOV_MOVES_DEG = 6.0, 4.0
+"""A place on the map that moves the field of view by more than this is not believed."""
+COHERENT = 2.0
+"""Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
 MAP_FLOOR_PX = 0.13
 """What no residual tells (map content that stands above the ground everywhere), in pixels of the compared map."""
 
@@ -49,10 +62,18 @@ class Options:
     Attributes:
         fov_start_rad: field of view to start from where the tags hint at none.
         work_width: pictures wider than this are reduced for the refinement.
+        dem: shape of the ground from outside, None to find it from the pictures.
     """
 
     fov_start_rad: float = float(np.radians(80.0))
     work_width: int = 960
+    dem: HeightModel | None = None
+
+    def ground(self, origin: Array) -> GroundModel:
+        """What is known of the ground before a picture is looked at, in the frame with this origin."""
+        if self.dem is None:
+            return GroundModel()
+        return GroundModel(given=Given(self.dem, (float(origin[0]), float(origin[1]))))
 
 
 def read_frame(frame: Frame) -> NDArray[np.uint8]:
@@ -69,7 +90,7 @@ def solo(
         watch = Stopwatch()
         flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
         watch.lap("tracks")
-        state = from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, watch)
+        state = from_flight(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, watch)
     return state
 
 
@@ -84,15 +105,15 @@ def followed(
     watch.lap("tracks")
     if flight is None:
         return None
-    surface = relative(flight)
+    surface = relative(flight, options.ground(origin))
     if len(frames) < FEW and strong_lens(flight):
         return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
     return from_flight(flight, surface, origin, basemap, watch)
 
 
-def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None) -> VehicleState:
+def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options) -> VehicleState:
     """Refine one vehicle whose photos were matched and adjusted together with those of others."""
-    return from_flight(flight, fit_surface(flight.adjustment, GroundModel()), origin, basemap, Stopwatch())
+    return from_flight(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, Stopwatch())
 
 
 def from_flight(
@@ -119,10 +140,36 @@ def from_flight(
     return state
 
 
-def relative(flight: Flight) -> GroundModel:
-    """The adjustment without a map, its ground fitted as soon as the points allow."""
-    surface = GroundModel()
-    schedule = [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]
+def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
+    """The adjustment without a map, its ground fitted as soon as the points allow (surface: what is known of it)."""
+    surface = surface or GroundModel()
+    begun = Snapshot.of(flight.adjustment)
+    found = _relative(flight, surface, SCHEDULE)
+    if ran_away(flight):
+        # A few wrong tracks, far off, threw it out of the valley before it could tell that they are wrong.
+        flight.adjustment = begun.restored()
+        found = _relative(flight, surface, WARY)
+    if ran_away(flight):
+        flight.adjustment = begun.restored()
+        p = flight.adjustment.priors
+        sigma = p.lens_sigma.copy()
+        sigma[:, 0] = flight.calibration.focal_sigma
+        flight.adjustment.priors = replace(p, lens_sigma=sigma)
+        found = _relative(flight, surface, WARY)
+    return found
+
+
+def ran_away(flight: Flight) -> bool:
+    """True if the focal length is far from what the flow of the pictures told: another minimum was found."""
+    told = flight.calibration
+    if told.pairs < FLOW_PAIRS or not told.trusted_height or not np.isfinite(told.spread):
+        return False
+    away = abs(float(np.log(flight.adjustment.rig.lens[0, F] / told.focal_px)))
+    return away > max(RUNAWAY, RUNAWAY_SIGMAS * told.focal_sigma)
+
+
+def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -> GroundModel:
+    schedule = list(schedule)
     for k, c in enumerate(schedule):
         first = k < 2
         flight.adjustment.step(
@@ -146,9 +193,21 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
     if fit is None:
         flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
         return
+    before, alone, sigma = Snapshot.of(flight.adjustment), state.surface, state.fov_sigma_deg
     shift_cameras(flight, fit.correction)
-    state.map_shift = fit.correction
     settled = settle(flight, basemap, origin, state.surface)
+    told, now = (
+        float(np.degrees(fov_rad(float(a.rig.lens[0, F]), flight.pictures.size[0])))
+        for a in (before, flight.adjustment)
+    )
+    if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, _level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
+        flight.adjustment = before.restored()
+        flight.warnings.append(
+            f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
+            "found on the map is not believed"
+        )
+        return
+    state.map_shift = fit.correction
     state.surface, state.ties, state.matches, state.roofs = (
         settled.surface,
         settled.ties,
@@ -213,6 +272,10 @@ def second_pass(
     elif not state.on_map:
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
+    if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
+        off = unexplained(flight.leg, state.matches.camera, adj.tie_residual)
+        off[off < COHERENT * state.sigma_m] = 0.0
+        state.sigma_m = np.hypot(state.sigma_m, off)
     release(flight)
     if not flight.sparse:
         steady_weak(flight, state.sigma_m)

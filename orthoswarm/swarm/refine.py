@@ -18,7 +18,7 @@ from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
-from orthoswarm.recorded import recorded_cameras
+from orthoswarm.recorded import recorded_cameras, told_of_lone_ones
 from orthoswarm.swarm.beside import lay_beside
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.group import Run, common_terrain, local_origin, neighbours_of, pooled_lean, serial
@@ -46,11 +46,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """Products of the refinement of a batch: the same vehicles before and after the map; state is in `fine`."""
+    """Products of the refinement of a batch: the same vehicles before and after the map; state is in `fine`.
+
+    Warnings are those that concern all vehicles.
+    """
 
     coarse: list[Solution]
     fine: list[Solution]
     terrain: Terrain | None
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,7 @@ class SwarmRefiner:
         recorded = recorded_cameras(frames, LocalGrid(self.epsg))
         kinds = sort_out(recorded.placed)
         if kinds.fit:
-            solution = self._refined([p.frame for p in kinds.fit], neighbours, basemap)
+            solution = self._refined(told_of_lone_ones(kinds.fit), neighbours, basemap)
         else:
             solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
         odd = carry(kinds.odd, kinds.fit, solution.placed)
@@ -101,7 +105,7 @@ class SwarmRefiner:
             beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
             item = (own[k], beside, float(network.correction_m[k]) - anchor)
             done[k] = second_pass(item, basemap=basemap, origin=self.origin)
-        terrain = _shifted(common_terrain([*done, *others]), self.origin)
+        terrain = _shifted(common_terrain([*done, *others], self.options.ground(self.origin).given)[0], self.origin)
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
 
@@ -140,14 +144,17 @@ def refine_all(
     if not vehicles:
         raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
-    states = _first_passes(split_units(vehicles), basemap, grid, origin, options or Options(), run, progress)
+    options = options or Options()
+    states = _first_passes(split_units(vehicles), basemap, grid, origin, options, run, progress)
     coarse = [to_solution(s, origin, None, coarse=True) for s in states]
     states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
     _level(states)
-    terrain = _shifted(common_terrain(states), origin)
+    given = options.ground(origin).given
+    terrain, warnings = common_terrain(states, given)
+    terrain = _shifted(terrain, origin)
     lean = pooled_lean(states)
     fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
-    return Refined(merge_units(coarse), merge_units(fine), terrain)
+    return Refined(merge_units(coarse), merge_units(fine), terrain, warnings)
 
 
 def _first_passes(
@@ -171,7 +178,9 @@ def _first_passes(
         watch = Stopwatch()
         flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, run, progress)
         watch.lap("tracks")
-        for k, state in zip(waiting, run(partial(matched, origin=origin, basemap=basemap), flights), strict=True):
+        for k, state in zip(
+            waiting, run(partial(matched, origin=origin, basemap=basemap, options=options), flights), strict=True
+        ):
             state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
             states[k] = state
     return [state for state in states if state is not None]

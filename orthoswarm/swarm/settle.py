@@ -22,6 +22,10 @@ TIE_SIGMA_M = 0.35
 TIE_SIGMA_LIMITS_M = (0.1, 1.0)
 FEWEST_TO_WEIGH = 20
 LINK_SIGMA_PX = 0.7
+FEWEST_ON_LINE, LEAST_ON_LINE = 6, 0.6
+"""So many matches of a leg, and this share of them, must agree on a line of shifts."""
+ON_LINE_M, OFF_LINE_M = 0.7, 0.7
+"""How near to the line they lie; a leg that is nowhere farther off than this finds its place by itself."""
 
 
 @dataclass(slots=True)
@@ -83,6 +87,53 @@ def mode_shift(shift: Array) -> Array:
         w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
         centre = (shift * w[:, None]).sum(0) / w.sum()
     return np.asarray(centre)
+
+
+def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
+    """Move the cameras to where their first matches are, and give the matches as they are from there.
+
+    All cameras by the shift that most matches agree on, and a leg whose own matches lie on another line by that line:
+    where the chain of pictures broke at a corner the coarse correction of the two legs runs into one another, and an
+    adjustment would take the right matches at the beginning of a leg for wrong ones.
+    """
+    points = flight.adjustment.points[matches.point].copy()
+    correction = leg_corrections(flight.leg, matches, mode_shift(matches.shift))
+    shift_cameras(flight, correction)
+    moved = flight.adjustment.points[matches.point, :2] - points[:, :2]
+    return replace(matches, shift=matches.shift - moved)
+
+
+def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
+    """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
+    out = np.tile(common, (len(leg), 1))
+    for k in np.unique(leg[leg >= 0]):
+        members = np.flatnonzero(leg == k)
+        mine = leg[matches.camera] == k
+        if int(mine.sum()) < FEWEST_ON_LINE:
+            continue
+        t = matches.camera[mine] - members.mean()
+        line, agree = _line(t, matches.shift[mine])
+        if int(agree.sum()) < max(FEWEST_ON_LINE, LEAST_ON_LINE * len(t)):
+            continue
+        ends = np.clip(members - members.mean(), t[agree].min(), t[agree].max())
+        own = line[0] + line[1] * ends[:, None]
+        if np.hypot(*(own - common).T).max() > OFF_LINE_M:
+            out[members] = own
+    between, within = np.flatnonzero(leg < 0), np.flatnonzero(leg >= 0)
+    if len(between) and len(within):
+        out[between] = np.column_stack([np.interp(between, within, out[within, a]) for a in range(2)])
+    return out
+
+
+def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
+    a = np.column_stack([np.ones(len(t)), t])
+    line = np.array([mode_shift(shift), np.zeros(2)])
+    for scale in (4.0, 2.0, 1.0, 0.7, 0.5, 0.5):
+        off = ((shift - a @ line) ** 2).sum(1)
+        w = 1.0 / (1.0 + off / scale**2) ** 2
+        line = np.linalg.solve((a * w[:, None]).T @ a + 1e-9 * np.eye(2), (a * w[:, None]).T @ shift)
+    return line, np.asarray(np.hypot(*(shift - a @ line).T) < ON_LINE_M)
 
 
 def as_ties(matches: MapMatches, points: Array) -> Ties:
@@ -157,8 +208,7 @@ def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundMod
     """
     ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
     matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
-    shift_cameras(flight, np.broadcast_to(mode_shift(matches.shift), (len(flight.frames), 2)).copy())
-    matches = replace(matches, shift=matches.shift - mode_shift(matches.shift))
+    matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)

@@ -10,6 +10,7 @@ from orthoswarm.swarm.rig import WIDTH, F
 Array = NDArray[np.float64]
 
 EVERY = 24
+FEWEST_TIES = 4
 RADIAL = 1.25
 """A frame's ground error has two axes: this times the sigma of one holds about two thirds of the errors."""
 
@@ -29,6 +30,33 @@ def frame_sigmas(
     f, width = float(lens[F]), int(lens[WIDTH])
     fov_sigma = abs(fov_rad(f * (1 + spread), width) - fov_rad(f * (1 - spread), width)) / 2
     return RADIAL * sigma, float(np.degrees(fov_sigma))
+
+
+def unexplained(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array, near: int = 4) -> Array:
+    """How far the map is from each picture where its ties agree on that and were not followed, float64 (N,), metres.
+
+    A few ties that are off alone are wrong matches, or ground that changed; if most of those around a picture are
+    off by the same, the picture is, or it cannot be told.
+
+    Args:
+        leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2).
+        near: ties of so many pictures before and after it, of the same leg, count.
+    """
+    out = np.zeros(len(leg))
+    order = np.argsort(camera, kind="stable")
+    camera, residual = camera[order], residual[order]
+    first, last = (
+        np.searchsorted(camera, np.arange(len(leg)) - near),
+        np.searchsorted(camera, np.arange(len(leg)) + near, side="right"),
+    )
+    for i, (a, b) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        mine = residual[a:b][leg[camera[a:b]] == leg[i]]
+        if len(mine) < FEWEST_TIES:
+            continue
+        middle = np.median(mine, axis=0)
+        spread = 1.4826 * float(np.median(np.abs(mine - middle)))
+        out[i] = max(0.0, float(np.hypot(*middle)) - 2.0 * 1.25 * spread / np.sqrt(len(mine)))
+    return out
 
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
