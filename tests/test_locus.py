@@ -10,6 +10,7 @@ from orthoswarm.camera import rotation_from_angles
 from orthoswarm.placement import Terrain
 from orthoswarm.swarm.lift import draw_positions, ground_lift, mode
 from orthoswarm.swarm.locus import LARGE, dense_ground
+from orthoswarm.swarm.locus_kernels import _leaves
 from orthoswarm.swarm.rig import Rig
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 190.0
@@ -223,3 +224,24 @@ def test_the_mode_ignores_a_long_tail():
     rng = np.random.default_rng(0)
     values = np.r_[rng.normal(-0.3, 0.1, 300), rng.uniform(-0.5, 8, 500)]
     assert mode(values, 0.2) == pytest.approx(-0.28, abs=0.08)
+
+
+def test_a_wall_in_the_terrain_reads_no_pixel_outside_a_picture():
+    rig, leg = rig_of()
+    pictures = Pictures(rig, lambda xy: np.zeros(xy.shape[:-1]))
+    z = np.zeros((60, 60), np.float32)
+    z[:, 30:] = 45.0  # a stadium in a height model, 2 m nodes: slopes of 20
+    wall = Terrain(-20.0, 0.0, 2.0, z)
+    cells = np.stack(np.meshgrid(np.linspace(20.0, 60.0, 60), np.linspace(20.0, 90.0, 20)), -1).reshape(-1, 2)
+    found = dense_ground(rig, pictures, cells, wall, leg)
+    assert np.isfinite(found.points).all()
+
+
+@pytest.mark.parametrize(
+    ("bend", "inside"), [(0.0, True), (10.0, True), (60.0, False), (-30.0, False)], ids=lambda value: str(value)
+)
+def test_a_row_that_bends_out_of_the_picture_is_known(bend, inside):
+    # u(s) = 50 - bend + bend s^2 for s = -1..1: both ends at 50 of 60 columns
+    middle = 50.0 - bend
+    assert bool(_leaves(0, 20, 10, middle, 0.0, bend, 60)) is not inside
+    assert not _leaves(18, 20, 10, middle, 2.0 * bend, bend, 1e9)  # the turning point lies outside the used columns

@@ -1,0 +1,124 @@
+"""Refinement over a ground with relief whose height model is given: right, in part, of another place."""
+
+import csv
+import pickle
+
+import numpy as np
+import pytest
+import rasterio
+
+from orthoswarm.basemap import Basemap
+from orthoswarm.dem import HeightModel
+from orthoswarm.extent import placed_bounds
+from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.recorded import recorded_cameras
+from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all
+from orthoswarm.twin.make import make_twin
+from orthoswarm.twin.presets import spec
+from telemetry import load
+from tests.test_swarm_refine import errors
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("twin") / "tiny"
+    make_twin(spec("tiny", seed=3, relief_m=8.0), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(twin):
+    frames = load([twin / "photos"]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
+    with (twin / "truth" / "frames.csv").open() as file:
+        truth = {row["image"]: row for row in csv.DictReader(file)}
+    with rasterio.open(twin / "truth" / "dtm.tif") as dataset:
+        heights, transform = dataset.read(1), dataset.transform
+    return vehicles, grid, Basemap.open(twin / "basemap.tif", grid.epsg), truth, (heights, transform)
+
+
+def options(folder, scene, heights):
+    """The refiner's options with a DEM of these heights (NaN for none), 37 m over the twin's own datum."""
+    vehicles, grid, _, _, (_, transform) = scene
+    path = folder / "dem.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=heights.shape[1], height=heights.shape[0], count=1, dtype="float32",
+        crs=f"EPSG:{grid.epsg}", transform=transform, nodata=float("nan"),
+    ) as dataset:  # fmt: skip
+        dataset.write((heights + 37.0).astype(np.float32), 1)
+    placed = recorded_cameras([f for frames in vehicles.values() for f in frames], grid).placed
+    at = [p.camera.position for p in placed]
+    return Options(dem=HeightModel.open(path, grid.epsg, placed_bounds(placed, 0.0, 0.0), at))
+
+
+def through_pickle(function, items):
+    """Run tasks as processes would: what goes there and what comes back is pickled."""
+    for item in items:
+        f, i = pickle.loads(pickle.dumps((function, item)))
+        yield pickle.loads(pickle.dumps(f(i)))
+
+
+def off_ground(refined, scene):
+    """The drawn ground under the pictures less the true one, about its median."""
+    heights, transform = scene[4]
+    xy = np.concatenate([[p.camera.nadir for p in s.placed] for s in refined.fine])
+    column, row = (np.floor(v).astype(int) for v in ~transform * (xy[:, 0], xy[:, 1]))
+    error = refined.terrain.height(xy) - heights[row, column]
+    return error - np.median(error)
+
+
+def all_errors(refined, scene):
+    return np.concatenate([errors(s, scene[3], scene[1]) for s in refined.fine])
+
+
+@pytest.fixture(scope="module")
+def without(scene):
+    vehicles, grid, basemap, _, _ = scene
+    return refine_all(vehicles, basemap, grid)
+
+
+def test_a_right_model_gives_the_ground_and_the_map_is_as_good(scene, without, tmp_path):
+    vehicles, grid, basemap, _, (heights, _) = scene
+    given = options(tmp_path, scene, heights)
+    refined = refine_all(vehicles, basemap, grid, given)
+    assert refined.warnings == []
+    assert np.abs(off_ground(refined, scene)).max() < 0.3
+    assert np.percentile(np.abs(off_ground(refined, scene)), 90) < np.percentile(np.abs(off_ground(without, scene)), 90)
+    assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.05
+    assert all(leg.state == "matched" for s in refined.fine for leg in s.legs)
+    processes = refine_all(vehicles, basemap, grid, given, through_pickle)
+    for one, other in zip(refined.fine, processes.fine, strict=True):
+        assert len(pickle.dumps(one.state.surface)) < 60_000  # no raster travels
+        for p, q in zip(one.placed, other.placed, strict=True):
+            np.testing.assert_array_equal(p.camera.position, q.camera.position)
+    np.testing.assert_array_equal(refined.terrain.z, processes.terrain.z)
+
+
+def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):
+    vehicles, grid, basemap, _, (heights, _) = scene
+    half = heights.copy()
+    half[:, : heights.shape[1] // 2] = np.nan
+    refined = refine_all(vehicles, basemap, grid, options(tmp_path, scene, half))
+    assert any("elsewhere the ground is found from the pictures" in w for w in refined.warnings)
+    assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.05
+    assert np.percentile(np.abs(off_ground(refined, scene)), 90) < 1.2 * np.percentile(
+        np.abs(off_ground(without, scene)), 90
+    )
+
+
+def test_a_model_of_another_place_is_told_and_does_no_harm(scene, without, tmp_path):
+    vehicles, grid, basemap, _, (heights, _) = scene
+    refined = refine_all(vehicles, basemap, grid, options(tmp_path, scene, 3.0 * heights[::-1, ::-1]))
+    assert any("contradicts" in w for w in refined.warnings)
+    assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.1
+    assert np.abs(off_ground(refined, scene)).max() < np.abs(off_ground(without, scene)).max() + 0.5
+
+
+def test_a_single_vehicle_is_refined_over_a_model_too(scene, tmp_path):
+    vehicles, grid, basemap, truth, (heights, _) = scene
+    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
+    name, frames = next(iter(vehicles.items()))
+    refiner = SwarmRefiner(grid.epsg, origin, options(tmp_path, scene, heights))
+    solution = refiner.refine(frames, [], basemap)
+    assert solution.vehicle == name and np.median(errors(solution, truth, grid)) < 0.4
