@@ -163,6 +163,13 @@ def test_what_travels_between_processes_is_small_and_gives_the_same_ground(tmp_p
     np.testing.assert_array_equal(again.prior(1.0).height(probe()), fit.prior(1.0).height(probe()))
 
 
+def test_what_an_earlier_version_kept_is_read():
+    old = object.__new__(GroundModel)
+    old.__setstate__([None, 1.5, -0.2])
+    assert old == GroundModel(level_m=1.5, lift_m=-0.2)
+    assert pickle.loads(pickle.dumps(old)) == old
+
+
 def test_zero_is_the_ground_below_the_cameras_that_the_model_knows(tmp_path):
     path = write(tmp_path / "dem.tif", lambda xy: 0.05 * xy[..., 0], known=lambda xy: xy[..., 0] < 200.0)
     model = HeightModel.open(path, EPSG, AREA, cameras())
