@@ -199,6 +199,12 @@ def serving(workspace: Path, *arguments: str, port: int = 0):
         stop(served)
 
 
+def exported(jobs: list[dict]) -> bool:
+    """Whether products were written, and nothing else is to be done."""
+    wrote = any(job["kind"] == "export" and job["state"] == "done" for job in jobs)
+    return wrote and all(job["state"] in ("done", "failed") for job in jobs)
+
+
 def tile_over(camera: Camera, zoom=19) -> tuple[int, int, int]:
     """The web tile that holds the ground below a camera."""
     lat, lon = np.radians(GRID.to_geographic(camera.position[:2]))

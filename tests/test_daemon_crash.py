@@ -75,6 +75,7 @@ def test_nothing_acknowledged_is_lost_when_it_is_killed(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_nothing_acknowledged_is_lost_over_many_kills(tmp_path):
     for seed in range(4):
         kill_again_and_again(tmp_path / f"w{seed}", kills=8, seed=seed)

@@ -4,13 +4,12 @@ import json
 import math
 import queue
 import threading
-import time
 
 import pytest
 
 from gcs_plugin.sim.motion import Airframe
 from gcs_plugin.sim.swarm import SimSwarm, make_swarm
-from tests.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
+from tests.daemon_kit import GRID, Shot, camera_at, exported, jpeg, pose_of, serving
 from tests.mosaic_scene import EAST, NORTH
 
 
@@ -60,9 +59,17 @@ def flown(tmp_path):
 
 
 def fly(served, vehicle, plan, mission=None):
+    upload(served, vehicle, plan, mission)
+    start(served, vehicle)
+
+
+def upload(served, vehicle, plan, mission=None):
     body = {"plan": plan, **({"mission": mission} if mission else {})}
     answer = served.command(f"/api/missions/{vehicle}/upload", body)
     assert answer.status_code == 200, answer.text
+
+
+def start(served, vehicle):
     answer = served.command(f"/api/missions/{vehicle}/start")
     assert answer.status_code == 200, answer.text
 
@@ -76,9 +83,11 @@ def test_completion_starts_the_refinement_while_the_others_fly(flown):
     number = plan.json()["id"]
     assert served.get("/api/plans").json()[0]["covered_share"] > 0.99
     assert served.get(f"/api/plans/{number}/map").json()["type"] == "FeatureCollection"
-    fly(served, "v1", number)
-    time.sleep(1.5)
-    fly(served, "v2", number)
+    for vehicle in ("v1", "v2"):
+        upload(served, vehicle, number)
+    start(served, "v1")
+    served.until("/api/vehicles", lambda rows: any(r["id"] == "v1" and r["mission"]["item"] >= 3 for r in rows))
+    start(served, "v2")
     jobs = served.until("/api/jobs", lambda rows: any(r["kind"] == "refine" and r["state"] == "done" for r in rows))
     first = next(job for job in jobs if job["kind"] == "refine")
     assert first["vehicle"] == "v1"
@@ -93,7 +102,7 @@ def test_completion_starts_the_refinement_while_the_others_fly(flown):
     rows = served.get("/api/frames?vehicle=v1").json()
     assert {row["stage"] for row in rows} <= {"coarse", "rejected"}
     assert served.get("/api/legs").json()["features"]
-    served.until("/api/jobs", lambda rows: rows[-1]["kind"] == "export" and rows[-1]["state"] == "done")
+    served.until("/api/jobs", exported)
     assert (workspace / "orthoimage.tif").exists()
     products_are_written(served, workspace)
     second_sortie(served, number)

@@ -18,7 +18,7 @@ from orthoswarm.geo import LocalGrid
 
 GRID = LocalGrid(32631)
 OFF_M = np.array([2.0, -2.2])
-LIMIT_S = 300.0
+LIMIT_S = 200.0
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +78,15 @@ def after_job(daemon, count):
         time.sleep(0.05)
 
 
+def after_all(daemon):
+    """Wait until all pictures are refined; gives the refinements."""
+    end = time.monotonic() + LIMIT_S
+    while set(stages(daemon).values()) != {"fine"}:
+        assert time.monotonic() < end, [job.document() for job in daemon.jobs.all()]
+        time.sleep(0.05)
+    return after_job(daemon, 1)
+
+
 def stages(daemon):
     return {row["image"]: row["stage"] for row in daemon.frames()}
 
@@ -93,9 +102,9 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert refined.detail["frames"] == 17
     note = daemon.completions()
     post(daemon, late)
-    _, beside = after_job(daemon, 2)
-    assert (beside.state, beside.detail["trigger"], beside.detail["beside"]) == ("done", "late", 3), beside.message
-    assert set(stages(daemon).values()) == {"fine"}
+    beside = after_all(daemon)[1:]  # one job, or more where they came slowly
+    assert {(job.state, job.detail["trigger"]) for job in beside} == {("done", "late")}
+    assert sum(job.detail["beside"] for job in beside) == 3
     assert daemon.completions() == note  # what the completion led to stays as it was
     row = daemon.journal.one("SELECT path FROM solutions")
     placed = {
@@ -108,11 +117,10 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
         assert one.sigma_m < 1.5
         assert not one.weak
     post(daemon, frames[20:])  # with the three they are more than a handful
-    *_, again = after_job(daemon, 3)
+    again = after_all(daemon)[-1]
     assert again.state == "done", again.message
     assert "beside" not in again.detail
     assert again.detail["frames"] == 28
-    assert set(stages(daemon).values()) == {"fine"}
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
 
 
@@ -161,7 +169,7 @@ def test_silence_is_told_however_few_pictures_came(monkeypatch):
         while len(silent) < count:
             assert time.monotonic() < end
             time.sleep(0.01)
-    time.sleep(0.5)
+    time.sleep(0.3)
     watch.close()
     assert silent == [("v1", 1)] * 2  # once for each silence
     assert asked == []

@@ -30,7 +30,7 @@ from orthoswarm.errors import InputError
 from orthoswarm.geo import LocalGrid, utm_epsg
 from telemetry.sample import Sample
 from telemetry.stream import open_stream
-from tests.daemon_kit import _end_with_us, serving
+from tests.daemon_kit import _end_with_us, exported, serving
 
 ADDRESSES = [a.strip() for a in os.environ.get("ORTHOSWARM_SITL", "").split(",") if a.strip()]
 HOME = (-35.363262, 149.165237, 584.0)  # ArduPilot's own default: far from the twin's city, south of the equator
@@ -198,7 +198,7 @@ def fly(served, name, pace):
 
 
 def products(served, workspace):
-    served.until("/api/jobs", lambda rows: rows[-1]["kind"] == "export" and rows[-1]["state"] in ("done", "failed"))
+    served.until("/api/jobs", exported)
     return json.loads((workspace / "report.json").read_text())
 
 

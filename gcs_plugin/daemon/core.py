@@ -284,7 +284,10 @@ class Daemon:
 
     def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
         """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""
-        if self.settings.coarse:
+        complete = self.journal.one(
+            "SELECT 1 FROM completions WHERE vehicle = ? AND sortie = ?", (packed(vehicle), sortie)
+        )
+        if self.settings.coarse and complete is None:
             self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
 
     def _watch_what_came_before(self) -> None:

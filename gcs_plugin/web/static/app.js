@@ -55,7 +55,7 @@ function confirmed(question) {
 
 const TITLES = { basemap: "Basemap", realtime: "Real time", coarse: "Coarse", fine: "Fine" };
 let bounds = null;
-let fitted = false;
+let fitted = "";
 
 function drawLayers(rows) {
   const box = $("layers");
@@ -77,9 +77,10 @@ function drawLayers(rows) {
   const known = rows.filter((row) => row.bounds);
   const best = known.find((row) => row.name === "best") || known.find((row) => row.name === "basemap");
   bounds = best ? best.bounds : bounds;
-  if (bounds && (!fitted || (fitted === "basemap" && best.name === "best"))) {
+  const shown = String(bounds);
+  if (bounds && shown !== fitted && !view.isMoved() && !corners.length) {
     view.fit(bounds);
-    fitted = best.name;
+    fitted = shown;
   }
 }
 

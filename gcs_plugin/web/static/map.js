@@ -86,6 +86,11 @@ export const setOpacity = (name, share) => {
   map.setLayoutProperty(name, "visibility", share > 0 ? "visible" : "none");
 };
 
+// Whether somebody has moved the map by hand; until then it follows what is mapped.
+let moved = false;
+map.on("movestart", (event) => { moved ||= Boolean(event.originalEvent); });
+export const isMoved = () => moved;
+
 // Width at the right that the panel covers, as the style says.
 const covered = () => parseFloat(getComputedStyle(document.getElementById("maps")).getPropertyValue("--free") || "360");
 
