@@ -133,6 +133,7 @@ class Served:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind(("127.0.0.1", port))
+            self._socket.listen()  # a browser may come at once
         except OSError as error:
             self._socket.close()
             raise InputError(f"port {port} cannot be served ({error.strerror}); choose another --port") from None
