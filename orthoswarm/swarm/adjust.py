@@ -67,7 +67,8 @@ class Adjustment:
             lens columns hold differences to the prior's start). tracks: observations sorted by point.
         obs_weight: float64 (M,) robust weights of the last step. point_inverse: float64 (P, 3, 3), inverse of each
             point's own block (its covariance with the cameras held).
-        tie_residual: float64 (Q, 2) of the last step.
+        tie_residual: float64 (Q, 2) of the last step. information: float64 (layout.size, layout.size), inverse
+            covariance of the common unknowns at the last step (empty before it).
     """
 
     rig: Rig
@@ -85,6 +86,7 @@ class Adjustment:
     tie_residual: Array = field(default_factory=lambda: np.zeros((0, 2)))
     cost: float = 0.0
     gps_weight: Array = field(default_factory=lambda: np.zeros(0))
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def begin(
@@ -122,7 +124,7 @@ class Adjustment:
         """
         system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
         system.band[0] *= 1.0 + damping
-        step_camera, step_common = _solve(system)
+        step_camera, step_common, self.information = _solve(system)
         self._move(step_camera, step_common)
         normal.back_substitute(
             self.points,
@@ -229,6 +231,15 @@ class Adjustment:
         at = self.layout.offset[group]
         return self.common[at : at + 3].copy(), float(self.common[at + 3]), float(self.common[at + 4])
 
+    def position_residuals(self) -> Array:
+        """Cameras minus records, drift, lag and height offset taken off, metres (N, 3)."""
+        p, lay = self.priors, self.layout
+        base = np.asarray(lay.offset)[p.group]
+        out = self.rig.position - p.position
+        out[:, :2] -= lay.drift(self.common, p.group) + self.common[base + 4][:, None] * p.velocity
+        out[:, 2] -= self.common[base + 3]
+        return np.asarray(out)
+
     def _move(self, step_camera: Array, step_common: Array) -> None:
         moves = np.zeros((len(self.rig), 6))
         index = np.flatnonzero(self.free)
@@ -279,9 +290,8 @@ class Adjustment:
         at = 6 * self.slot[i]
         base = np.asarray(lay.offset)[p.group[i]]
         knots = np.asarray(lay.knots)[p.group[i]]
-        drift = lay.drift(self.common, p.group)[i]
-        lag = self.common[base + 4]
-        xy = self.rig.position[i, :2] - p.position[i, :2] - drift - lag[:, None] * p.velocity[i]
+        residual = self.position_residuals()[i]
+        xy, rz = residual[:, :2], residual[:, 2]
         w = _weights(p.position_sigma[i])
         e2 = (xy * xy * w[:, :2]).sum(1)
         robust = 1.0 / (1.0 + e2 / p.position_c) ** 2
@@ -305,7 +315,6 @@ class Adjustment:
                 np.add.at(rhs_common, c, -wa * f * ra)
                 for c2, f2 in zip(columns, factors):
                     np.add.at(corner, (c, c2), wa * f * f2)
-        rz = self.rig.position[i, 2] - p.position[i, 2] - self.common[base + 3]
         wz = w[:, 2]
         band[0, at + 2] += wz
         rhs[at + 2] -= wz * rz
@@ -395,14 +404,15 @@ def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
     return whole[: b - a], whole[b - a :]
 
 
-def _solve(system: _System) -> tuple[Array, Array]:
-    """Solve the bordered banded system; returns the cameras' and the common steps."""
+def _solve(system: _System) -> tuple[Array, Array, Array]:
+    """Solve the bordered banded system: the cameras' steps, the common ones and their inverse covariance."""
     if not system.band.shape[1]:
-        return np.zeros(0), np.asarray(np.linalg.solve(system.corner, system.rhs_common))
+        return np.zeros(0), np.asarray(np.linalg.solve(system.corner, system.rhs_common)), system.corner
     both = _back(_factor(system.band), np.column_stack([system.side, system.rhs]))
     y, x = both[:, :-1], both[:, -1]
-    common = np.linalg.solve(system.corner - system.side.T @ y, system.rhs_common - system.side.T @ x)
-    return np.asarray(x - y @ common), np.asarray(common)
+    information = system.corner - system.side.T @ y
+    common = np.linalg.solve(information, system.rhs_common - system.side.T @ x)
+    return np.asarray(x - y @ common), np.asarray(common), np.asarray(information)
 
 
 def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:

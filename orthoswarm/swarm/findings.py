@@ -6,7 +6,9 @@ import numpy as np
 
 from orthoswarm.angles import wrap_rad
 from orthoswarm.frame import Frame
+from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.heading import tag_yaw
+from orthoswarm.swarm.heights import log_focal_sigmas
 from orthoswarm.swarm.plane import Array, Flags, Records
 from orthoswarm.swarm.start2d import Start2D
 
@@ -17,7 +19,7 @@ _ONE_WAY = 0.9
 """Length of the mean of headings from which on a tilt cannot be told from a slope of the ground."""
 _SLOPE_DEG = 6.0
 _OBLIQUE_DEG = 35.0
-_HEIGHT_SHARE = 0.2
+_HEIGHT_SHARE, _HEIGHT_SIGMAS = 0.15, 4.0
 _LAG_M = 1.0
 _LISTED = 3
 
@@ -34,9 +36,9 @@ def flipped_yaw(records: Records, start: Start2D) -> Flags:
 
 
 def findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
-    """Sentences on everything in the records that the pictures contradict."""
+    """Sentences on everything in the records that the pictures contradict, but heights: those are told in the end."""
     found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
-    found += _height_findings(frames, records, start) + _position_findings(frames, records, start)
+    found += _position_findings(frames, records, start)
     found += _overlap_findings(records, start)
     return found
 
@@ -117,27 +119,42 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
     return found
 
 
-def _height_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+def height_findings(frames: Sequence[Frame], records: Records, start: Start2D, adjustment: Adjustment) -> list[str]:
+    """Sentences on recorded heights that the adjusted pictures contradict, and on heights that are not recorded.
+
+    Metres per pixel come from the way flown, so that a height is known as well as the focal length.
+
+    Args:
+        frames: N photos. records: what they recorded. start: from the pairs.
+        adjustment: of all of them, without a map.
+    """
     found, without = [], []
+    ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
+    height = adjustment.rig.position[:, 2] - ground
+    doubt = log_focal_sigmas(adjustment)[adjustment.rig.lens_id]
     for v in range(len(start.tags)):
         rows = records.vehicle == v
-        k = int(records.lens[rows][0])
         who = _name(frames, records, v)
-        recorded, seen = records.height_m[rows], float(np.median(start.height[rows]))
-        if not start.scale_known[k]:
+        recorded, seen = records.height_m[rows], float(np.median(height[rows]))
+        if not start.scale_known[int(records.lens[rows][0])]:
             continue
         if not np.isfinite(recorded).any():
             without.append((who, seen))
             continue
         said = float(np.nanmedian(recorded))
-        doubt = max(_HEIGHT_SHARE, 3.0 * float(start.focal_sigma[k]))
-        if said <= 2.0 or abs(np.log(seen / said)) > doubt:
-            found.append(f"{who}: the recorded height of {said:.0f} m contradicts the pictures, which say {seen:.0f} m")
+        limit = max(_HEIGHT_SHARE, _HEIGHT_SIGMAS * float(doubt[rows][0]))
+        if said <= 2.0 or abs(np.log(max(seen, 1.0) / said)) > limit:
+            found.append(contradiction(who, said, seen))
     if without:
         names = ", ".join(who for who, _ in without[:_LISTED]) + (" and others" if len(without) > _LISTED else "")
         seen = float(np.median([height for _, height in without]))
         found.append(f"{names}: no height is recorded; {seen:.0f} m come from metres per pixel")
     return found
+
+
+def contradiction(who: str, said_m: float, seen_m: float) -> str:
+    """The sentence on a recorded height that the pictures contradict."""
+    return f"{who}: the recorded height of {said_m:.0f} m contradicts the pictures, which say {seen_m:.0f} m"
 
 
 def _position_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:

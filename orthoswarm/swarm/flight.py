@@ -11,6 +11,7 @@ from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm.adjust import Adjustment, log_rotation
 from orthoswarm.swarm.calibrate import Calibration, calibrate
+from orthoswarm.swarm.heights import FREE_SIGMA_M
 from orthoswarm.swarm.legs import split_legs
 from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.priors import GroupModel, Priors
@@ -42,6 +43,7 @@ class Flight:
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
         survived: float64 (N,), share of tracks that survived into each picture.
         warnings: findings in plain words. sparse: True where photos were matched in pairs, not followed.
+        focal_sigma: relative one sigma of a lens found together with other vehicles and held since (else 0).
     """
 
     frames: Sequence[Frame]
@@ -53,6 +55,7 @@ class Flight:
     survived: Array
     warnings: list[str]
     sparse: bool = False
+    focal_sigma: float = 0.0
 
     def rig(self) -> Rig:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
@@ -91,7 +94,10 @@ def open_flight(
 
 
 def weigh_records(flight: Flight) -> None:
-    """Give heights and attitudes the sigmas that they show: pictures tell well how one differs from the next."""
+    """Give heights and attitudes the sigmas that they show: pictures tell well how one differs from the next.
+
+    Positions that scatter more than theirs say get larger ones, too.
+    """
     adj = flight.adjustment
     p = adj.priors
     height = adj.rig.position[:, 2] - p.position[:, 2]
@@ -101,6 +107,8 @@ def weigh_records(flight: Flight) -> None:
     sigma = p.position_sigma.copy()
     if flight.calibration.trusted_height:
         sigma[:, 2] = z
+    off = adj.position_residuals()[:, :2] / np.maximum(sigma[:, :2], 1e-9)
+    sigma[:, :2] *= max(1.0, 1.4826 * float(np.median(np.abs(off))))
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
@@ -161,7 +169,7 @@ def _begin(records: Records, pictures: Pictures, calibration: Calibration, track
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
     model = GroupModel(
-        height_sigma=1.0 if calibration.trusted_height else 30.0,
+        height_sigma=1.0 if calibration.trusted_height else FREE_SIGMA_M,
         lag_sigma=0.5 if records.timed else 0.3,
         drift_sigma=15.0 if not np.isfinite(records.position_sigma).all() else 0.0,
     )

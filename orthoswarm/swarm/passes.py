@@ -15,10 +15,12 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.adjust import Ties
+from orthoswarm.swarm.findings import contradiction
 from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
 from orthoswarm.swarm.given import Given
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
+from orthoswarm.swarm.heights import height_doubt, release_heights
 from orthoswarm.swarm.legs import leads_one_way
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
@@ -49,6 +51,9 @@ RUNAWAY, RUNAWAY_SIGMAS = 0.15, 5.0
 """A focal length that leaves what the flow of so many pairs told by this share and so many sigmas is not believed."""
 FOV_SIGMAS, FOV_MOVES_DEG = 6.0, 4.0
 """A place on the map that moves the field of view by more than this is not believed."""
+DECENTRED_SHARE = 0.02
+"""What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
+FREE_STEPS = 6
 COHERENT = 2.0
 """Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
 MAP_FLOOR_PX = 0.13
@@ -156,7 +161,7 @@ def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
         sigma[:, 0] = flight.calibration.focal_sigma
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
         found = _relative(flight, surface, WARY)
-    return found
+    return _without_wrong_heights(flight, found)
 
 
 def ran_away(flight: Flight) -> bool:
@@ -181,6 +186,21 @@ def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -
                 schedule += [9.0] * 4
         if k >= 3:
             surface = fit_surface(flight.adjustment, surface)
+    return surface
+
+
+def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
+    """Go on without the recorded heights where the pictures contradict them."""
+    adjustment = flight.adjustment
+    if not flight.records.has_height.any() or not release_heights(adjustment).any():
+        return surface
+    flight.calibration = replace(flight.calibration, trusted_height=False)
+    for _ in range(FREE_STEPS):
+        adjustment.step(9.0, surface.belief(adjustment.points))
+        surface = fit_surface(adjustment, surface)
+    said = float(np.median(flight.records.position[flight.records.has_height, 2]))
+    seen = float(np.median(adjustment.rig.position[:, 2])) - surface.level_m
+    flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
     return surface
 
 
@@ -219,18 +239,21 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
 
 
 def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
-    """How far the field of view may be off by what no picture tells.
+    """How far the field of view may be off by what the adjustment takes for granted.
 
     The takeoff spot need not be at the ground's middle level: over flat ground straight down only f / h is observable;
-    the more relief, the less the level is known. Photos without heights on one straight way do not tell it at all.
+    the more relief, the less the level is known. Recorded heights may be wrong: as far as they disagree with the
+    pictures. Photos without heights on one straight way do not tell it at all. A lens that was found together with
+    other vehicles is held, and known as well as it was then; one that distorts strongly is not quite as modelled.
     """
     if flight.sparse and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
         return ONE_WAY_FOV_SIGMA_DEG
-    if not flight.calibration.trusted_height or not flight.records.has_height.any():
-        return 0.0
-    relief = 0.0 if surface.fit is None else surface.fit.sd_m
     rig = flight.rig()
-    share = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
+    share = float(np.hypot(flight.focal_sigma, DECENTRED_SHARE if strong_lens(flight) else 0.0))
+    if flight.calibration.trusted_height and flight.records.has_height.any():
+        relief = 0.0 if surface.fit is None else surface.fit.sd_m
+        level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
+        share = float(np.linalg.norm([share, level, height_doubt(flight.adjustment)]))
     half = 0.5 * fov_rad(float(rig.lens[0, F]), int(rig.lens[0, WIDTH]))
     return float(np.degrees(np.sin(2 * half))) * share
 

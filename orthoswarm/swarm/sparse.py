@@ -11,6 +11,7 @@ import numpy as np
 
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
+from orthoswarm.swarm.alike import by_vehicle, told_apart
 from orthoswarm.swarm.chains import build_tracks, thin_tracks
 from orthoswarm.swarm.features import Features
 from orthoswarm.swarm.findings import findings, flipped_yaw, unplaced_reasons
@@ -21,7 +22,7 @@ from orthoswarm.swarm.plane import Array, Flags, Ints, Records
 from orthoswarm.swarm.rig import HEIGHT, K1, WIDTH, F, Rig, Tracks
 from orthoswarm.swarm.scales import focal_by_hint
 from orthoswarm.swarm.segments import split_segments
-from orthoswarm.swarm.start2d import Start2D
+from orthoswarm.swarm.start2d import Start2D, start_in_plane
 
 _OUTLIER_SIGMA_M = 5.0
 _STATED_FLOOR_M = 0.03
@@ -128,6 +129,11 @@ def sparse_start(
     """
     builder = PairGraphBuilder(frames, records, read_gray, run, progress)
     start = build_pair_graph(builder)
+    if len(records.fov_hint) <= int(records.vehicle.max()):  # vehicles share lenses by name
+        alone = start_in_plane(by_vehicle(records), builder.pairs(), builder.features)
+        records = told_apart(records, alone)
+        if records is not builder.records:
+            start = start_in_plane(records, builder.pairs(), builder.features)
     return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
 
 

@@ -12,6 +12,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm import records as dense
 from orthoswarm.swarm.adjust import Adjustment
 from orthoswarm.swarm.calibrate import Calibration
+from orthoswarm.swarm.findings import height_findings
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.matching import Progress, ReadGray, Run, serial
 from orthoswarm.swarm.pictures import Pictures
@@ -19,7 +20,7 @@ from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.rig import CX, CY, HEIGHT, WIDTH, F, Tracks
 from orthoswarm.swarm.segments import photo_legs
 from orthoswarm.swarm.sparse import SparseStart, read_records, sparse_start
-from orthoswarm.swarm.sparse_solve import datum, heights_above_ground, solve_sparse
+from orthoswarm.swarm.sparse_solve import believed_heights, datum, heights_above_ground, solve_sparse
 
 
 def open_sparse_flight(
@@ -44,7 +45,10 @@ def open_sparse_flight(
     """
     frames = [replace(frame, camera=frames[0].camera) for frame in frames]
     start = sparse_start(frames, read_records(frames, grid, origin), read, run, progress)
-    return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), solve_sparse(start), start.warnings)
+    adjustment = solve_sparse(start)
+    believed = believed_heights(adjustment, start)
+    warnings = [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]
+    return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), adjustment, believed, warnings)
 
 
 def flight_of(
@@ -55,7 +59,9 @@ def flight_of(
     start: SparseStart,
     rows: NDArray[np.int64],
     adjustment: Adjustment,
+    believed: NDArray[np.bool_],
     warnings: Sequence[str],
+    focal_sigma: float = 0.0,
 ) -> Flight:
     """A vehicle's flight from photos that were adjusted alone or together with others.
 
@@ -67,7 +73,9 @@ def flight_of(
         start: of all photos that were matched together.
         rows: which of them are the vehicle's.
         adjustment: of the vehicle's photos alone, in pixels of the full pictures.
+        believed: bool, of all photos, whose recorded heights were believed to the end.
         warnings: findings to be told with this vehicle.
+        focal_sigma: of a lens that was found together with others, see `Flight`.
     """
     records = dense.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
@@ -80,13 +88,16 @@ def flight_of(
         float(adjustment.rig.lens[0, F]),
         float(np.median(heights_above_ground(adjustment))),
         wrap_rad(yaw - records.yaw),
-        bool(start.height_known[rows].any()),
+        bool(believed[rows].any()),
         start.pairs[1],
         mine,
     )
     leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
     held = start.placed[rows].astype(np.float64)
-    return Flight(frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(mine), sparse=True)
+    return Flight(
+        frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(mine), sparse=True,
+        focal_sigma=focal_sigma,
+    )  # fmt: skip
 
 
 def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:

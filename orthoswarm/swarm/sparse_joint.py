@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.swarm.adjust import Adjustment
+from orthoswarm.swarm.findings import height_findings
 from orthoswarm.swarm.flight import Flight
+from orthoswarm.swarm.heights import log_focal_sigmas
 from orthoswarm.swarm.matching import Progress, ReadGray, Run, serial
 from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.rig import Tracks
 from orthoswarm.swarm.sparse import SparseStart, read_records, sparse_start
 from orthoswarm.swarm.sparse_flight import flight_of, open_sparse_flight
-from orthoswarm.swarm.sparse_solve import datum, solve_sparse
+from orthoswarm.swarm.sparse_solve import believed_heights, datum, solve_sparse
 
 _MOST_LENSES = 16
 _OWN_LENS_STEPS = 4
@@ -66,15 +68,20 @@ def open_sparse_flights(
     records = read_records(frames, grid, origin, share_lenses=True)
     start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
+    believed = believed_heights(adjustment, start)
+    focal_sigma = log_focal_sigmas(adjustment)[adjustment.rig.lens_id]
     if int(records.vehicle.max()) < _MOST_LENSES:
         adjustment = own_lenses(adjustment, start)
-    told = _told(start.warnings, [part[0].vehicle for part in units])
+        focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.rig.lens_id])
+    found = height_findings(frames, start.records, start.plane, adjustment)
+    told = _told([*start.warnings, *found], [part[0].vehicle for part in units])
     flights, first = [], 0
     for part, warnings in zip(units, told, strict=True):
         rows = np.arange(first, first + len(part))
         first += len(part)
         alone = _apart(adjustment, start, rows)
-        flights.append(flight_of(part, grid, origin, read, start, rows, alone, warnings))
+        sigma = float(focal_sigma[rows[0]])
+        flights.append(flight_of(part, grid, origin, read, start, rows, alone, believed, warnings, sigma))
     return flights
 
 

@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.swarm.adjust import Adjustment, Ground, log_rotation
 from orthoswarm.swarm.flight import first_points
+from orthoswarm.swarm.heights import FREE_SIGMA_M, release_heights
 from orthoswarm.swarm.plane import Array
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.rig import K1, WIDTH, F, Tracks
@@ -24,8 +26,9 @@ _DRIFT_BEND_M = 2.5
 _PHOTOS_PER_KNOT = 12
 _HELD = 0.02
 _LENS_SIGMA = (0.1, 0.05)
-_FULL_LENS_SIGMA = (0.3, 0.012)
-"""k3, and the principal point as a share of the picture's width."""
+_FULL_LENS_SIGMA = (0.2, 0.2, 0.3, 0.012)
+"""k1, k2, k3, and the principal point as a share of the picture's width. A tight k2 bends the focal length of a lens
+that distorts strongly, as distortion goes with powers of it."""
 _FULL_LENS_OBSERVATIONS = 800
 _BIAS_SIGMA = (float(np.radians(15.0)), float(np.radians(15.0)), float(np.radians(5.0)))
 _FIRST_ATTITUDE_SIGMA = float(np.radians(3.0))
@@ -63,16 +66,34 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True, schedule: Sequen
     for k, stage in enumerate(schedule):
         if k == 1:
             _free_lens(adjustment, start, full=False)
+        if k >= 2:
+            _records_from_scatter(adjustment)
         if k == len(schedule) - 1:
             _attitude_from_scatter(adjustment)
             _free_lens(adjustment, start, full=full_lens)
         for _ in range(stage.steps):
             ground = plane(adjustment) if k == 0 else datum(adjustment)
             move = adjustment.step(stage.c, ground, damping=1e-4 if k == 0 else 1e-6)
-            if move < 2e-4 * float(np.median(np.abs(adjustment.rig.position[:, 2]))):
+            if move < _settled_m(adjustment):
                 break
         _rescale_sigmas(adjustment)
+    if release_heights(adjustment).any():
+        for _ in range(schedule[-1].steps):
+            if adjustment.step(schedule[-1].c, datum(adjustment)) < _settled_m(adjustment):
+                break
     return adjustment
+
+
+def believed_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
+    """Photos whose recorded heights were believed to the end, bool (N,)."""
+    p = adjustment.priors
+    sigma = np.array([model.height_sigma for model in p.models])
+    return np.asarray(start.height_known & (sigma < FREE_SIGMA_M)[p.group])
+
+
+def _settled_m(adjustment: Adjustment) -> float:
+    """A step that moves no camera farther than this is the last one."""
+    return 2e-4 * float(np.median(np.abs(adjustment.rig.position[:, 2])))
 
 
 def plane(adjustment: Adjustment) -> Ground:
@@ -118,7 +139,7 @@ def _models(start: SparseStart) -> tuple[GroupModel, ...]:
         models.append(
             GroupModel(
                 bias_sigma=_BIAS_SIGMA,
-                height_sigma=(0.1 if stated else 1.0) if start.height_known[rows].mean() > 0.5 else 30.0,
+                height_sigma=(0.1 if stated else 1.0) if start.height_known[rows].mean() > 0.5 else FREE_SIGMA_M,
                 lag_sigma=0.2 if stated else 0.5,
                 drift_sigma=0.0 if stated else _DRIFT_SIGMA_M,
                 drift_bend=_DRIFT_BEND_M,
@@ -140,11 +161,22 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
     lens[:, 0] = start.log_focal
     sigma = np.zeros((lenses, 6))
     sigma[:, 0], sigma[:, 1], sigma[:, 2] = start.log_focal_sigma, *_LENS_SIGMA
-    sigma[rich, 1], sigma[rich, 3] = 2.0 * _LENS_SIGMA[0], _FULL_LENS_SIGMA[0]
-    sigma[rich, 4] = sigma[rich, 5] = _FULL_LENS_SIGMA[1] * width[rich]
+    sigma[rich, 1:4] = _FULL_LENS_SIGMA[:3]
+    sigma[rich, 4] = sigma[rich, 5] = _FULL_LENS_SIGMA[3] * width[rich]
     now = p.lens + adjustment.common[: 6 * lenses].reshape(-1, 6)
     adjustment.common[: 6 * lenses] = (now - lens).ravel()
     adjustment.priors = replace(p, lens=lens, lens_sigma=sigma)
+
+
+def _records_from_scatter(adjustment: Adjustment) -> None:
+    """Larger sigmas for positions and heights that scatter more than theirs say.
+
+    Heights that are worse than they are believed to be push the cameras up, where they matter less.
+    """
+    p = adjustment.priors
+    off = np.abs(adjustment.position_residuals()) / np.maximum(p.position_sigma, 1e-9)
+    scatter = 1.4826 * np.array([np.median(off[:, :2]), np.median(off[:, :2]), np.median(off[:, 2])])
+    adjustment.priors = replace(p, position_sigma=p.position_sigma * np.maximum(scatter, 1.0))
 
 
 def _attitude_from_scatter(adjustment: Adjustment) -> None:
