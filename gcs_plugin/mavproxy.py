@@ -43,6 +43,7 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
         self._drawn, self._look_at = 0, 0.0
         self._drawing: threading.Thread | None = None
         self._picture: Any = None
+        self._hello = ""
         self._worker = threading.Thread(target=self._work, name="orthoswarm", daemon=True)
         self._worker.start()
         self.add_command("orthoswarm", self.typed, "map with a swarm", [_VERBS])
@@ -59,7 +60,10 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
             self.feed.packet(packet)
 
     def idle_task(self) -> None:
-        """Keep the mosaic on the maps that are open."""
+        """Keep the mosaic on the maps that are open; say what to type once the console is there."""
+        if self._hello:
+            print(self._hello)
+            self._hello = ""
         picture, self._picture = self._picture, None
         if picture is not None:
             for shown in self._maps():
@@ -95,7 +99,7 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
         )
 
     def _work(self) -> None:
-        print(self._greeting())
+        self._hello = self._greeting()
         while (words := self._typed.get()) is not None:
             try:
                 for line in self._run(words):

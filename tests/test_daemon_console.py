@@ -63,12 +63,13 @@ def mavproxy_state():
     )  # fmt: skip
 
 
-def said(capsys, text, limit_s=60.0):
-    """Wait until something was printed."""
+def said(module, capsys, text, limit_s=60.0):
+    """Pass the time as MAVProxy does, until something was printed."""
     end, out = time.monotonic() + limit_s, ""
     while text not in out:
         assert time.monotonic() < end, out
         time.sleep(0.01)
+        module.idle_task()
         out += capsys.readouterr().out
     return out
 
@@ -83,12 +84,12 @@ def test_the_mavproxy_module_says_what_runs_and_what_to_type(served, running, mo
     state = mavproxy_state()
     module = mavproxy.init(state)
     assert "orthoswarm" in state.command_map
-    assert "orthoswarm connect" in said(capsys, "a daemon runs at" if running else "no daemon runs at")
+    assert "orthoswarm connect" in said(module, capsys, "a daemon runs at" if running else "no daemon runs at")
     module.typed([])
-    assert "serve|feed" in said(capsys, "usage: orthoswarm")
+    assert "serve|feed" in said(module, capsys, "usage: orthoswarm")
     if running:
         module.typed(["connect", served.url, served.token])
-        said(capsys, "orthoswarm feed")
+        said(module, capsys, "orthoswarm feed")
     else:
         module.typed(["refine"])
-        said(capsys, "say serve to start one")
+        said(module, capsys, "say serve to start one")
