@@ -19,10 +19,17 @@ FLAGS += ["--disable-background-networking", "--disable-component-update", "--di
 LIMIT_MS = 120_000
 
 
-@pytest.fixture
-def page(tmp_path):
-    with serving(tmp_path / "w") as served, playwright.sync_playwright() as play:
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(browser, tmp_path):
+    with serving(tmp_path / "w") as served:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(LIMIT_MS)
         page.foreign, page.errors = [], []
@@ -36,7 +43,7 @@ def page(tmp_path):
         yield served, page
         assert page.errors == []
         assert page.foreign == []  # it works without the internet
-        browser.close()
+        page.close()
 
 
 def colours(page) -> float:

@@ -86,6 +86,7 @@ function drawLayers(rows) {
 
 // -- vehicles --------------------------------------------------------------------------------------------------------
 
+const STATES = { pictures: "", found: "", lost: "no link" };
 const vehicles = new Map();
 const outlines = new Map();
 
@@ -95,7 +96,7 @@ function drawVehicles() {
     const colour = view.colourOf(row.id);
     const counts = row.frames || {};
     const mission = row.mission || {};
-    const facts = [row.state === "pictures" ? "" : row.state, row.mode, row.armed ? "armed" : "", row.battery == null ? "" : `${Math.round(row.battery * 100)} %`];
+    const facts = [STATES[row.state] ?? row.state, row.mode, row.armed ? "armed" : "", row.battery == null ? "" : `${Math.round(row.battery * 100)} %`];
     const pictures = [`${counts.frames || 0} pictures`, ...[["refined", counts.fine], ["coarse", counts.coarse], ["rejected", counts.rejected]].filter(([, n]) => n).map(([what, n]) => `${n} ${what}`)].join(", ");
     const share = mission.phase === "complete" ? 1 : mission.items ? mission.item / mission.items : 0;
     return make("div", { className: "card" },
