@@ -340,14 +340,14 @@ def test_all_sheffield_photos_lie_on_the_control_points(real_data):
 
 @pytest.mark.slow
 def test_legs_of_sheffield_as_vehicles_fit_together(real_data):
-    from orthoswarm.pipeline import split_legs
+    from orthoswarm.vehicles import legs_as_vehicles
 
     folder = real_data("sheffield_cross_800")
     frames = real_frames(folder, 2)
     grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
     origin = np.round(grid.to_grid([frames[0].fix.lat_deg], [frames[0].fix.lon_deg])[0])
     vehicles: dict[str, list] = {}
-    for frame in split_legs(frames, grid):
+    for frame in legs_as_vehicles(frames, grid):
         vehicles.setdefault(frame.vehicle, []).append(frame)
     assert len(vehicles) >= 8
     flights = open_sparse_flights(list(vehicles.values()), grid, origin, lambda f: read_gray(f.path))

@@ -51,6 +51,8 @@ RUNAWAY, RUNAWAY_SIGMAS = 0.15, 5.0
 """A focal length that leaves what the flow of so many pairs told by this share and so many sigmas is not believed."""
 FOV_SIGMAS, FOV_MOVES_DEG = 6.0, 4.0
 """A place on the map that moves the field of view by more than this is not believed."""
+NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
+"""Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
 DECENTRED_SHARE = 0.02
 """What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
 FREE_STEPS = 6
@@ -111,6 +113,8 @@ def followed(
     if flight is None:
         return None
     surface = relative(flight, options.ground(origin))
+    if not NARROWEST_RAD < fov_rad(float(flight.rig().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
+        return None  # the recorded height that is behind such a lens cannot be right
     if len(frames) < FEW and strong_lens(flight):
         return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
     return from_flight(flight, surface, origin, basemap, watch)
@@ -249,7 +253,8 @@ def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     if flight.sparse and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
         return ONE_WAY_FOV_SIGMA_DEG
     rig = flight.rig()
-    share = float(np.hypot(flight.focal_sigma, DECENTRED_SHARE if strong_lens(flight) else 0.0))
+    held = getattr(flight, "focal_sigma", 0.0)  # flights that were kept by an earlier version lack it
+    share = float(np.hypot(held, DECENTRED_SHARE if strong_lens(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
         level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
