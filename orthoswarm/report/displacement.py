@@ -1,12 +1,12 @@
 """How far the orthoimage lies from the map, block by block, as a user would see it by flickering the two."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.evaluation import FieldSettings, displacement_field
+from orthoswarm.evaluation import Displacements, FieldSettings, displacement_field
 from orthoswarm.geo import GroundGrid
 
 Array = NDArray[np.float64]
@@ -15,6 +15,7 @@ Mask = NDArray[np.bool_]
 
 _BLOCK_PX, _SEARCH_PX, _APART_PX = 64, 15, 6
 _MOST_BLOCKS = 500
+_BAND_PX = 500_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,25 @@ def moved(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, grid: GroundGri
         min_cover=0.9,
         min_peak=0.4,  # a map of another day: a chance likeness reaches 0.3
     )
-    field = displacement_field(ortho.astype(np.float32), seen, basemap.astype(np.float32), valid, settings)
+    field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
     found = field.matched
     shift = field.shift_m[found]
     return Moved(grid.to_ground(field.position[found]) + shift, -shift, len(found))
+
+
+def _fields(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, settings: FieldSettings) -> Iterator[Displacements]:
+    """The field in bands of whole rows of blocks: gradients take a hundred bytes a pixel."""
+    side, step, reach = (
+        max(1, round(length / settings.gsd_m)) for length in (settings.block_m, settings.step_m, settings.search_m)
+    )
+    wide_ortho, wide_seen = np.pad(ortho, reach), np.pad(seen, reach)
+    rows, columns = basemap.shape
+    at_once = step * max(1, _BAND_PX // columns // step)
+    for top in range(0, rows - side + 1, at_once):
+        last = min(top + at_once, rows - side + 1) - 1
+        end = last // step * step + side
+        around = slice(top, end + 2 * reach)
+        yield displacement_field(
+            wide_ortho[around].astype(np.float32), wide_seen[around], basemap[top:end].astype(np.float32),
+            valid[top:end], settings, (top, 0),
+        )  # fmt: skip
