@@ -7,7 +7,7 @@ alpha, nodata, a rotated or foreign grid) leaves here as 8-bit values and a mask
 import os
 import threading
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,6 +27,7 @@ Bounds = tuple[float, float, float, float]
 os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 _FLAT_PX = 15
+_READ_AT_ONCE = 8_000_000
 _STRETCH_PERCENT = (0.5, 99.5)
 
 
@@ -184,7 +185,8 @@ class _Raster:
             return self._read_palette(grid)
         try:
             if self._aligned:
-                return self._read_aligned(grid, gray)
+                parts = [self._read_aligned(part, gray) for part in self._bands_of(grid)]
+                return parts[0] if len(parts) == 1 else _below_each_other(parts)
             data, valid = self._warp(grid)
         except (self._error, OSError) as error:
             raise InputError(
@@ -203,6 +205,16 @@ class _Raster:
         usable = [i for i, f in enumerate(self._factors) if f <= ratio / 2]
         return usable[-1] if usable else None
 
+    def _bands_of(self, grid: GroundGrid) -> list[GroundGrid]:
+        """A grid in bands of rows for which not too many pixels are read at once: maps need not have overviews."""
+        t = self._open(self._level(grid)).transform
+        read = grid.width * (grid.gsd_m / t.a) * (grid.gsd_m / -t.e)
+        rows = max(1, int(_READ_AT_ONCE / max(read, 1.0)))
+        return [
+            replace(grid, north=grid.north - top * grid.gsd_m, height=min(rows, grid.height - top))
+            for top in range(0, grid.height, rows)
+        ]
+
     def _read_aligned(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
         """A window of a raster that lies on the area's own grid, north up: several times cheaper than warping."""
         from rasterio.windows import Window
@@ -210,7 +222,7 @@ class _Raster:
         source = self._open(self._level(grid))
         t = source.transform
         west, south, east, north = grid.bounds
-        margin = 4
+        margin = 4 + int(max(0.0, grid.gsd_m / t.a - 4.0))
         c0, c1 = int((west - t.c) / t.a) - margin, int((east - t.c) / t.a) + 1 + margin
         r0, r1 = int((north - t.f) / t.e) - margin, int((south - t.f) / t.e) + 1 + margin
         c0, c1 = max(c0, 0), min(c1, source.width)
@@ -284,6 +296,10 @@ class _Raster:
             if not high[i] > low[i]:
                 high[i] = low[i] + 1.0
         return _Stretch(low, high)
+
+
+def _below_each_other(parts: list[tuple[Bytes, Mask]]) -> tuple[Bytes, Mask]:
+    return np.concatenate([data for data, _ in parts], axis=1), np.concatenate([valid for _, valid in parts])
 
 
 def _luma(data: Bytes) -> Bytes:
