@@ -25,6 +25,7 @@ from orthoswarm.export.partial import disk_error, written_whole
 from orthoswarm.extent import drawn_window, from_takeoff, ground_level, map_offset, partial_cover, placed_bounds
 from orthoswarm.frame import Frame, Ingest, Rejection
 from orthoswarm.geo import GroundGrid, LocalGrid
+from orthoswarm.mapcheck import UnreadableMapError
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.gains import estimate_gains
@@ -77,12 +78,16 @@ class Options:
 
 @dataclass(slots=True)
 class _Refinement:
-    """What the refiner made: cameras before and after the map, the ground, and what concerns all vehicles."""
+    """What the refiner made: cameras before and after the map, the ground, and what concerns all vehicles.
+
+    map_lost: the map that was asked for turned out to be unreadable, so that it was not used.
+    """
 
     coarse: list[Solution]
     fine: list[Solution]
     terrain: Terrain | None
     warnings: list[str] = field(default_factory=list)
+    map_lost: bool = False
 
 
 @dataclass(slots=True)
@@ -143,7 +148,8 @@ class _Batch:
             with self.clock.stage("load") as stage:
                 state = self.load(load)
                 stage.items = len(state.ingest.frames) + len(state.ingest.rejected)
-            if self.space.begin(run_key(state.ingest.frames, self.options)):
+            key = run_key(state.ingest.frames, self.options, self.options.basemap, self.options.dem)
+            if self.space.begin(key):
                 state.warnings.append("this run was interrupted before and was continued")
             placed = self.realtime(state)
             refinement = None
@@ -183,6 +189,7 @@ class _Batch:
         if self.options.basemap is not None:
             near = placed_bounds(recorded.placed, 0.0, 0.0)
             basemap = Basemap.open(self.options.basemap, grid.epsg, near)
+            basemap.require_readable(near)
             warnings += partial_cover(basemap, recorded.placed)
         dem = None if self.options.dem is None else self.height_model(self.options.dem, grid, recorded)
         rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
@@ -228,12 +235,13 @@ class _Batch:
         known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
         if known is not None:
             self.clock.stages += known[1]
+            state.basemap = None if known[0].map_lost else state.basemap
             return known[0]
         outer = Clock(self.workers.usage)
         frames = told_of_lone_ones(by_kind.fit)
         with outer.stage("refine", len(frames)) as stage:
             try:
-                refinement = self.call_refiner(frames, state)
+                refinement = self.refined(frames, state)
             except OrthoSwarmError as error:
                 state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
                 return None
@@ -249,6 +257,21 @@ class _Batch:
         self.space.remember("refinement", (refinement, stages))
         return refinement
 
+    def refined(self, frames: Sequence[Frame], state: _State) -> _Refinement:
+        """The refinement; without the map where that turns out to be unreadable after its check.
+
+        The photos adjusted to each other are worth more than the real-time picture, and hours may have gone into it.
+        """
+        try:
+            return self.call_refiner(frames, state)
+        except UnreadableMapError as error:
+            lost = f"{error}: it was not used, the orthoimage is the coarse one and lies where the receivers say"
+        state.basemap = None
+        refinement = self.call_refiner(frames, state)
+        refinement.warnings.append(lost)
+        refinement.map_lost = True
+        return refinement
+
     def call_refiner(self, frames: Sequence[Frame], state: _State) -> _Refinement:
         # Only the one that is asked for: the other's imports would cost memory in every run.
         refine: Any = import_module(f"orthoswarm.{self.options.refine}.refine").refine_all
@@ -256,7 +279,9 @@ class _Batch:
         for frame in frames:
             vehicles.setdefault(frame.vehicle, []).append(frame)
         basemap = state.basemap if self.options.until == "fine" else None
-        run = self.space.remembering("vehicle", self.workers.map)
+        # Results with a map that was lost are others than those without it.
+        lost = state.basemap is None and self.options.basemap is not None
+        run = self.space.remembering("vehicle without map" if lost else "vehicle", self.workers.map)
         if state.dem is not None:
             options = import_module("orthoswarm.swarm.refine").Options(dem=state.dem)
             refined = refine(vehicles, basemap, state.grid, options, run=run, progress=self.progress)
@@ -396,7 +421,7 @@ class _Batch:
         """Without a map the orthoimage is the coarse product, too."""
         with written_whole(self.out / COARSE) as part:
             shutil.copyfile(self.out / ORTHOIMAGE, part)
-        if state.basemap is None:
+        if self.options.basemap is None:
             state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
 
     def leave_out(self, state: _State, reasons: Mapping[str, str], placed: Iterable[PlacedFrame]) -> None:
@@ -459,7 +484,7 @@ class _Batch:
             "gsd_m": state.gsd_m,
             "area_ha": state.drawn[0] / 1e4,
             "covered_share": state.drawn[1],
-            "basemap": str(self.options.basemap) if self.options.basemap else None,
+            "basemap": str(self.options.basemap) if state.basemap else None,
             "until": self.options.until,
             "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],
             "root": image_root(state.ingest.frames),

@@ -96,6 +96,13 @@ class TileFolder:
         east, north = _transformer(self._epsg).transform(corners[:, 0], corners[:, 1], direction="INVERSE")
         return float(np.min(east)), float(np.min(north)), float(np.max(east)), float(np.max(north))
 
+    def gsds(self) -> list[float]:
+        """A pixel size for each zoom level, metres."""
+        return [self.native_gsd_m * 2 ** (self._zoom - zoom) for zoom in self._columns]
+
+    def require_whole(self, bounds: Bounds) -> None:
+        """Nothing to compare: each tile is a file of its own, and one that cannot be decoded is a hole in the map."""
+
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
         """Colours uint8 (3, rows, columns), also where grey is enough, and validity of a window."""
         from rasterio.enums import Resampling

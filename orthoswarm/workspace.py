@@ -20,9 +20,15 @@ VIDEO = "video"
 """Sub-folder of `.work` for pictures that were taken out of videos."""
 
 
-def run_key(frames: Sequence[Frame], options: Any) -> str:
-    """What a run is made of: pictures (name, size, date, fix) and options; a run with another key starts afresh."""
+def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
+    """What a run is made of: pictures (name, size, date, fix), options, other files (map, heights) by size and date.
+
+    A run with another key starts afresh.
+    """
     digest = hashlib.sha256(f"{__version__} {options!r}".encode())
+    for file in files:
+        with contextlib.suppress(OSError):
+            digest.update(f"{file and (file.stat().st_size, file.stat().st_mtime_ns)}".encode())
     for frame in frames:
         with contextlib.suppress(OSError):
             stat = frame.path.stat()

@@ -247,6 +247,37 @@ def test_maps_that_are_of_no_use_are_refused_before_work_begins(scene, tmp_path,
     assert mosaic(tmp_path / "photos", basemap=tmp_path / "none.tif")[0] == 2
 
 
+def cut_short(basemap, path):
+    """A copy of a map that was broken off: it opens, but half of its blocks are not there."""
+    whole = basemap.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    return path
+
+
+def test_a_map_that_is_cut_short_is_refused_before_work_begins(scene, basemap, tmp_path, mosaic):
+    scene.fly(tmp_path / "photos", legs(count=2, photos=4))
+    code, _, _, said = mosaic(tmp_path / "photos", basemap=cut_short(basemap, tmp_path / "map.tif"))
+    assert code == 2 and "map.tif is cut short; copy or export it again" in said
+
+
+def test_a_map_that_fails_during_the_work_gives_the_coarse_map_and_is_named(
+    scene, basemap, tmp_path, mosaic, monkeypatch
+):
+    shots = legs(count=2, photos=8)
+    scene.fly(tmp_path / "photos", shots)
+    monkeypatch.setattr("orthoswarm.basemap.Basemap.require_readable", lambda *_: None)
+    bad = cut_short(basemap, tmp_path / "map.tif")
+    code, rows, report, _ = mosaic(tmp_path / "photos", basemap=bad)
+    assert code == 0 and report["refine"] == "swarm" and report["basemap"] is None
+    assert {r["stage"] for r in rows.values()} == {"coarse"}
+    (told,) = [w for w in report["warnings"] if "map.tif" in w]
+    assert "damaged" in told and "lies where the receivers say" in told
+    assert np.median(errors(scene, rows, shots)) < 3.0
+    out = tmp_path / "out"
+    assert (out / "coarse.tif").read_bytes() == (out / "orthoimage.tif").read_bytes()
+    assert not any("there is no basemap" in w for w in report["warnings"])
+
+
 def test_flags_that_make_no_sense_are_refused(scene, tmp_path, mosaic):
     scene.fly(tmp_path / "photos", legs(count=1, photos=2))
     for flag in ({"gsd": 0}, {"gsd": -1}, {"fov_min": 190}, {"workers": 0}, {"dem": tmp_path / "none.tif"}):

@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 from rasterio.crs import CRS
 from rasterio.transform import Affine, from_origin
 
 from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError
 from orthoswarm.geo import GroundGrid, LocalGrid
+from orthoswarm.mapcheck import UnreadableMapError
 
 EPSG = 32633
 EAST, NORTH = 412_000.0, 5_320_000.0
@@ -268,6 +270,92 @@ def test_a_truncated_map_is_one_clear_error(tmp_path):
     path.write_bytes(data[: len(data) // 3])
     with pytest.raises(InputError, match=r"damaged|cannot be read"):
         Basemap.open(path, EPSG, AREA).gray(AREA, 0.1)
+
+
+def noisy(path, bands=1, kind=np.uint8, **profile):
+    """A map of noise over AREA and around it, so that no compression makes its blocks alike."""
+    values = np.random.default_rng(0).integers(1, np.iinfo(kind).max, (bands, 2000, 2000), kind)
+    return write(path, values, from_origin(EAST, NORTH, 0.1, 0.1), **profile)
+
+
+STORED = [
+    {"compress": "deflate", "tiled": True},
+    {"compress": "lzw", "bands": 3, "interleave": "band"},
+    {"bands": 3, "interleave": "pixel"},
+    {"compress": "deflate", "kind": np.uint16, "tiled": True},
+    {"compress": "jpeg", "tiled": True, "bands": 3, "interleave": "pixel", "photometric": "YCBCR"},
+]
+
+
+@pytest.mark.parametrize("stored", STORED)
+def test_a_map_that_is_cut_short_is_found_before_it_is_used(tmp_path, stored):
+    path = noisy(tmp_path / "m.tif", **stored)
+    size = path.stat().st_size
+    Basemap.open(path, EPSG, AREA).require_readable(AREA)
+    with path.open("r+b") as file:
+        file.truncate(int(0.6 * size))
+    with pytest.raises(UnreadableMapError, match=r"copy or export it again"):
+        Basemap.open(path, EPSG, AREA).require_readable(AREA)
+
+
+def test_a_map_whose_reduced_pictures_alone_are_whole_is_found(tmp_path):
+    path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True)
+    rasterio.shutil.copy(path, tmp_path / "cog.tif", driver="COG", compress="deflate")
+    cog = tmp_path / "cog.tif"
+    Basemap.open(cog, EPSG, AREA).require_readable(AREA)
+    with cog.open("r+b") as file:
+        file.truncate(int(0.6 * cog.stat().st_size))
+    basemap = Basemap.open(cog, EPSG, AREA)
+    assert basemap.gray(AREA, 1.0)[1].all()
+    with pytest.raises(UnreadableMapError, match="cut short"):
+        basemap.require_readable(AREA)
+
+
+def test_damage_outside_the_area_does_not_matter(tmp_path):
+    path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True)
+    with path.open("r+b") as file:
+        file.truncate(int(0.6 * path.stat().st_size))
+    north = (AREA[0], AREA[3] - 5, AREA[2], AREA[3])
+    Basemap.open(path, EPSG, north).require_readable(north)
+
+
+def test_blocks_that_were_never_written_are_found(tmp_path):
+    path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True)
+    size = path.stat().st_size
+    with path.open("r+b") as file:
+        file.seek(size // 2)
+        file.write(bytes(size - size // 2))
+    with pytest.raises(UnreadableMapError, match="damaged"):
+        Basemap.open(path, EPSG, AREA).require_readable(AREA)
+
+
+@pytest.mark.parametrize("overviews", ["inside", "beside", "none"])
+def test_a_whole_map_is_not_doubted(tmp_path, overviews):
+    path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True, SPARSE_OK=True)
+    if overviews != "none":
+        with rasterio.Env(TIFF_USE_OVR=overviews == "beside"), rasterio.open(path, "r+") as file:
+            file.build_overviews([2, 4, 8])
+    assert (tmp_path / "m.tif.ovr").exists() == (overviews == "beside")
+    Basemap.open(path, EPSG, AREA).require_readable(AREA)
+
+
+def test_a_palette_map_that_is_damaged_is_one_clear_error(tmp_path):
+    colours = {i: (i, 255 - i, 30, 255) for i in range(256)}
+    path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True, colormap=colours)
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size // 4)
+        file.write(bytes(path.stat().st_size // 2))  # its directory stands at the end
+    with pytest.raises(UnreadableMapError, match="damaged"):
+        Basemap.open(path, EPSG, AREA).gray(AREA, 0.5)
+
+
+def test_a_copy_for_another_process_says_at_its_first_use_that_the_map_is_gone(tmp_path):
+    path = noisy(tmp_path / "m.tif")
+    sent = pickle.dumps(Basemap.open(path, EPSG, AREA))
+    path.unlink()
+    basemap = pickle.loads(sent)
+    with pytest.raises(UnreadableMapError, match="cannot be read"):
+        basemap.gray(AREA, 0.5)
 
 
 def test_threads_and_processes_share_a_map(gray_tif):
