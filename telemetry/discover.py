@@ -16,6 +16,7 @@ VIDEO_SUFFIXES = frozenset(
 )
 LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg"})
 _SIDECARS = frozenset({".txt", ".csv"})
+_SUBTITLES = frozenset({".srt"})
 
 
 @dataclass(slots=True)
@@ -43,11 +44,17 @@ class Discovery:
     Attributes:
         root: names are relative to it. folders: those with something in them.
         left_out: files with a picture's suffix that are not looked into, and why.
+        everywhere: tables and logs that were named, themselves or by a folder, apart from all pictures and videos.
     """
 
     root: Path
     folders: list[Folder]
     left_out: list[tuple[Path, str]] = field(default_factory=list)
+    everywhere: frozenset[Path] = frozenset()
+
+    def scope(self, path: Path) -> Path:
+        """The folder whose pictures and videos, with those below it, a table or log tells about."""
+        return self.root if path in self.everywhere else path.parent
 
     def name(self, path: Path) -> str:
         """A file's name in all products: relative to the root, forward slashes, writable as UTF-8."""
@@ -76,6 +83,9 @@ _DIGITS = re.compile(r"([0-9]{1,18})")
 def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are not looked into.
 
+    A video or photo that is named itself brings what lies beside it and tells its pose: the SRT of the same name,
+    geo.txt and CSV. Logs have to be named, for any flight's may lie there.
+
     Raises:
         InputError: no input, or one that does not exist.
     """
@@ -93,7 +103,8 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     left_out: dict[Path, str] = {}
     sorted_in: set[Path] = set()
     inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
-    files = [*inside, *((path, False) for path in absolute if not path.is_dir())]
+    named = [path for path in absolute if not path.is_dir()]
+    files = [*inside, *((path, False) for path in named), *((path, True) for path in _beside(named))]
     real_folder = lru_cache(maxsize=None)(os.path.realpath)
     links = [(file.is_symlink(), file, walked) for file, walked in files]
     for is_link, file, walked in sorted(links, key=lambda entry: entry[0]):  # the file itself before links to it
@@ -112,7 +123,8 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     _name_vehicles(ordered, root)
     pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
-    return Discovery(root, ordered, [(file, why) for file, why in pictures if file not in sorted_in])
+    left = [(file, why) for file, why in pictures if file not in sorted_in]
+    return Discovery(root, ordered, left, _far_from_pictures(tops, ordered))
 
 
 def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
@@ -129,6 +141,32 @@ def _walk(top: Path, outside: set[str]) -> list[Path]:
     return found
 
 
+def _beside(named: list[Path]) -> list[Path]:
+    """Files beside videos and photos that tell where these were taken."""
+    videos = {(path.parent, path.stem.lower()) for path in named if path.suffix.lower() in VIDEO_SUFFIXES}
+    photos = {path.parent for path in named if path.suffix.lower() in PICTURE_SUFFIXES}
+    found: list[Path] = []
+    for folder in sorted(photos | {parent for parent, _ in videos}):
+        try:
+            files = sorted(path for path in folder.iterdir() if path.is_file())
+        except OSError:  # a folder that may be entered but not listed
+            continue
+        for path in files:
+            suffix = path.suffix.lower()
+            table = suffix == ".csv" or path.name.lower() == "geo.txt"
+            if (table and folder in photos) or (suffix in _SUBTITLES and (folder, path.stem.lower()) in videos):
+                found.append(path)
+    return found
+
+
+def _far_from_pictures(tops: Sequence[Path], folders: list[Folder]) -> frozenset[Path]:
+    """Tables and logs in named folders (or named themselves in folders) that hold no picture and no video."""
+    seen = {up for folder in folders if folder.pictures or folder.videos for up in (folder.path, *folder.path.parents)}
+    apart = {top for top in tops if top not in seen}
+    there = (folder for folder in folders if not apart.isdisjoint((folder.path, *folder.path.parents)))
+    return frozenset(path for folder in there for path in (*folder.tables, *folder.logs))
+
+
 def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None:
     suffix = file.suffix.lower()
     folder = folders.get(file.parent) or Folder(file.parent, "")
@@ -136,7 +174,7 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
         (PICTURE_SUFFIXES, folder.pictures),
         (VIDEO_SUFFIXES, folder.videos),
         (LOG_SUFFIXES, folder.logs),
-        (frozenset({".srt"}), folder.subtitles),
+        (_SUBTITLES, folder.subtitles),
         (_SIDECARS, folder.tables),
     )
     for suffixes, where in kinds:

@@ -87,9 +87,10 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, posetable
             else:
                 continue
             if table is not None:
-                tables.append((folder.path, kind, table))
+                where = found.scope(path)
+                tables.append((where, kind, table))
                 source = SourceInfo(found.name(path), kind)
-                source.findings += _table_findings(path, folder.path, table, found)
+                source.findings += _table_findings(path, where, table, found)
                 result.sources.append(source)
     return sorted(tables, key=lambda entry: len(entry[0].parts))
 
@@ -119,8 +120,8 @@ def _photo_folder(
     result: Survey,
 ) -> None:
     """Read one folder's photos into one source."""
-    name = found.name(folder.path)
-    source = SourceInfo(folder.path.name if name == "." else name, "photos")
+    at_root = folder.path == found.root
+    source = SourceInfo(folder.path.name if at_root else found.name(folder.path), "photos")
     groups: dict[str, list[PhotoTags]] = {}
     seen = 0
     tags = read_photos(folder.pictures, workers=options.workers, run=options.run, progress=advance)
@@ -168,7 +169,7 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
         if photo.lat_deg is not None and photo.lon_deg is not None:
             placed.append(photo)
         else:
-            reason = "the picture has no position; put a geo.txt or a log beside it"
+            reason = "the picture has no position; put a geo.txt beside it or name a log, too"
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
     return placed
 

@@ -27,7 +27,7 @@ _NAME_BONUS = 0.05
 
 @dataclass(slots=True)
 class LogSource:
-    """A log, where it lies, and what of it was used."""
+    """A log, the folder that it is about, and what of it was used."""
 
     folder: Path
     log: FlightLog
@@ -54,7 +54,7 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
                 source.findings += log.findings
                 source.tracks[log.vehicle] = [s for s in log.samples if s.has_position]
                 source.shown[log.vehicle] = 0
-                logs.append(LogSource(path.parent, log, source, log.timeline()))
+                logs.append(LogSource(found.scope(path), log, source, log.timeline()))
     _count_once(logs)
     return logs
 

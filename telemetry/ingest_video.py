@@ -19,7 +19,7 @@ from telemetry.survey import LoadOptions, Progress, SourceInfo, Survey
 from telemetry.video import NotAVideo, VideoScan, scan
 from telemetry.videolog import add_log
 
-NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT or a log beside it"
+NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
 
 
 def read_videos(

@@ -252,7 +252,7 @@ class Poses:
             Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items() if cues.cues
         ]
         if not self.has_positions:
-            text = f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT or a log beside it"
+            text = f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
             self.findings.append(Finding("no-position", text))
 
 

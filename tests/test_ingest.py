@@ -299,3 +299,38 @@ def test_a_picture_from_far_below_the_others_is_named(tmp_path):
     for i in range(8):
         photo(tmp_path / f"p{i}.JPG", 47.5 + 1e-4 * i, second=2 * i, yaw=0.0, height=5.0 if i == 4 else 120.0)
     assert any("1 picture taken at 5 m, the others at 120 m (p4.JPG first)" in w for w in load([tmp_path]).warnings)
+
+
+def test_a_photo_that_is_named_itself_brings_the_table_beside_it(tmp_path):
+    bare = jpeg(tmp_path / "a.JPG")
+    jpeg(tmp_path / "b.JPG")
+    (tmp_path / "geo.txt").write_text("EPSG:4326\na.JPG 8.25 47.5\nb.JPG 8.26 47.6\n")
+    (tmp_path / "notes.txt").write_text("windy")
+    (frame,) = load([bare]).frames
+    assert (frame.image, frame.fix.lat_deg, frame.fix.lon_deg) == ("a.JPG", 47.5, 8.25)
+
+
+@pytest.mark.parametrize("named", ["tables", "tables/geo.txt"])
+def test_a_table_that_is_named_apart_from_the_photos_is_about_all_of_them(tmp_path, named):
+    for vehicle in ("v1", "v2"):
+        (tmp_path / "photos" / vehicle).mkdir(parents=True)
+        jpeg(tmp_path / "photos" / vehicle / f"{vehicle}.JPG")
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "geo.txt").write_text("EPSG:4326\nv1.JPG 8.25 47.5\nv2.JPG 8.26 47.6\n")
+    frames = load([tmp_path / "photos", tmp_path / named]).frames
+    assert [(f.vehicle, f.fix.lat_deg) for f in frames] == [("photos/v1", 47.5), ("photos/v2", 47.6)]
+    assert not load([tmp_path]).frames  # not named: it may be about anything
+
+
+def test_each_folders_own_table_stays_its_own_when_it_is_named(tmp_path):
+    for vehicle, lat in (("v1", 47.5), ("v2", 47.6)):
+        (tmp_path / vehicle).mkdir()
+        jpeg(tmp_path / vehicle / "a.JPG")
+        (tmp_path / vehicle / "geo.txt").write_text(f"EPSG:4326\na.JPG 8.25 {lat}\n")
+    inputs = [tmp_path / vehicle / name for vehicle in ("v1", "v2") for name in ("", "geo.txt")]
+    assert [(f.vehicle, f.fix.lat_deg) for f in load(inputs).frames] == [("v1", 47.5), ("v2", 47.6)]
+
+
+def test_a_folder_of_photos_that_is_the_input_is_called_by_its_name(tmp_path):
+    photo(tmp_path / "day" / "a.JPG")
+    assert [source.path for source in survey([tmp_path / "day"]).sources] == ["day"]

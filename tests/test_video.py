@@ -230,7 +230,8 @@ def test_klv_without_times_is_bound_by_its_own_utc(real_data):
         assert own.lat_deg == pytest.approx(packet.sample.lat_deg, abs=1e-6)
 
 
-def test_an_srt_beside_a_video_gives_interpolated_poses(tmp_path):
+@pytest.mark.parametrize("named", ["", "DJI_0001.MP4"], ids=["its folder is named", "it is named itself"])
+def test_an_srt_beside_a_video_gives_interpolated_poses(tmp_path, named):
     make_video(tmp_path / "DJI_0001.MP4", rate=10, count=40)
     lines = []
     for second in range(4):
@@ -240,7 +241,7 @@ def test_an_srt_beside_a_video_gives_interpolated_poses(tmp_path):
         )
         lines.append(f"{second + 1}\n00:00:0{second},000 --> 00:00:0{second + 1},000\n{text}\n")
     (tmp_path / "DJI_0001.SRT").write_text("\n".join(lines))
-    result = load([tmp_path], options=LoadOptions(cache=tmp_path / "c", every_m=1.0))
+    result = load([tmp_path / named], options=LoadOptions(cache=tmp_path / "c", every_m=1.0))
     assert len(result.frames) >= 28
     frame = next(f for f in result.frames if f.image.endswith("#000015"))
     assert frame.fix.lat_deg == pytest.approx(47.0 + 30 * METRE, abs=1e-7)
