@@ -41,7 +41,8 @@ def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
 class Workspace:
     """An output folder that one run writes to at a time.
 
-    Intermediate results lie in its sub-folder `.work` until the run is complete.
+    Intermediate results lie in its sub-folder `.work` until the run is complete. Used as a context, a run that failed
+    before it had anything to go on from (by refused input, for instance) leaves no `.work` and no folder that it made.
 
     Attributes:
         out: the output folder; made if absent.
@@ -54,6 +55,8 @@ class Workspace:
     def __init__(self, out: Path) -> None:
         self.out = out
         self._work = out / ".work"
+        self._afresh = not self._work.exists()
+        self._missing = missing(out)
         if out.exists() and not out.is_dir():
             raise InputError(f"{out} is a file; choose a folder for --out")
         try:
@@ -128,9 +131,13 @@ class Workspace:
     def __enter__(self) -> "Workspace":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.clear_scratch()
         self.close()
+        failed = kind is not None and issubclass(kind, Exception)  # and not interrupted
+        if failed and self._afresh and not any(self._work.glob("*.pickle")):
+            _remove(self._work)
+            unmake(self._missing)
 
 
 class RememberingRun(Generic[Result]):
@@ -158,6 +165,18 @@ class RememberingRun(Generic[Result]):
             value = next(fresh)
             self._workspace.remember(name, value)
             yield value
+
+
+def missing(folder: Path) -> list[Path]:
+    """The folders that have to be made for one to be there: itself and its parents, the innermost first."""
+    return [p for p in (folder, *folder.parents) if not p.exists()]
+
+
+def unmake(folders: Iterable[Path]) -> None:
+    """Remove folders that nothing came into, the innermost first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _try_lock(file: IO[bytes]) -> bool:

@@ -29,6 +29,7 @@ def mosaic(tmp_path, capsys):
 
     def call(*inputs, basemap=None, **flags):
         out = tmp_path / "out"
+        before = listing(out)
         args = ["mosaic", *map(str, inputs), "--out", str(out), "--workers", "1", "--json"]
         args += ["--basemap", str(basemap)] if basemap else []
         for name, value in flags.items():
@@ -36,7 +37,7 @@ def mosaic(tmp_path, capsys):
         code = main(args)
         said = capsys.readouterr()
         if code:
-            assert not any(out.glob("*.tif")) and not said.out
+            assert listing(out) == before and not said.out
             assert "Traceback" not in said.err and len(said.err.strip().splitlines()[-1]) > 20
             return code, {}, {}, said.err
         rows = {r["image"]: r for r in map(json.loads, (out / "frames.jsonl").read_text().splitlines())}
@@ -46,6 +47,11 @@ def mosaic(tmp_path, capsys):
         return code, rows, report, said.err
 
     return call
+
+
+def listing(folder):
+    """What lies in a folder, hidden files too; None where it is not there."""
+    return {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()} if folder.exists() else None
 
 
 def errors(scene, rows, shots, names=None):

@@ -191,6 +191,37 @@ def test_an_interrupted_run_is_continued(flight, mapped, tmp_path, when):
         assert any("continued" in w for w in report["warnings"])
 
 
+def test_a_refusal_leaves_an_interrupted_run_to_be_continued(flight, mapped, tmp_path):
+    def interrupt(what, done, total):
+        if what == "drawing orthoimage":
+            raise KeyboardInterrupt
+
+    photos, out, options = flight[2] / "photos", tmp_path / "out", Options(basemap=flight[2] / "map.tif")
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, options, progress=interrupt)
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
+    Scene(47.5, 8.9).basemap(tmp_path / "elsewhere.tif")
+    with pytest.raises(InputError, match="does not overlap"):
+        make(photos, out, Options(basemap=tmp_path / "elsewhere.tif"))
+    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
+    report = make(photos, out, options)
+    assert any("continued" in w for w in report["warnings"]) and content(out) == content(mapped[0])
+
+
+def test_a_map_that_was_replaced_does_not_continue_an_interrupted_run(flight, tmp_path):
+    def interrupt(what, done, total):
+        if what == "drawing orthoimage":
+            raise KeyboardInterrupt
+
+    scene, _, folder = flight
+    photos, out, options = folder / "photos" / "a", tmp_path / "out", Options(basemap=tmp_path / "map.tif")
+    scene.basemap(tmp_path / "map.tif")
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, options, progress=interrupt)
+    scene.basemap(tmp_path / "map.tif")
+    assert not any("continued" in w for w in make(photos, out, options)["warnings"])
+
+
 def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
     def interrupt(what, done, total):
         if what == "solo":
@@ -231,8 +262,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, 
     with pytest.raises(OrthoSwarmError, match="disk is full") as caught:
         make(flight[2] / "photos", tmp_path / "out")
     assert caught.value.exit_code == 1
-    assert [p.name for p in (tmp_path / "out").iterdir()] == [".work"]
-    assert not (tmp_path / "out" / ".work" / "scratch").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, tmp_path, monkeypatch, capsys):

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm import pipeline
     from orthoswarm.errors import InputError
     from orthoswarm.frame import Ingest
-    from orthoswarm.workspace import VIDEO
+    from orthoswarm.workspace import VIDEO, missing, unmake
 
     _check(args)
     options = pipeline.Options(
@@ -71,25 +71,28 @@ def run(args: argparse.Namespace) -> int:
     def load(progress: pipeline.Progress) -> Ingest:
         reading = telemetry.LoadOptions(
             args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,),
-            run=None if args.cluster else pool.map,
+            run=None if args.cluster or pool is None else pool.map,
         )  # fmt: skip
         return telemetry.load(args.inputs, progress=progress, options=reading)
 
     if args.out.is_file():
         raise InputError(f"{args.out} is a file; choose a folder for --out")
-    pool: Workers
-    if args.cluster:
-        from orthoswarm.cluster import Cluster
-
-        args.out.mkdir(parents=True, exist_ok=True)
-        pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
-    else:
-        pool = workers(args.workers)
+    pool: Workers | None = None
+    folders = missing(args.out)
     try:
+        if args.cluster:
+            from orthoswarm.cluster import Cluster
+
+            args.out.mkdir(parents=True, exist_ok=True)  # the workers must see it
+            pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
+        else:
+            pool = workers(args.workers)
         with ProgressBars() as progress:
             report = pipeline.run(load, args.out, options, pool, progress)
     finally:
-        pool.close()
+        if pool is not None:
+            pool.close()
+        unmake(folders)
     if args.json:
         json.dump(report, sys.stdout, indent=1, ensure_ascii=False)
         print()
