@@ -104,6 +104,21 @@ def carry(
     return [_carried(one, _near(one, pairs)) for one in odd] if pairs else list(odd)
 
 
+def follow(
+    extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
+) -> list[PlacedFrame]:
+    """Move frames by what changed in their nearest neighbours when those were placed again; as sure of them as before.
+
+    Args:
+        extra: placed beside the others, but not with them.
+        before: the others as they were.
+        after: the others as they are.
+    """
+    own = {p.frame.image for p in extra}
+    moved = carry(extra, [p for p in before if p.frame.image not in own], after)
+    return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
+
+
 def _near(one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> list[tuple[PlacedFrame, PlacedFrame]]:
     """The refined frames nearest to a frame, of its own vehicle if there are any."""
     own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)

@@ -251,16 +251,21 @@ class Blank:
         return np.where(inside, 0.0, gray).astype(np.float32), valid & ~inside
 
 
-def test_a_vehicle_over_a_hole_of_the_map_is_carried_by_its_mapped_neighbour(scene):
-    vehicles, grid, basemap, truth = scene
-    shift = np.array([14.0, -9.0])  # of the second vehicle's receiver
+def off_and_over_a_hole(frames, grid):
+    """Frames whose receiver is off by 17 m, and a box around what they see."""
+    shift = np.array([14.0, -9.0])
     moved = []
-    for frame in vehicles["uav02"]:
+    for frame in frames:
         fix = frame.fix
         lat, lon = grid.to_geographic(grid.to_grid(fix.lat_deg, fix.lon_deg) + shift)
         moved.append(replace(frame, fix=replace(fix, lat_deg=float(lat), lon_deg=float(lon))))
-    path = np.array([grid.to_grid(f.fix.lat_deg, f.fix.lon_deg) for f in vehicles["uav02"]])
-    box = (*(path.min(0) - 160.0), *(path.max(0) + 160.0))
+    path = np.array([grid.to_grid(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
+    return moved, (*(path.min(0) - 160.0), *(path.max(0) + 160.0))
+
+
+def test_a_vehicle_over_a_hole_of_the_map_is_carried_by_its_mapped_neighbour(scene):
+    vehicles, grid, basemap, truth = scene
+    moved, box = off_and_over_a_hole(vehicles["uav02"], grid)
     refiner = SwarmRefiner(grid.epsg, local_origin(grid, vehicles["uav01"]))
     first = refiner.refine(vehicles["uav01"], [], basemap)
     alone = refiner.refine(moved, [], Blank(basemap, box))
@@ -272,3 +277,44 @@ def test_a_vehicle_over_a_hole_of_the_map_is_carried_by_its_mapped_neighbour(sce
     sigma = np.array([p.sigma_m for p in carried.placed])
     assert np.median(error) < 1.5 and (error < 3.0 * sigma).all() and sigma.max() < 3.0
     assert any("neighbours carry it" in w for w in carried.warnings)
+
+
+def test_vehicles_that_were_refined_one_after_the_other_are_solved_together(scene):
+    vehicles, grid, basemap, truth = scene
+    refiner = SwarmRefiner(grid.epsg, local_origin(grid, (f for frames in vehicles.values() for f in frames)))
+    at_once = {}
+    for vehicle, frames in vehicles.items():
+        at_once[vehicle] = refiner.refine(frames, list(at_once.values()), basemap)
+    before = {v: [p.camera.position.copy() for p in s.placed] for v, s in at_once.items()}
+    together = dict(at_once)
+    for vehicle in vehicles:
+        others = [together[other] for other in vehicles if other != vehicle]
+        together[vehicle] = refiner.again(together[vehicle], others, basemap)
+    for vehicle, solution in together.items():
+        assert [p.frame.image for p in solution.placed] == [p.frame.image for p in at_once[vehicle].placed]
+        assert {p.stage for p in solution.placed} == {"fine"} and solution.warnings == at_once[vehicle].warnings
+        np.testing.assert_array_equal(before[vehicle], [p.camera.position for p in at_once[vehicle].placed])
+    was, now = (np.concatenate([errors(s, truth, grid) for s in all_.values()]) for all_ in (at_once, together))
+    assert np.median(now) < 1.1 * np.median(was) and now.max() < 1.0
+
+
+def test_a_vehicle_over_a_hole_of_the_map_is_carried_once_its_neighbour_is_there(scene):
+    vehicles, grid, basemap, truth = scene
+    moved, box = off_and_over_a_hole(vehicles["uav02"], grid)
+    refiner = SwarmRefiner(grid.epsg, local_origin(grid, vehicles["uav01"]))
+    alone = refiner.refine(moved, [], Blank(basemap, box))
+    assert refiner.again(alone, [], basemap) is alone
+    lone = replace(alone.placed[-1], frame=replace(alone.placed[-1].frame, image="late.jpg"), sigma_m=0.7)
+    alone.placed.append(lone)  # laid beside the refined ones
+    first = refiner.refine(vehicles["uav01"], [], basemap)
+    carried = refiner.again(alone, [first], Blank(basemap, box))
+    assert {leg.state for leg in alone.legs} == {"failed"} and {leg.state for leg in carried.legs} == {"carried"}
+    assert {p.stage for p in carried.placed} == {"fine"}
+    *own, follower = carried.placed
+    assert np.median(errors(replace(carried, placed=own), truth, grid)) < 1.5
+    assert (follower.frame.image, follower.sigma_m) == ("late.jpg", 0.7)
+    middle = np.array([319.5, 239.5])
+    off = follower.camera.to_ground(middle) - own[-1].camera.to_ground(middle)
+    assert np.hypot(*off) < 1.0
+    assert any("neighbours carry it" in w for w in carried.warnings)
+    assert not any("no part of this flight was found" in w for w in carried.warnings)

@@ -17,11 +17,11 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.crew import Crew
-from gcs_plugin.daemon.jobs import GaveWay, Job
+from gcs_plugin.daemon.jobs import GaveWay, Job, Tell
 from gcs_plugin.daemon.journal import Change, Journal, packed
 from gcs_plugin.daemon.layers import new_name
 from gcs_plugin.daemon.press import Press
-from gcs_plugin.daemon.refinement import Tell, apart_m, detail_of, sortie_frames
+from gcs_plugin.daemon.refined import apart_m, detail_of, sortie_frames
 from gcs_plugin.daemon.store import PictureStore
 from gcs_plugin.daemon.work import Solved, SolveTask, coarse_after, joined, near, place
 from orthoswarm.errors import OrthoSwarmError

@@ -30,6 +30,7 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.sources import Source
 from gcs_plugin.daemon.store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.tiles import TileServer
+from gcs_plugin.daemon.together import Together
 from gcs_plugin.daemon.usage import resident_mb
 from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError
@@ -87,7 +88,11 @@ class Daemon:
             self.journal, self.store, press, self.crew, self.drawer, settings.basemap, self._published,
             self._make_way, lambda: self.jobs.stopping,
         )  # fmt: skip
-        handlers = {"refine": self.refinement.refine, "coarse": self.coarse.make, "export": self._export}
+        self.together = Together(self.journal, press, self.background, settings.basemap, self._published)
+        handlers = {
+            "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
+            "export": self._export,
+        }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
         )
@@ -305,7 +310,8 @@ class Daemon:
             self.legwatch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
 
     def _make_way(self, vehicle: str, layer: str | None) -> None:
-        """A refinement begins, or needs a layer: coarse work stands aside."""
+        """A refinement begins, or needs a layer: what is done in the background stands aside."""
+        self.together.give_up()
         if layer is None:
             self.jobs.drop("coarse", vehicle, _REPLACED)
         else:
@@ -316,9 +322,9 @@ class Daemon:
         if job.kind == "refine":
             self._note_refined(job)
             self.jobs.wake()
-        elif job.kind != "coarse" or "after" not in job.detail:
+        elif job.kind != "together" and (job.kind != "coarse" or "after" not in job.detail):
             return
-        if not self.jobs.open("refine", "coarse"):
+        if not self.jobs.open("refine", "together", "coarse"):
             self.jobs.add("export", formats=["cog", "gpkg"])
 
     def _note_refined(self, job: Job) -> None:

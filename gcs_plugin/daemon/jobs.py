@@ -2,7 +2,8 @@
 
 A job that was queued or running when the daemon ended is queued again; what it does must be repeatable up to the one
 change of the journal that also marks it as done. Refinement of completed vehicles goes before everything; what belongs
-to the background (coarse maps in flight, exports) runs one at a time and never takes a refinement's place.
+to the background (coarse maps in flight, neighbours solved together, exports) runs one at a time and never takes a
+refinement's place; neighbours are solved together only while no refinement waits or runs.
 """
 
 import json
@@ -21,7 +22,7 @@ from orthoswarm.errors import OrthoSwarmError
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
 _KEPT: Final = 1000
-_BACKGROUND: Final = frozenset({"coarse", "export"})
+_BACKGROUND: Final = frozenset({"coarse", "together", "export"})
 _ORDER: Final = (
     "CASE WHEN kind = 'refine' THEN 0 WHEN kind = 'coarse' AND detail NOT LIKE '%\"after\"%' THEN 2 ELSE 1 END, id"
 )
@@ -33,7 +34,7 @@ class Job:
     """One job.
 
     Attributes:
-        id: number. kind: refine, coarse, export or products. vehicle: whose, None for all. sortie: which.
+        id: number. kind: refine, together, coarse or export. vehicle: whose, None for all. sortie: which.
         state: queued, running, done or failed. progress: 0 to 1. message: what is being done, or why it failed.
         created, started, ended: UTC epoch seconds. attempts: how often it was begun. detail: JSON values.
     """
@@ -76,7 +77,9 @@ class GaveWay(Exception):
     """A handler's way to say that its work was taken away: to be done again later."""
 
 
-Handler = Callable[[Job, Callable[[float, str], None]], Change]
+Tell = Callable[[float, str], None]
+"""Told a job's progress, 0 to 1, and what is being done."""
+Handler = Callable[[Job, Tell], Change]
 """Does a job, telling its progress; gives the change that makes its result so. That the job is done is written with
 it, in one transaction."""
 After = Callable[[Job], None]
@@ -212,9 +215,10 @@ class Jobs:
         """Take the next job that may run: refinement goes first, and a vehicle's jobs one after the other."""
         rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_ORDER}")
         busy = {_lane(job) for job in self._running.values()}
+        refining = any(kind == "refine" for kind, _ in busy) or any(row["kind"] == "refine" for row in rows)
         for row in rows:
             job = Job.of(row)
-            if row["id"] in self._running or _lane(job) in busy:
+            if row["id"] in self._running or _lane(job) in busy or (refining and job.kind == "together"):
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
             self._running[job.id] = job

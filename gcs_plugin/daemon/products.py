@@ -227,16 +227,17 @@ def facts_of(
             for j in jobs
             if j["kind"] == "refine" and j["state"] == "done"
         ),
-        *_in_flight([j["detail"] for j in jobs if j["kind"] == "coarse" and "frames" in j["detail"]]),
+        *_summed("coarse: in flight", "coarse", jobs),
+        *_summed("fine: neighbours together", "together", jobs),
     ]  # fmt: skip
     document = {"stages": stages, "wall_s": wall_s, "cpu_s": cpu_s, "peak_rss_mb": rss_mb, "completions": completions}
     return dict(json.loads(json.dumps(document)))
 
 
-def _in_flight(details: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The stage of the coarse maps in flight, if there were any."""
+def _summed(name: str, kind: str, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The stage of all jobs of a kind that placed pictures, if there were any."""
+    details = [j["detail"] for j in jobs if j["kind"] == kind and "frames" in j["detail"]]
     if not details:
         return []
     wall, cpu = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))
-    frames = sum(d["frames"] for d in details)
-    return [{"name": "coarse: in flight", "wall_s": wall, "cpu_s": cpu, "items": frames}]
+    return [{"name": name, "wall_s": wall, "cpu_s": cpu, "items": sum(d["frames"] for d in details)}]

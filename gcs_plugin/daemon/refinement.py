@@ -3,24 +3,22 @@
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.crew import Crew
-from gcs_plugin.daemon.drawing import Drawer, frame_of_row
-from gcs_plugin.daemon.jobs import Job, new_job
+from gcs_plugin.daemon.drawing import Drawer
+from gcs_plugin.daemon.jobs import Job, Tell, new_job
 from gcs_plugin.daemon.journal import Change, Journal, late_frames, packed
-from gcs_plugin.daemon.kept import Bytes, thumbnail_of
 from gcs_plugin.daemon.layers import Bounds, new_name
 from gcs_plugin.daemon.press import Press
+from gcs_plugin.daemon.refined import detail_of, others_near, refined_change, solution_row, sortie_frames
 from gcs_plugin.daemon.store import PictureStore
+from gcs_plugin.daemon.together import together_jobs
 from gcs_plugin.daemon.work import Solved, SolveTask, joined, lay_beside, near, solve
-from orthoswarm.errors import OrthoSwarmError
-from orthoswarm.frame import Frame
-from orthoswarm.products import finite
 
 _REACH_M: Final = 400.0
 _DRAWN_S: Final = 3.0
@@ -29,7 +27,6 @@ _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
 _AGAIN: Final = 10
 """So many pictures that came late have their vehicle refined again; fewer are laid beside its refined ones."""
-Tell = Callable[[float, str], None]
 
 
 @dataclass(slots=True)
@@ -128,55 +125,34 @@ class Refinement:
         """The kept refinement beside which late pictures are laid; None if all are to be refined."""
         if job.detail.get("trigger") != "late":
             return None
-        row = self.journal.one(
-            "SELECT * FROM solutions WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
-        )
+        row = solution_row(self.journal, job)
         refined = None if row is None else json.loads(row["detail"]).get("refined")
         return row if refined is not None and count - refined < _AGAIN else None
 
     def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
         """Solutions of others whose ground comes near."""
-        mine = (packed(str(job.vehicle)), job.sortie)
-        return [
-            self.press.kept / row["path"]
-            for row in self.journal.rows("SELECT * FROM solutions")
-            if (row["vehicle"], row["sortie"]) != mine and apart_m(json.loads(row["detail"])["bounds"], box) < _REACH_M
-        ]
+        return [self.press.kept / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
 
     def _publish(
         self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str], before: Any
     ) -> Change:
-        vehicle = packed(str(job.vehicle))
-        dropped = {**solved.dropped, **rejected}
-        placed = [
-            (stage, finite(sigma), vehicle, job.sortie, packed(image))
-            for image, (stage, sigma) in solved.stages.items()
-            if image not in dropped
-        ]
-        lost = [(why, vehicle, job.sortie, packed(image)) for image, why in dropped.items()]
         if before is None:
-            detail = json.dumps(detail_of(solved, solved.legs) | {"layer": layer, "refined": len(placed)})
+            count = len(solved.stages) - len(rejected)
+            detail = detail_of(solved, solved.legs) | {"layer": layer, "refined": count}
         else:
-            detail = json.dumps(json.loads(before["detail"]) | {"bounds": solved.bounds})
-        old = self.journal.one("SELECT path FROM solutions WHERE vehicle=? AND sortie=?", (vehicle, job.sortie))
-        then = None
+            detail = json.loads(before["detail"]) | {"bounds": solved.bounds}
+        stands = refined_change(job, solved, rejected, target.name, detail)
+        old = solution_row(self.journal, job)
+        then = []
         if self.basemap is not None:  # the coarse layer shows all of the sortie, too
-            then = new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"})
+            then.append(new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"}))
+            if before is None:
+                then += together_jobs(self.journal, job, solved.bounds)
 
         def change(db: sqlite3.Connection) -> None:
-            db.executemany(
-                "UPDATE frames SET stage = ?, sigma = ? WHERE vehicle = ? AND sortie = ? AND image = ?", placed
-            )
-            db.executemany(
-                "UPDATE frames SET stage = 'rejected', reason = ? WHERE vehicle = ? AND sortie = ? AND image = ?", lost
-            )
-            db.execute(
-                "INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", (vehicle, job.sortie, target.name, detail)
-            )
-            # The job's result stands with this, so that it is not done again if the daemon ends right now.
-            db.execute("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", (time.time(), job.id))
-            if then is not None:
-                then(db)
+            stands(db)
+            for queue in then:
+                queue(db)
 
         if old is not None:
             self.press.retire(self.press.kept / old["path"])
@@ -186,38 +162,3 @@ class Refinement:
 def _nothing_came(job: Job) -> Change:
     job.detail["note"] = "nothing came late"
     return lambda db: None
-
-
-def sortie_frames(
-    journal: Journal, store: PictureStore, vehicle: str, sortie: int | None
-) -> tuple[list[Frame], dict[str, Bytes]]:
-    """A sortie's frames in order of time that were not rejected, and image -> thumbnail of those that were drawn.
-
-    Raises:
-        OrthoSwarmError: there are none.
-    """
-    rows = journal.rows(
-        "SELECT frames.*, thumbnails.rgb FROM frames LEFT JOIN thumbnails USING (seq)"
-        " WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
-        (packed(vehicle), sortie),
-    )
-    if not rows:
-        raise OrthoSwarmError(f"{vehicle} has no pictures that could be drawn; check its camera and its poses")
-    frames = [frame_of_row(row, store) for row in rows]
-    small = {f.image: thumbnail_of(row["rgb"]) for f, row in zip(frames, rows, strict=True) if row["rgb"] is not None}
-    return frames, small
-
-
-def detail_of(solved: Solved, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """What the journal keeps of a placed sortie, as JSON values."""
-    return {
-        "bounds": solved.bounds,
-        "legs": [leg | {key: finite(leg[key]) for key in ("confidence", "sigma_m")} for leg in legs],
-        "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
-        "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
-    }  # fmt: skip
-
-
-def apart_m(one: Bounds, other: Bounds) -> float:
-    """How far two boxes lie apart along an axis; negative where they overlap."""
-    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])

@@ -14,6 +14,7 @@ import numpy as np
 from gcs_plugin.daemon.kept import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
 from gcs_plugin.daemon.layers import Bounds, drawn_bounds, successor, union
 from orthoswarm.basemap import Basemap
+from orthoswarm.camera import Camera
 from orthoswarm.frame import Frame
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
@@ -113,6 +114,66 @@ def lay_beside(task: SolveTask) -> Solved:
     kept.write(task.target)
     new = replace(whole, placed=placed, dropped=dropped, legs=[])
     return watch.solved(new, [], kept, seen(placed, kept.terrain))
+
+
+@dataclass(frozen=True, slots=True)
+class AgainTask:
+    """A refined sortie, to be solved once more beside neighbours.
+
+    Attributes:
+        before: the kept sortie. neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        epsg, origin: the area's. basemap: the map.
+    """
+
+    before: Path
+    neighbours: list[Path]
+    target: Path
+    epsg: int
+    origin: tuple[float, float]
+    basemap: Path
+
+
+def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
+    """Solve a refined sortie again; gives how far its pictures moved (metres, 95 %), None if nothing was to be solved.
+
+    Its exposure stays as it is: its neighbours were drawn to agree with it.
+    """
+    from orthoswarm.swarm.refine import SwarmRefiner, states_of
+
+    watch = _Watch()
+    before = load_kept(task.before)
+    frames = [frame for state in states_of(before.solution) for frame in state.flight.frames]
+    if not frames:
+        return None
+    others = [load_kept(path).solution for path in task.neighbours]
+    basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
+    solution = SwarmRefiner(task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
+    if solution is before.solution:
+        return None
+    kept = replace(before, solution=solution)
+    kept.write(task.target)
+    changed = joined([seen(p.solution.placed, p.terrain) for p in (before, kept)])
+    return watch.solved(solution, frames, kept, changed), _moved_m(before.solution, solution)
+
+
+def _moved_m(before: Solution, now: Solution) -> float:
+    """How far the ground under pictures moved, 95 % of their middles and corners."""
+    was = {p.frame.image: p.camera for p in before.placed}
+    moved = [
+        np.hypot(*(ground_of(p.camera, now.ground_z_m) - ground_of(was[p.frame.image], before.ground_z_m)).T)
+        for p in now.placed
+        if p.frame.image in was and not p.weak
+    ]
+    found = np.concatenate(moved) if moved else np.zeros(1)
+    return float(np.nanpercentile(found, 95))
+
+
+def ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """East and north (5, 2) of a picture's middle and corners on a level plane."""
+    lens = camera.lens
+    right, low = lens.width - 1.0, lens.height - 1.0
+    uv = np.array([lens.principal_point, (0.0, 0.0), (right, 0.0), (0.0, low), (right, low)])
+    return camera.to_ground(uv, z_m)
 
 
 def place(task: SolveTask) -> Solved:

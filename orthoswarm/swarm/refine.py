@@ -6,6 +6,7 @@ The map's lean is voted over the roofs of all vehicles for the report; ties are 
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -13,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.carried import carry, sort_out
+from orthoswarm.carried import carry, follow, sort_out
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
@@ -96,6 +97,38 @@ class SwarmRefiner:
         parts = split_units({frames[0].vehicle: frames})
         own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
         others = [state for n in neighbours for state in states_of(n)]
+        return self._beside(own, others, basemap)
+
+    def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place a vehicle again beside neighbours that were not there, or not yet so good, when it was refined.
+
+        Its second pass is repeated on their common level, and what was not found on the map is laid beside those that
+        were. Pictures beside its refined ones (late ones, those of another camera) follow them.
+
+        Args:
+            solution: an earlier result of this refiner; it stays as it is. neighbours: the same of others, held.
+            basemap: the map, or None.
+
+        Returns:
+            The new one; the same one where there is nothing to solve.
+        """
+        own = deepcopy(states_of(solution))
+        others = [state for n in neighbours for state in states_of(n)]
+        if not own or not any(neighbours_of(state, others) for state in own):
+            return solution
+        told = {warning for state in own for warning in state.flight.warnings}
+        now = self._beside(own, others, basemap)
+        there = {p.frame.image for p in now.placed}
+        extra = [p for p in solution.placed if p.frame.image not in there]
+        return replace(
+            now,
+            placed=[*now.placed, *follow(extra, solution.placed, now.placed)],
+            dropped=dict(solution.dropped),
+            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in told)])),
+        )
+
+    def _beside(self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None) -> Solution:
+        """The second pass of a vehicle's units, with others held as they are."""
         own = lay_lost_beside(own, others, self.epsg, self.origin, serial)
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])

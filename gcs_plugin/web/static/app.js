@@ -141,11 +141,11 @@ function countLegs(features) {
 // -- jobs and exports ------------------------------------------------------------------------------------------------
 
 const jobs = new Map();
-const NAMES = { refine: "Refine", export: "Export", coarse: "Coarse" };
+const NAMES = { refine: "Refine", together: "Neighbours", export: "Export", coarse: "Coarse" };
 
 function drawJobs() {
-  // Coarse maps in flight come and go by themselves: only what is under way, or went wrong, is worth a line.
-  const shown = [...jobs.values()].filter((job) => job.kind !== "coarse" || job.state === "running" || job.state === "failed");
+  // What is done in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
+  const shown = [...jobs.values()].filter((job) => !["coarse", "together"].includes(job.kind) || job.state === "running" || job.state === "failed");
   const latest = shown.sort((a, b) => b.id - a.id).slice(0, 12);
   if (latest.length) {
     $("jobs").replaceChildren(...latest.map((job) => make("div", { className: "card" },
