@@ -85,6 +85,16 @@ def test_the_map_shows_roofs_leaning_and_ground_in_place(lean):
         np.testing.assert_allclose(centre, [20 + lean[0] * height, 10 + lean[1] * height], atol=0.25)
 
 
+@pytest.mark.parametrize("lean", [(0.3, 0.0), (0.0, -0.25), (-0.2, 0.2), (0.0, 0.0)])
+def test_the_map_is_complete_to_its_edges_whatever_stands_elsewhere(lean):
+    # a tower decides at what height rays begin; where they lean, those of the edges begin outside the scene
+    towered, low = (satellite_view(stage_of(box_scene(h, slope=0.05)), lean, 0.4)[0] for h in (40.0, 2.0))
+    assert towered[..., 0].min() == 40.0  # walls are red
+    near_box = np.zeros(towered.shape[:2], bool)
+    near_box[30:-30, 30:-30] = True
+    np.testing.assert_array_equal(towered[~near_box], low[~near_box])
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-3, 3))
 @example(362881, -2.4203227286099054, -2.5)

@@ -33,7 +33,10 @@ Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0
 """Absolute altitude of the takeoff point, so that nobody takes absolute altitudes for heights."""
 GENERATOR = 3
-"""Raised when the same parameters give other data, so that a set is never continued by another generator."""
+"""Raised when the same parameters give other data, so that a set is never continued by another generator.
+
+Not raised for the map's edges, which were black where rays began outside the scene: no photo and no truth changed.
+"""
 
 
 @dataclass(frozen=True, slots=True)

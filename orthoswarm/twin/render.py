@@ -337,6 +337,14 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
 
 
 @kernel
+def _rise_inside(x, lean, side):  # type: ignore[no-untyped-def]
+    """Height over its ground point, which is at x, up to which a leaning ray is within a scene's side of 0 to side."""
+    if abs(lean) < 1e-9:
+        return 1e9
+    return (x / lean if lean > 0.0 else (x - side) / lean) - 1e-3
+
+
+@kernel
 def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lean_x, lean_y, top, gsd, out):  # type: ignore[no-untyped-def]
     """Parallel rays: each map pixel looks from its terrain point towards the satellite, 2x2 rays a pixel."""
     rows, cols = out.shape[:2]
@@ -352,6 +360,12 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                 hr, hc, z, side = _march(
                     dsm, tiles, x / CELL_M, y / CELL_M, ground, lean_x / CELL_M, lean_y / CELL_M, top
                 )
+                if hr < 0:  # the ray is outside the scene at the height of its highest thing: begin where it enters
+                    wide, high = CELL_M * dsm.shape[1], CELL_M * dsm.shape[0]
+                    rise = min(_rise_inside(x, lean_x, wide), _rise_inside(y, lean_y, high))
+                    hr, hc, z, side = _march(
+                        dsm, tiles, x / CELL_M, y / CELL_M, ground, lean_x / CELL_M, lean_y / CELL_M, ground + rise
+                    )
                 if hr < 0:
                     rgb[0] = rgb[1] = rgb[2] = 0.0
                 elif side > 0 and dsm[hr, hc] - z > 0.45:
