@@ -2,6 +2,8 @@
 
 import argparse
 import importlib
+import io
+import os
 import sys
 from collections.abc import Sequence
 
@@ -42,8 +44,23 @@ def _overview() -> str:
     return "\n".join(lines)
 
 
+def _open_streams() -> None:
+    """Let no text fail for its way out.
+
+    A stream that was closed leads nowhere; otherwise a product could get its file number, and with it what libraries
+    write there. What a console has no character for is written as an escape.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper) and stream.writable():
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (0 made, 1 nothing could be made, 2 wrong input, 130 interrupted)."""
+    _open_streams()
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
         print(_overview())
@@ -66,6 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parsed = parser.parse_args(args[1:])
     except SystemExit as stop:
         return int(stop.code or 0)
+    if getattr(parsed, "json", False) and isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # JSON is UTF-8
     try:
         return int(module.run(parsed))
     except OrthoSwarmError as error:

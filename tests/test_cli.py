@@ -1,6 +1,7 @@
 """The command line: fast, helpful, and with the right exit codes."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -47,6 +48,32 @@ def test_exit_codes(capsys):
     assert cli.main(["fly"]) == 2
     assert "there is no verb 'fly'" in capsys.readouterr().err
     assert cli.main(["mosaic"]) == 2
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.skipif(sys.platform == "win32", reason="closes streams in a Unix shell")
+def test_a_closed_stream_leads_nowhere_and_gives_its_number_to_no_file(closed, tmp_path):
+    code = (
+        "import sys; from gcs_plugin.cli import main; code = main(['doctor', '--json']); "
+        f"file = open({str(tmp_path / 'product')!r}, 'w'); file.write(str(file.fileno())); file.close(); sys.exit(code)"
+    )
+    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, code], capture_output=True)
+    assert done.returncode == 0
+    assert int((tmp_path / "product").read_text()) > 2
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_any_name_can_be_printed_on_any_console_and_json_is_utf_8(encoding, tmp_path):
+    folder = tmp_path / "Überflug 無人機"
+    folder.mkdir()
+    for args in (["inspect", str(folder)], ["inspect", "--json", str(folder)]):
+        done = subprocess.run(
+            [sys.executable, "-m", "gcs_plugin.cli", *args],
+            capture_output=True,
+            env=os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"},
+        )
+        assert done.returncode == 1, done.stderr  # nothing there
+    assert json.loads(done.stdout.decode())["root"] == str(folder)
 
 
 def test_doctor_says_what_is_there(capsys, tmp_path):
