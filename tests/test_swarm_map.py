@@ -10,6 +10,7 @@ from orthoswarm.camera import rotation_from_angles
 from orthoswarm.geo import GroundGrid
 from orthoswarm.swarm.coarse import correlate, orientation_field, register
 from orthoswarm.swarm.loadedmap import LoadedMap
+from orthoswarm.swarm.patches import gradient_field, match, texture_field
 from orthoswarm.swarm.rig import Rig
 from orthoswarm.swarm.settle import mode_shift
 from orthoswarm.swarm.sights import one_per_cell
@@ -123,6 +124,38 @@ def roofs(height, lean, seed=0, wild=0.3):
     shift[bad] = rng.uniform(-8, 8, (int(bad.sum()), 2))
     n = len(height)
     return MapMatches(np.arange(n, dtype=np.int32), np.zeros(n, np.int32), shift, np.ones(n), np.zeros(n))
+
+
+def in_light(ground, things, east, north):
+    """Ground with dark things on it that cast shadows of so many pixels, float32."""
+    out = ground.copy()
+    for r, c in things:
+        for k in np.linspace(0.0, 1.0, 9):
+            row, column = round(r - k * north), round(c + k * east)
+            out[row : row + 3, column : column + 3] = 0.5 * ground[row : row + 3, column : column + 3]
+    return out
+
+
+def common_shift(field, pictures, maps):
+    shifts = []
+    for picture, other in zip(pictures, maps, strict=True):
+        template = np.ascontiguousarray(field(picture)[12:53, 12:53])
+        shifts.append(match(template, field(other))[:2])
+    return float(np.hypot(*np.mean(shifts, axis=0)))
+
+
+def test_shadows_of_another_hour_pull_less_where_texture_is_compared():
+    rng = np.random.default_rng(3)
+    pictures, maps = [], []
+    for _ in range(60):
+        ground = cv2.GaussianBlur(rng.normal(0.0, 1.0, (65, 65)).astype(np.float32), (0, 0), 1.5)
+        ground = 120.0 + 12.0 * ground / ground.std()
+        things = rng.integers(8, 54, (14, 2))
+        pictures.append(in_light(ground, things, 3.0, 0.0))
+        maps.append(in_light(ground, things, 0.0, 3.0))
+    edges, texture = (common_shift(field, pictures, maps) for field in (gradient_field, texture_field))
+    assert edges > 0.03
+    assert texture < 0.6 * edges
 
 
 def test_the_lean_is_voted_among_outliers():

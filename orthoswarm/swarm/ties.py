@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.swarm.loadedmap import LoadedMap
-from orthoswarm.swarm.patches import gradient_field, match, rectify
+from orthoswarm.swarm.patches import gradient_field, match, rectify, texture_field
 from orthoswarm.swarm.rig import Rig
 
 Array = NDArray[np.float64]
@@ -48,7 +48,8 @@ def match_points(
     """Find the surroundings of points on the map.
 
     What surrounds a corner is mostly ground, although the corner itself sits on something raised: so the surroundings
-    are rectified on the ground where the camera sees the point, not at the point's own height.
+    are rectified on the ground where the camera sees the point, not at the point's own height. Ground is compared by
+    its texture, because strong edges belong to what leans and casts shadows; roofs by all their edges.
 
     Args:
         chosen: (Q,) indices of points; camera: (P,) the picture to take for each point.
@@ -57,6 +58,7 @@ def match_points(
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
     """
     order = np.argsort(camera[chosen], kind="stable")
+    field = gradient_field if level is None else texture_field
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
     rows: list[tuple[int, int, float, float, float, float]] = []
     for k in order:
@@ -73,8 +75,8 @@ def match_points(
         seen = rectify(rig.position[i], rig.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch)
         if seen < 0.85:
             continue
-        template = gradient_field(patch)[1:-1, 1:-1]
-        dc, dr, peak, second = match(np.ascontiguousarray(template), gradient_field(window[0])[1:-1, 1:-1])
+        template = field(patch)[1:-1, 1:-1]
+        dc, dr, peak, second = match(np.ascontiguousarray(template), field(window[0])[1:-1, 1:-1])
         if peak > 0:
             rows.append((p, i, dc * ground.gsd_m, -dr * ground.gsd_m, peak, second / peak))
     if not rows:
