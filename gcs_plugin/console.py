@@ -83,7 +83,7 @@ class Commands:
         self._plan = ""
         self._verbs: dict[str, Callable[[list[str]], list[str]]] = {
             "status": self.status, "vehicles": self.vehicles, "plan": self.plan, "upload": self.upload,
-            "start": self.command("start"), "pause": self.command("pause"), "rtl": self.command("rtl"),
+            "start": self.start, "pause": self.command("pause"), "rtl": self.command("rtl"),
             "refine": self.refine, "layers": self.layers, "export": self.export, "web": self.web,
             "connect": self.connect,
         }  # fmt: skip
@@ -144,6 +144,15 @@ class Commands:
             return ["usage: orthoswarm upload VEHICLE [PLAN]; plan first"]
         plan = words[1] if len(words) > 1 else self._plan
         return [self.client.ask(f"/api/missions/{words[0]}/upload", {"plan": plan})["text"]]
+
+    def start(self, words: list[str]) -> list[str]:
+        """`start VEHICLE` at once, or `start PLAN`: its vehicles at its times."""
+        if len(words) != 1:
+            return ["usage: orthoswarm start VEHICLE, or start PLAN for its vehicles at its times"]
+        if not words[0].startswith("plan-"):
+            return self.command("start")(words)
+        waits = self.client.ask(f"/api/plans/{words[0]}/start", {})["takeoffs_in_s"]
+        return [f"{vehicle} takes off in {seconds:.0f} s" for vehicle, seconds in sorted(waits.items())]
 
     def command(self, verb: str) -> Callable[[list[str]], list[str]]:
         """A command to a vehicle."""

@@ -47,8 +47,11 @@ def test_plans_are_made_and_wrong_words_explained(commands, tmp_path):
     area.write_text(json.dumps(square(150)))
     assert "% covered" in commands.run(["plan", str(area), "2", "60", "65"])[0]
     assert "links" in commands.run(["upload", "v1"])[0]
+    (plan,) = (row["id"] for row in commands.client.ask("/api/plans"))
+    assert "links" in commands.run(["start", plan])[0]
     assert "usage" in commands.run(["plan"])[0]
     assert "usage" in commands.run([])[0]
+    assert "usage" in commands.run(["start"])[0]
     assert "no picture" in commands.run(["refine", "nobody"])[0]
 
 

@@ -147,3 +147,38 @@ def test_commands_that_cannot_be_carried_out_say_why(flown):
     assert "vehicles" in served.command("/api/plans", {"area": square(100)}).json()["detail"]
     bad = {"area": {"type": "Point"}, "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65}
     assert served.command("/api/plans", bad).status_code == 422
+
+
+def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
+    served, _, _ = flown
+    served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST - 90.0, NORTH - 90.0]))
+    body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "end": "hover", "speed_m_s": 8}
+    plan = served.command("/api/plans", body | {"starts": [[lat, lon], [lat, lon]]}).json()
+    starts = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
+    apart = max(starts.values()) - min(starts.values())
+    assert apart >= 5.0  # from one start they take off one after the other
+    later = max(starts, key=starts.get)
+    go = f"/api/plans/{plan['id']}/start"
+    upload(served, later, plan["id"])
+    refused = served.command(go)
+    assert refused.status_code == 409 and "nobody was started" in refused.json()["detail"]
+    assert ({"v1", "v2"} - {later}).pop() in refused.json()["detail"] and later not in refused.json()["detail"]
+    for vehicle in starts:
+        upload(served, vehicle, plan["id"])
+    assert served.post(go, json={}).status_code == 401  # a command
+    assert served.command(go, {"sortie": 7}).status_code == 422
+    assert "alpha" in served.command(go, {"vehicles": {later: "alpha"}}).json()["detail"]
+    answer = served.command(go)
+    assert answer.status_code == 202, answer.text
+    assert answer.json()["takeoffs_in_s"] == {
+        v: pytest.approx(t - min(starts.values()), abs=0.1) for v, t in starts.items()
+    }
+    waiting = served.until("/api/vehicles", lambda rows: [r for r in rows if "takeoff" in r])
+    assert [r["id"] for r in waiting if "takeoff" in r and r["takeoff"]["in_s"] > 1.0] == [later]
+    assert "under way" in served.command(go).json()["detail"]
+    served.until("/api/vehicles", lambda rows: sum(r["mission"]["phase"] == "active" for r in rows) == 1)
+    assert "cancelled" in served.command(f"/api/missions/{later}/rtl").json()["text"]
+    served.until("/api/completions", lambda rows: len(rows) == 1)  # and the other one stays on the ground
+    rows = {r["id"]: r for r in served.get("/api/vehicles").json()}
+    assert "takeoff" not in rows[later] and not rows[later]["armed"]

@@ -29,6 +29,7 @@ from gcs_plugin.daemon.refinement import Refinement
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.sources import Source
 from gcs_plugin.daemon.store import PictureStore, frame_key, picture_size
+from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.tiles import TileServer
 from gcs_plugin.daemon.together import Together
 from gcs_plugin.daemon.usage import resident_mb
@@ -101,8 +102,10 @@ class Daemon:
         self.posted: Counter[str] = Counter()
         self.plans = Plans(folder / "plans")
         self.flock: Flock | None = None
+        self.takeoffs: Takeoffs | None = None
         if settings.links:
             self.flock = Flock(settings, self.journal, self.events, self.jobs)
+            self.takeoffs = Takeoffs(self.flock, self.plans, self._say)
         self.sources = [
             Source(
                 v.id,
@@ -137,6 +140,8 @@ class Daemon:
         self.jobs.give_up()
         self._close_sources()
         self.legwatch.close()
+        if self.takeoffs is not None:
+            self.takeoffs.close()
         if self.flock is not None:
             self.flock.close()
         self.crew.close()
@@ -216,6 +221,8 @@ class Daemon:
     def vehicles(self) -> list[dict[str, Any]]:
         """All vehicles that were heard or sent pictures, as JSON values."""
         linked = {} if self.flock is None else {row["id"]: row for row in self.flock.rows()}
+        for vehicle, takeoff in ({} if self.takeoffs is None else self.takeoffs.rows()).items():
+            linked.setdefault(vehicle, {"id": vehicle})["takeoff"] = takeoff
         return told.vehicle_rows(self.journal, self.settings.vehicles, self.sources, linked)
 
     def legs(self) -> dict[str, Any]:

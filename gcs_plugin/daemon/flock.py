@@ -23,7 +23,9 @@ from telemetry.sample import Sample
 if TYPE_CHECKING:
     from gcs_plugin.fleet import Fleet
     from gcs_plugin.fleetevents import FleetEvent
+    from gcs_plugin.mission.download import MissionDownload
     from gcs_plugin.mission.exchange import Exchange
+    from gcs_plugin.mission.items import Mission
     from gcs_plugin.vehicle import Vehicle
     from telemetry.live import LivePoses
 
@@ -133,6 +135,24 @@ class Flock:
         if not dialogue.outcome.ok:
             raise OrthoSwarmError(dialogue.outcome.text)
         return dialogue.outcome.text
+
+    def unlike(self, system: int, mission: "Mission") -> str | None:
+        """In what the mission that a vehicle holds differs from one, None if it does not.
+
+        Raises:
+            OrthoSwarmError: the vehicle does not hand it out.
+        """
+        from gcs_plugin.mission.compare import difference
+
+        reads: list[MissionDownload] = []
+
+        def begin(fleet: "Fleet") -> "Exchange":
+            reads.append(fleet.download(system))
+            return reads[0]
+
+        self.command(begin)
+        found = difference(mission, reads[0].items or [])
+        return None if found is None else found.text
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 

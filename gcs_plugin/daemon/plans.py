@@ -93,6 +93,20 @@ class Plans:
                 return read_mission(path, autopilot)
         raise InputError(f"{folder.name} has no mission {name}; see /api/plans")
 
+    def starts(self, name: Any, sortie: int = 1) -> dict[str, float]:
+        """Vehicle -> takeoff of a flight in seconds after the swarm's start.
+
+        Raises:
+            InputError: there is no such plan or flight.
+        """
+        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
+        flights = {v["id"]: v["flights"] for v in figures["vehicles"]}
+        starts = {v: float(rows[sortie - 1]["start_s"]) for v, rows in flights.items() if len(rows) >= sortie}
+        if not starts:
+            most = max(len(rows) for rows in flights.values())
+            raise InputError(f"{name} has no sortie {sortie} (there are {most}); send another")
+        return starts
+
     def _path(self, name: Any) -> Path:
         if not isinstance(name, str) or not _NAME.match(name) or not (self.folder / name / "plan.json").is_file():
             raise InputError("there is no such plan; see /api/plans")

@@ -18,12 +18,14 @@ from gcs_plugin.daemon.core import Daemon
 from gcs_plugin.daemon.flock import Flock
 from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.daemon.pose import PostedPose, parse_pose, parse_time
+from gcs_plugin.daemon.takeoffs import names_of
 from gcs_plugin.daemon.tiles import TileAddress
 from gcs_plugin.web.guard import Guard, TooLarge, bounded
 from orthoswarm import __version__
 from orthoswarm.errors import InputError, OrthoSwarmError
 
 Result = TypeVar("Result")
+Linked = TypeVar("Linked")
 
 STATIC: Final = Path(__file__).parent / "static"
 MOST_PICTURE_BYTES: Final = 96_000_000
@@ -245,15 +247,30 @@ class Routes:
         """A plan as GeoJSON: area, legs, ways, starts."""
         return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
 
+    async def start_plan(self, number: str, request: Request) -> Response:
+        """Start all vehicles of a plan at its times ({"sortie": 1}). Answers with the seconds until each takeoff.
+
+        {"vehicles": {"v1": "alpha"}} says which vehicle flies which part where names differ. A `pause` or `rtl` of a
+        vehicle that waits cancels its takeoff, a `start` starts it at once.
+        """
+        body = await self.body(request)
+        takeoffs = self._linked(self.daemon.takeoffs)
+        sortie, names = names_of(body)
+        seconds = await self.work(takeoffs.begin, number, sortie, names)
+        return Ascii({"plan": number, "sortie": sortie, "takeoffs_in_s": seconds}, status_code=202)
+
+    def _linked(self, what: Linked | None) -> Linked:
+        if what is None:
+            raise HTTPException(409, "the daemon has no links; start it with --link")
+        return what
+
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
         """Upload ({"plan": id, "mission": "v1"}), start, pause, resume or rtl. Answers when the vehicle has."""
         body = await self.body(request)
         flock = self.daemon.flock
         if verb not in ("upload", "start", "pause", "resume", "rtl"):
             raise HTTPException(404, "there is no such command; choose upload, start, pause, resume or rtl")
-        if flock is None:
-            raise HTTPException(409, "the daemon has no links; start it with --link")
-        text = await self.work(self._command, flock, vehicle, verb, body)
+        text = await self.work(self._command, self._linked(flock), vehicle, verb, body)
         return Ascii({"vehicle": vehicle, "command": verb, "ok": True, "text": text})
 
     def _command(self, flock: Flock, vehicle: str, verb: str, body: dict[str, Any]) -> str:
@@ -262,6 +279,9 @@ class Routes:
             autopilot = flock.fleet.vehicles[system].autopilot
             mission = self.daemon.plans.mission(body, vehicle, autopilot)
             return flock.command(lambda fleet: fleet.upload(system, mission))
+        waited = self._linked(self.daemon.takeoffs).cancel(vehicle)
+        if waited is not None and verb in ("pause", "rtl"):
+            return f"{vehicle} stays on the ground: its takeoff in {waited:.0f} s is cancelled"
         return flock.command(lambda fleet: getattr(fleet, verb)(system))
 
     async def body(self, request: Request) -> dict[str, Any]:
@@ -373,6 +393,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/plans", routes.plans)
     add("/api/plans", routes.plan, methods=["POST"], status_code=201)
     add("/api/plans/{number}/map", routes.plan_map)
+    add("/api/plans/{number}/start", routes.start_plan, methods=["POST"], status_code=202)
     add("/api/missions/{vehicle}/{verb}", routes.mission, methods=["POST"])
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile)
     app.add_api_websocket_route("/api/events", routes.events)

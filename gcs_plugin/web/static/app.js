@@ -104,6 +104,7 @@ function drawVehicles() {
       make("span", { className: "quiet" }, facts.filter(Boolean).join(", ")),
       mission.items ? make("div", { className: `bar ${mission.phase === "complete" ? "done" : ""}`, title: `mission ${mission.phase}` }, make("i", { style: `width:${100 * share}%` })) : null,
       mission.items ? make("p", { className: "quiet" }, mission.phase === "complete" ? "mission complete" : `mission ${mission.phase}, item ${mission.item} of ${mission.items}`) : null,
+      row.takeoff ? make("p", { className: row.takeoff.failed ? "wrong" : "quiet" }, row.takeoff.failed || `takes off in ${clock(row.takeoff.in_s)}`) : null,
       make("p", { className: "quiet" }, `${pictures}${row.sortie > 1 ? `; sortie ${row.sortie}` : ""}`),
       refinedAfter(row.id) ? make("p", { className: "quiet" }, refinedAfter(row.id)) : null,
       make("div", { className: "buttons" },
@@ -210,41 +211,50 @@ $("plan-form").onsubmit = attempt(async (event) => {
   $("make").disabled = true;
   try {
     plan = await post("/api/plans", body);
+    const able = heard.length >= plan.vehicles.length;
+    plan.names = Object.fromEntries(able ? plan.vehicles.map((row, k) => [row.id, heard[k].id]) : []);
   } finally {
     $("make").disabled = false;
   }
   const picture = await get(`/api/plans/${plan.id}/map`);
-  view.show("plan", picture.features.filter((f) => f.geometry.type === "LineString").map((f) => ({ ...f, properties: { ...f.properties, colour: view.colourOf(f.properties.vehicle) } })));
+  view.show("plan", picture.features.filter((f) => f.geometry.type === "LineString").map((f) => ({ ...f, properties: { ...f.properties, colour: view.colourOf(flies(f.properties.vehicle)) } })));
   drawPlan();
 });
 
+const clock = (seconds) => `${Math.floor(Math.round(seconds) / 60)}:${String(Math.round(seconds) % 60).padStart(2, "0")}`;
+
 function drawPlan() {
   drawArea();
-  const minutes = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.round(seconds % 60)).padStart(2, "0")}`;
   $("plan-result").replaceChildren(
-    make("p", {}, `${(100 * plan.covered_share).toFixed(1)} % covered in ${minutes(plan.makespan_s)} min, lines ${plan.spacing_m.toFixed(0)} m apart`),
+    make("p", {}, `${(100 * plan.covered_share).toFixed(1)} % covered in ${clock(plan.makespan_s)} min, lines ${plan.spacing_m.toFixed(0)} m apart`),
     ...plan.vehicles.map((row) => make("div", { className: "card" },
-      make("span", { className: "swatch", style: `background:${view.colourOf(row.id)}` }), make("b", {}, row.id),
-      make("span", { className: "quiet" }, `${row.length_m.toFixed(0)} m, ${row.photos} pictures, ${minutes(row.time_s)} min`),
+      make("span", { className: "swatch", style: `background:${view.colourOf(flies(row.id))}` }), make("b", {}, flies(row.id)),
+      make("span", { className: "quiet" }, `${row.length_m.toFixed(0)} m, ${row.photos} pictures, ${clock(row.time_s)} min${row.flights[0].start_s > 0 ? `, takes off at ${clock(row.flights[0].start_s)}` : ""}`),
       make("div", { className: "buttons" },
         make("button", { onclick: () => upload(row.id) }, "upload"),
-        make("button", { onclick: () => command(row.id, "start") }, "start")))),
+        make("button", { onclick: () => command(flies(row.id), "start") }, "start")))),
     make("div", { className: "buttons" },
       make("button", { onclick: uploadAll }, "Upload all"), make("button", { className: "go", onclick: startAll }, "Start all")),
     ...plan.warnings.map((text) => make("p", { className: "quiet" }, text)));
 }
 
-const send = (vehicle) => post(`/api/missions/${vehicle}/upload`, { plan: plan.id });
+// A plan's v1, v2, ... are the vehicles that were heard, in their order, whatever their names.
+const flies = (vehicle) => plan.names[vehicle] || vehicle;
+const send = (vehicle) => post(`/api/missions/${encodeURIComponent(flies(vehicle))}/upload`, { plan: plan.id, mission: vehicle });
 const upload = attempt(async (vehicle) => {
-  if (await confirmed(`Upload this mission to ${vehicle}? It replaces what the vehicle holds.`)) await send(vehicle);
+  if (await confirmed(`Upload this mission to ${flies(vehicle)}? It replaces what the vehicle holds.`)) await send(vehicle);
 });
 const uploadAll = attempt(async () => {
   if (!(await confirmed(`Upload missions to ${plan.vehicles.length} vehicles?`))) return;
   for (const row of plan.vehicles) await send(row.id);
 });
 const startAll = attempt(async () => {
-  if (!(await confirmed(`Start ${plan.vehicles.length} vehicles now? They arm and take off.`))) return;
-  await Promise.all(plan.vehicles.map((row) => post(`/api/missions/${row.id}/start`)));
+  const starts = plan.vehicles.map((row) => row.flights[0].start_s);
+  const last = Math.max(...starts) - Math.min(...starts);
+  const when = last > 0 ? `at the plan's times, the last ${clock(last)} min after the first` : "at once";
+  if (!(await confirmed(`Start ${plan.vehicles.length} vehicles? They arm and take off ${when}.`))) return;
+  await post(`/api/plans/${plan.id}/start`, { vehicles: plan.names });
+  later();
 });
 
 // -- news ------------------------------------------------------------------------------------------------------------
