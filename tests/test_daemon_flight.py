@@ -122,6 +122,7 @@ def products_are_written(served, workspace):
     assert report["frames"]["used"] > 10
     assert [row["vehicle"] for row in report["completions"]] == ["v1", "v2"]
     assert any("no basemap" in text for text in report["warnings"])
+    assert {row["name"]: row["items"] for row in report["stages"]}["realtime"] == report["frames"]["used"]
     for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl", "footprints.gpkg", "report.html"):
         assert (workspace / name).stat().st_size > 1000
     assert served.command("/api/export", {"formats": ["exe"]}).status_code == 422

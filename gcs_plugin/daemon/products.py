@@ -178,6 +178,9 @@ def _report(
     warnings = [w for s in solutions for w in s.warnings]
     if task.basemap is None:
         warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
+    for stage in task.facts.get("stages", []):
+        if stage["name"] == "realtime":
+            stage["items"] = len(placed)
     return {
         "frames": {"input": len(placed) + len(rejected), "used": len(placed), "rejected": len(rejected)},
         "vehicles": vehicle_rows(solutions, placed), "legs": leg_rows(solutions), "ground_z_m": level,
@@ -217,7 +220,7 @@ def facts_of(
 ) -> dict[str, Any]:
     """What only the daemon knows for the report: stage timings from its jobs, completions, its own use."""
     stages = [
-        {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},
+        {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},  # counted when the report is written
         *(
             {
                 "name": f"{j['detail'].get('layer', 'fine')}: {j['vehicle']}",
