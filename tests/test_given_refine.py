@@ -2,6 +2,7 @@
 
 import csv
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from orthoswarm.basemap import Basemap
 from orthoswarm.dem import HeightModel
 from orthoswarm.extent import placed_bounds
 from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.placement import Terrain
 from orthoswarm.recorded import recorded_cameras
 from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all
 from orthoswarm.twin.make import make_twin
@@ -59,12 +61,12 @@ def through_pickle(function, items):
         yield pickle.loads(pickle.dumps(f(i)))
 
 
-def off_ground(refined, scene):
-    """The drawn ground under the pictures less the true one, about its median."""
+def off_ground(refined, scene, terrain=None):
+    """The drawn ground under the pictures (or another) less the true one, about its median."""
     heights, transform = scene[4]
     xy = np.concatenate([[p.camera.nadir for p in s.placed] for s in refined.fine])
     column, row = (np.floor(v).astype(int) for v in ~transform * (xy[:, 0], xy[:, 1]))
-    error = refined.terrain.height(xy) - heights[row, column]
+    error = (terrain or refined.terrain).height(xy) - heights[row, column]
     return error - np.median(error)
 
 
@@ -93,6 +95,15 @@ def test_a_right_model_gives_the_ground_and_the_map_is_as_good(scene, without, t
         for p, q in zip(one.placed, other.placed, strict=True):
             np.testing.assert_array_equal(p.camera.position, q.camera.position)
     np.testing.assert_array_equal(refined.terrain.z, processes.terrain.z)
+
+
+def test_the_ground_is_known_before_the_map_is_used(scene, without):
+    (ground,) = {id(s.terrain): s.terrain for s in without.coarse}.values()
+    for solution in without.fine:  # each vehicle on a level of its own
+        one = replace(without, fine=[solution])
+        flat = np.percentile(np.abs(off_ground(one, scene, Terrain.flat())), 90)
+        assert flat > 1.0
+        assert np.percentile(np.abs(off_ground(one, scene, ground)), 90) < 0.3 * flat
 
 
 def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):

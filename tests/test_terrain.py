@@ -1,11 +1,16 @@
 """The ground surface: what it follows, what it ignores, and when it is taken for a plane."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.placement import Terrain
+from orthoswarm.swarm.ground import GroundModel
+from orthoswarm.swarm.group import coarse_terrain
 from orthoswarm.swarm.surface import FitSettings, fit_nodes, solve_banded
 from orthoswarm.swarm.terrain import fit_terrain, lower_flank
 
@@ -210,3 +215,17 @@ def test_the_ground_is_the_lowest_of_several_modes():
     rng = np.random.default_rng(0)
     z = np.r_[rng.normal(0, 0.15, 1000), rng.normal(1.3, 0.12, 1300), rng.uniform(3, 12, 500), rng.normal(-2, 1, 40)]
     assert abs(lower_flank(z, np.full(len(z), 0.15))) < 0.12
+
+
+def test_before_the_map_each_place_has_the_ground_of_the_nearest_camera():
+    def vehicle(east, ground):
+        surface = None if ground is None else GroundModel(fit=SimpleNamespace(rendering=lambda lift: ground))
+        path = np.column_stack([np.full(9, east), np.linspace(0.0, 400.0, 9), np.full(9, 100.0)])
+        return SimpleNamespace(coarse=SimpleNamespace(position=path), coarse_surface=surface)
+
+    slope = Terrain(-200.0, -200.0, 30.0, np.tile(np.arange(40, dtype=np.float32), (40, 1)))
+    both = coarse_terrain([vehicle(0.0, slope), vehicle(300.0, Terrain.flat(-2.0)), vehicle(600.0, None)])
+    assert both.step_m == 30.0
+    at = np.array([[10.0, 50.0], [100.0, 390.0], [250.0, 10.0], [380.0, 200.0], [600.0, 200.0]])
+    np.testing.assert_allclose(both.height(at), [7.0, 10.0, -2.0, -2.0, 0.0], atol=1e-3)
+    assert coarse_terrain([vehicle(0.0, None)]) is None

@@ -5,6 +5,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
@@ -99,6 +100,33 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
         fit, off = fit_given(given, points, sigma, bounds, settings=DRAWN, most_nodes=DRAWN_NODES)
     drawn = fit or fit_terrain(points, sigma, bounds, settings=DRAWN)
     return drawn.rendering(lift), _doubts(given, fit is None, off, states) if given is not None else []
+
+
+def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
+    """The ground before the map was used, in the local frame: everywhere that of the vehicle whose camera is nearest.
+
+    Each vehicle's ground belongs to its own cameras, on a level that no other shares yet, and the nearest camera is the
+    one that is drawn. None where no vehicle has found its ground.
+    """
+    found = [getattr(s, "coarse_surface", None) for s in states]  # states of an earlier version lack it
+    grounds = [None if surface is None or surface.fit is None else surface.terrain() for surface in found]
+    steps = [ground.step_m for ground in grounds if ground is not None]
+    if not steps:
+        return None
+    paths = [s.coarse.position for s in states]
+    path = np.concatenate(paths)
+    reach = 1.1 * float(np.median(path[:, 2]))
+    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
+    step = max(min(steps), float(np.sqrt(np.prod(high - low) / DRAWN_NODES)))
+    columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
+    nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
+    vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])
+    nearest = vehicle[cKDTree(path[:, :2]).query(nodes)[1]]
+    z = np.zeros((rows, columns), np.float32)
+    for k, ground in enumerate(grounds):
+        if ground is not None:
+            z[nearest == k] = ground.height(nodes[nearest == k])
+    return Terrain(float(low[0]), float(low[1]), step, z)
 
 
 def _doubts(given: Given, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:

@@ -140,6 +140,7 @@ def from_flight(
     state = VehicleState(
         flight.frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
         (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
+        coarse_surface=surface,
     )  # fmt: skip
     if basemap is not None:
         state.had_map = True

@@ -22,7 +22,7 @@ from orthoswarm.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.recorded import recorded_cameras, told_of_lone_ones
 from orthoswarm.swarm.beside import lay_beside
 from orthoswarm.swarm.ground import ground_points
-from orthoswarm.swarm.group import Run, common_terrain, local_origin, neighbours_of, pooled_lean, serial
+from orthoswarm.swarm.group import Run, coarse_terrain, common_terrain, local_origin, neighbours_of, pooled_lean, serial
 from orthoswarm.swarm.levels import level_network
 from orthoswarm.swarm.passes import Options, followed, matched, read_frame, second_pass, solo
 from orthoswarm.swarm.sparse_joint import open_sparse_flights
@@ -179,7 +179,8 @@ def refine_all(
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
     options = options or Options()
     states = _first_passes(split_units(vehicles), basemap, grid, origin, options, run, progress)
-    coarse = [to_solution(s, origin, None, coarse=True) for s in states]
+    below = _shifted(coarse_terrain(states), origin)
+    coarse = [to_solution(s, origin, below, coarse=True) for s in states]
     states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
     _level(states)
     given = options.ground(origin).given

@@ -26,7 +26,8 @@ class VehicleState:
     """One vehicle between passes; everything is picklable, decoded pictures are let go.
 
     Attributes:
-        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used.
+        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
+            ground below them in the same frame.
         surface: its ground. ties, matches: of the last round (empty without a map).
         roofs: raised points on the map and their heights;
             ground_shift: float64 (2,) what ground points were off by then.
@@ -56,6 +57,7 @@ class VehicleState:
     had_map: bool = False
     carried: bool = False
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
+    coarse_surface: GroundModel | None = None
 
 
 def lies_on_map(state: VehicleState) -> bool:
