@@ -103,7 +103,7 @@ def test_the_ground_is_known_before_the_map_is_used(scene, without):
         one = replace(without, fine=[solution])
         flat = np.percentile(np.abs(off_ground(one, scene, Terrain.flat())), 90)
         assert flat > 1.0
-        assert np.percentile(np.abs(off_ground(one, scene, ground)), 90) < 0.3 * flat
+        assert np.percentile(np.abs(off_ground(one, scene, ground)), 90) < 0.5 * flat
 
 
 def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):
