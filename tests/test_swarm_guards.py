@@ -9,8 +9,9 @@ from gcs_plugin.daemon import warmup
 from orthoswarm.basemap import Basemap
 from orthoswarm.camera import fov_rad
 from orthoswarm.geo import LocalGrid
-from orthoswarm.swarm import passes
+from orthoswarm.swarm import heights, passes
 from orthoswarm.swarm.flight import open_flight
+from orthoswarm.swarm.heights import height_doubt
 from orthoswarm.swarm.passes import Options, ran_away, read_frame, relative, solo
 from orthoswarm.swarm.settle import leg_corrections
 from orthoswarm.swarm.sigma import unexplained
@@ -54,6 +55,32 @@ def test_without_an_answer_of_the_flow_nothing_is_called_a_runaway(made_up):
     assert ran_away(flight)
     flight.calibration = replace(flight.calibration, pairs=2)
     assert not ran_away(flight)
+
+
+def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_up, monkeypatch):
+    frames, _ = made_up  # straight down over flat ground: without heights no focal length is better than another
+
+    def doubted(adjustment):
+        return np.array([m.height_sigma < heights.FREE_SIGMA_M for m in adjustment.priors.models])
+
+    steps = passes._steps
+
+    def wandering(flight, surface, count):
+        surface, focal_px = steps(flight, surface, count)
+        if not doubted(flight.adjustment).any():
+            flight.adjustment.rig.lens[:, 0] *= 0.7
+            focal_px = [f * 0.96**k for k, f in enumerate(focal_px)]
+        return surface, focal_px
+
+    for module in (passes, heights):
+        monkeypatch.setattr(module, "contradicted", doubted)
+    for how in (steps, wandering):  # set free it stays where it is, or comes to no rest: both contradict nothing
+        monkeypatch.setattr(passes, "_steps", how)
+        flight = opened(frames)
+        relative(flight)
+        assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
+        assert flight.warnings == [] and flight.calibration.trusted_height
+        assert doubted(flight.adjustment).all() and height_doubt(flight.adjustment) < 0.05
 
 
 def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):

@@ -20,7 +20,7 @@ from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, 
 from orthoswarm.swarm.given import Given
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
-from orthoswarm.swarm.heights import height_doubt, release_heights
+from orthoswarm.swarm.heights import contradicted, height_doubt, release_heights
 from orthoswarm.swarm.legs import leads_one_way
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
@@ -55,7 +55,11 @@ NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
 """Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
 DECENTRED_SHARE = 0.02
 """What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
-FREE_STEPS = 6
+REST_STEPS, FREE_STEPS, FREE_ROUNDS = 3, 6, 4
+AT_REST = 0.03
+"""A focal length that still moves by this share in three steps is not at rest."""
+AGREES = 0.08
+"""Pictures that, set free, come to rest within this share of the recorded height do not contradict it."""
 COHERENT = 2.0
 """Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
 MAP_FLOOR_PX = 0.13
@@ -195,18 +199,41 @@ def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -
 
 
 def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
-    """Go on without the recorded heights where the pictures contradict them."""
-    adjustment = flight.adjustment
-    if not flight.records.has_height.any() or not release_heights(adjustment).any():
+    """Go on without the recorded heights where the pictures contradict them.
+
+    They must do so still when the adjustment is at rest, and it must come to rest without the heights, too: few
+    pictures of a camera that is held level tell little of the focal length, and without heights run anywhere.
+    """
+    if not flight.records.has_height.any() or not contradicted(flight.adjustment).any():
         return surface
-    flight.calibration = replace(flight.calibration, trusted_height=False)
-    for _ in range(FREE_STEPS):
-        adjustment.step(9.0, surface.belief(adjustment.points))
-        surface = fit_surface(adjustment, surface)
+    surface, _ = _steps(flight, surface, REST_STEPS)
+    believed, calibration, was = Snapshot.of(flight.adjustment), flight.calibration, surface
+    if not release_heights(flight.adjustment).any():
+        return surface
+    flight.calibration = replace(calibration, trusted_height=False)
+    for _ in range(FREE_ROUNDS):
+        surface, focal_px = _steps(flight, surface, FREE_STEPS)
+        at_rest = np.ptp(np.log(focal_px[-3:])) < AT_REST
+        if at_rest:
+            break
     said = float(np.median(flight.records.position[flight.records.has_height, 2]))
-    seen = float(np.median(adjustment.rig.position[:, 2])) - surface.level_m
+    seen = float(np.median(flight.adjustment.rig.position[:, 2])) - surface.level_m
+    if not at_rest or abs(seen - said) < AGREES * said:
+        flight.adjustment, flight.calibration = believed.restored(), calibration
+        flight.adjustment.step(9.0, was.belief(flight.adjustment.points))  # what is asked of a step is not restored
+        return was
     flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
     return surface
+
+
+def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundModel, list[float]]:
+    """So many steps near the end, with the focal length after each."""
+    focal_px = []
+    for _ in range(count):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points))
+        surface = fit_surface(flight.adjustment, surface)
+        focal_px.append(float(flight.adjustment.rig.lens[0, F]))
+    return surface, focal_px
 
 
 def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
