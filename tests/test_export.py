@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 from rasterio.warp import transform, transform_bounds
 
 from gcs_plugin.cli import main
 from orthoswarm.camera import Lens
 from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.export import cog
 from orthoswarm.export.cog import TILE_PX, write_cog
 from orthoswarm.export.convert import convert_cog
 from orthoswarm.export.kmz import write_kmz
@@ -23,6 +25,7 @@ from orthoswarm.export.odm import unique_names, write_odm
 from orthoswarm.export.partial import written_whole
 from orthoswarm.geo import GroundGrid
 from orthoswarm.products import iso_time, simple_lens
+from telemetry.container import read_container
 
 EPSG = 32632
 WEST, NORTH, STEP = 465_000.0, 5_250_000.0, 0.5
@@ -77,6 +80,34 @@ def test_a_cog_holds_the_pixels_and_its_overviews(raster, ortho):
     with rasterio.open(ortho, OVERVIEW_LEVEL=1) as image:
         np.testing.assert_array_equal(image.read().transpose(1, 2, 0), raster.rgba[::4, ::4])
     assert raster.largest <= TILE_PX**2
+
+
+@pytest.mark.parametrize(("limit", "version"), [(None, 42), (1, 43)])
+def test_a_picture_is_a_classic_tiff_unless_it_may_be_too_large(raster, tmp_path, monkeypatch, limit, version):
+    if limit is not None:
+        monkeypatch.setattr(cog, "_CLASSIC_BYTES", limit)
+    path = tmp_path / "o.tif"
+    write_cog(raster, path)
+    data = path.read_bytes()
+    assert data[:4] == bytes([73, 73, version, 0])
+    with rasterio.open(path) as image:
+        assert image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        np.testing.assert_array_equal(image.read().transpose(1, 2, 0), raster.rgba)
+        places = [int(image.get_tag_item(f"BLOCK_OFFSET_{c}_1", "TIFF", bidx=1)) for c in range(3)]
+        assert places == sorted(places) and max(places) < len(data)
+        assert image.crs.to_epsg() == EPSG and image.bounds == pytest.approx(raster.grid.bounds)
+    if version == 42:  # as software reads it that knows nothing of maps
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), raster.rgba)
+    assert read_container(path).georeferenced  # a map, not a photo, where it lies among photos
+
+
+def test_a_city_is_a_classic_tiff_and_a_county_is_not():
+    assert cog._form_of(cog._levels(16_000, 14_000)) is cog._CLASSIC
+    assert cog._form_of(cog._levels(60_000, 50_000)) is cog._BIG
+    noise = np.random.default_rng(0).integers(0, 256, (TILE_PX, TILE_PX, 4), np.uint8)
+    noise[..., 3] = np.maximum(noise[..., 3], 1)
+    assert len(cog._deflate(noise)) + 8 < cog._WORST_TILE
 
 
 def test_a_cog_of_a_window(raster, tmp_path):

@@ -3,12 +3,16 @@
 Layout as the OGC's COG standard (21-026) and GDAL's driver have it: header, all directories (full resolution first),
 then tiles from the coarsest overview to full resolution. Tile positions are filled in at the end, which is possible
 because the length of every table is known at the beginning. Transparent tiles take no room (offset and size 0).
+
+A picture that cannot exceed 4 GiB, however badly it compresses, is a classic TIFF, which everything reads; a larger one
+is a BigTIFF.
 """
 
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -97,8 +101,8 @@ def _levels(rows: int, cols: int) -> list[_Level]:
 class _Table:
     """Where the tiles of one level are; its room in the file is known before they are written."""
 
-    def __init__(self, count: int) -> None:
-        self.offsets = np.zeros(count, "<u8")
+    def __init__(self, count: int, form: "_Form") -> None:
+        self.offsets = np.zeros(count, f"<u{form.word}")
         self.sizes = np.zeros(count, "<u4")
         self.offsets_at = self.sizes_at = 0
 
@@ -145,23 +149,59 @@ def _deflate(tile: Bytes) -> bytes:
     return isal_zlib.compress(tile.tobytes(), _LEVEL)
 
 
-# -- BigTIFF ------------------------------------------------------------------------------------------------------
+# -- TIFF ---------------------------------------------------------------------------------------------------------
 
 _SHORT, _LONG, _DOUBLE, _ASCII, _LONG8 = 3, 4, 12, 2, 16
-_FORMATS = {_SHORT: "H", _LONG: "I", _DOUBLE: "d", _LONG8: "Q"}
+_FORMATS = {_SHORT: "H", _LONG: "I", _DOUBLE: "d"}
+_CLASSIC_BYTES = 2**32 - 2**20
+_TILE_BYTES = TILE_PX * TILE_PX * 4
+_WORST_TILE = _TILE_BYTES + _TILE_BYTES // 64 + 1024  # deflate stores what it cannot shrink, with some bytes a block
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """The two forms of a TIFF, which differ in how wide places in the file and counts are.
+
+    Attributes:
+        header: of the file but for the place of its first directory.
+        word: bytes of a place or of an entry's count. count: struct format of a directory's number of entries.
+        place: struct format of a place. place_kind: TIFF type of one.
+    """
+
+    header: bytes
+    word: int
+    count: str
+    place: str
+    place_kind: int
+
+    @property
+    def entry(self) -> int:
+        """Bytes of a directory's entry: tag, type, count, and a value or its place."""
+        return 4 + 2 * self.word
+
+
+_CLASSIC = _Form(struct.pack("<2sH", b"II", 42), 4, "<H", "<I", _LONG)
+_BIG = _Form(struct.pack("<2sHHH", b"II", 43, 8, 0), 8, "<Q", "<Q", _LONG8)
+
+
+def _form_of(levels: list[_Level]) -> _Form:
+    """Classic where the file stays below 4 GiB at worst."""
+    worst = sum(_WORST_TILE * level.tiles for level in levels)
+    return _CLASSIC if worst < _CLASSIC_BYTES else _BIG
 
 
 def _write_directories(file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level]) -> list[_Table]:
     """Header and directories, with room for the tile tables; the file is left at the first tile's place."""
+    form = _form_of(levels)
     ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
     ghost += bytes(-len(ghost) % 16)
-    at = 16 + len(ghost)
-    file.write(struct.pack("<2sHHHQ", b"II", 43, 8, 0, at) + ghost)
+    at = len(form.header) + form.word + len(ghost)
+    file.write(form.header + struct.pack(form.place, at) + ghost)
     tables = []
     for i, level in enumerate(levels):
-        table = _Table(level.tiles)
+        table = _Table(level.tiles, form)
         tags = _tags(level, grid if i == 0 else None, first)
-        block = _directory(at, tags, table, last=i == len(levels) - 1)
+        block = _directory(at, tags, table, form, last=i == len(levels) - 1)
         file.write(block)
         at += len(block)
         tables.append(table)
@@ -195,39 +235,43 @@ def _tags(level: _Level, grid: GroundGrid | None, first: tuple[int, int]) -> dic
     return tags
 
 
-def _directory(at: int, tags: dict[int, tuple[int, bytes | list[float]]], table: _Table, *, last: bool) -> bytes:
+def _directory(
+    at: int, tags: dict[int, tuple[int, bytes | list[float]]], table: _Table, form: _Form, *, last: bool
+) -> bytes:
     """One directory at a place in the file, with the values that do not fit into its entries after it."""
-    count = len(tags) + 2
-    values_at = at + 8 + 20 * count + 8
+    number = struct.pack(form.count, len(tags) + 2)
+    entries_at = at + len(number)
+    values_at = entries_at + form.entry * (len(tags) + 2) + form.word
+    values_at += -values_at % 8
     entries: list[bytes] = []
     values = bytearray()
 
-    def add(tag: int, kind: int, number: int, data: bytes) -> int:
+    def add(tag: int, kind: int, count: int, data: bytes) -> int:
         """Write an entry; gives where its data lies in the file."""
-        nonlocal entries
-        head = struct.pack("<HHQ", tag, kind, number)
-        if len(data) <= 8:
-            place = at + 8 + 20 * len(entries) + 12
-            entries.append(head + data.ljust(8, b"\0"))
+        head = struct.pack("<HH", tag, kind) + struct.pack(form.place, count)
+        if len(data) <= form.word:
+            place = entries_at + form.entry * len(entries) + len(head)
+            entries.append(head + data.ljust(form.word, b"\0"))
             return place
         values.extend(bytes(-len(values) % 8))
         place = values_at + len(values)
         values.extend(data)
-        entries.append(head + struct.pack("<Q", place))
+        entries.append(head + struct.pack(form.place, place))
         return place
 
-    pending = {**tags, 324: (_LONG8, b""), 325: (_LONG, b"")}
+    pending = {**tags, 324: (form.place_kind, b""), 325: (_LONG, b"")}
     for tag in sorted(pending):
         kind, content = pending[tag]
         if tag == 324:
-            table.offsets_at = add(tag, _LONG8, len(table.offsets), table.offsets.tobytes())
+            table.offsets_at = add(tag, kind, len(table.offsets), table.offsets.tobytes())
         elif tag == 325:
-            table.sizes_at = add(tag, _LONG, len(table.sizes), table.sizes.tobytes())
+            table.sizes_at = add(tag, kind, len(table.sizes), table.sizes.tobytes())
         elif isinstance(content, bytes):
             add(tag, kind, len(content), content)
         else:
             data = struct.pack(f"<{len(content)}{_FORMATS[kind]}", *content)
             add(tag, kind, len(content), data)
     values.extend(bytes(-len(values) % 8))
-    following = 0 if last else values_at + len(values)
-    return struct.pack("<Q", count) + b"".join(entries) + struct.pack("<Q", following) + bytes(values)
+    following = struct.pack(form.place, 0 if last else values_at + len(values))
+    block = number + b"".join(entries) + following
+    return block + bytes(values_at - at - len(block)) + bytes(values)

@@ -27,6 +27,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
 
     settings: dict[str, Any] = {
         "driver": "COG",
+        "bigtiff": "IF_SAFER",  # GDAL itself only asks how large the picture is before it is compressed, and fails later
         "compress": "DEFLATE",
         "predictor": 2,
         "overview_resampling": "AVERAGE",
