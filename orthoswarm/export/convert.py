@@ -27,7 +27,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
 
     settings: dict[str, Any] = {
         "driver": "COG",
-        "bigtiff": "IF_SAFER",  # GDAL itself only asks how large the picture is before it is compressed, and fails later
+        "bigtiff": "IF_SAFER",  # by default GDAL never makes one of a compressed picture, and fails at 4 GB
         "compress": "DEFLATE",
         "predictor": 2,
         "overview_resampling": "AVERAGE",
