@@ -79,7 +79,11 @@ class RasterMap:
         handles: dict[Any, Any] = self._handles.__dict__
         key = (os.getpid(), level)
         if key not in handles:
-            options = {} if level is None else {"OVERVIEW_LEVEL": level}
+            options: dict[str, Any] = {} if level is None else {"OVERVIEW_LEVEL": level}
+            if self._path.suffix.lower() == ".mbtiles":
+                # Bounds that cut a pixel move the whole map by up to half of one: GDAL takes them as the corner, and
+                # whole pixels from there.
+                options["USE_BOUNDS"] = "NO"
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said as an error, in plain words

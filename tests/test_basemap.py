@@ -1,6 +1,8 @@
 """Maps of every kind give the same ground at the same place, or one clear error."""
 
+import contextlib
 import pickle
+import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.shutil
+import rasterio.warp
 from rasterio.crs import CRS
 from rasterio.transform import Affine, from_origin
 
@@ -215,6 +218,24 @@ def test_mbtiles(tmp_path):
     gray = picture(affine, 1024, 1024, 3857).round().astype(np.uint8)
     path = write(tmp_path / "m.mbtiles", np.stack([gray] * 3), affine, 3857, driver="MBTiles", TILE_FORMAT="PNG")
     assert_same_ground(Basemap.open(path, EPSG, AREA), 0.4, tolerance=5.0)
+
+
+@pytest.mark.parametrize("bounds", ["", "13.8197,48.0254,13.8224,48.0273", "13.819701,48.025402,13.822403,48.027304"])
+def test_mbtiles_lie_where_their_tiles_lie_whatever_bounds_they_tell(tmp_path, bounds):
+    for zoom in (17, 18):
+        web_tiles(tmp_path / "xyz", zoom, tms=True)
+    path = tmp_path / "m.mbtiles"
+    with contextlib.closing(sqlite3.connect(path)) as file, file:
+        file.execute("CREATE TABLE metadata (name TEXT, value TEXT)")
+        file.execute("CREATE TABLE tiles (zoom_level INT, tile_column INT, tile_row INT, tile_data BLOB)")
+        told = {"format": "png", "minzoom": "17", "maxzoom": "18"} | ({"bounds": bounds} if bounds else {})
+        file.executemany("INSERT INTO metadata VALUES (?, ?)", told.items())
+        for tile in (tmp_path / "xyz").rglob("*.png"):
+            numbers = (int(part) for part in (tile.parts[-3], tile.parts[-2], tile.stem))
+            file.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (*numbers, tile.read_bytes()))
+    basemap = Basemap.open(path, EPSG, AREA)
+    for gsd in (0.4, 1.5):
+        assert_same_ground(basemap, gsd, tolerance=6.0)
 
 
 def test_a_map_without_crs_is_refused(tmp_path):
