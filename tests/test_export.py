@@ -161,6 +161,8 @@ def test_mbtiles_open_and_show_the_ground(ortho, tmp_path, kind):
         assert image.res[0] * math.cos(math.radians(47.4)) == pytest.approx(STEP, rel=0.4)
         rgba = image.read().transpose(1, 2, 0)
         found = colours_at(rgba, image.transform, 3857, PLACES)
+        corner = np.array([image.transform.c, image.transform.f]) / image.res[0]
+        assert corner == pytest.approx(corner.round(), abs=1e-3)  # on whole pixels: else GDAL shows it shifted
     assert np.abs(found[:, :3] - ground(*PLACES.T)).max() < (12 if kind == "png" else 20)
     database = sqlite3.connect(path)
     meta = dict(database.execute("SELECT name, value FROM metadata"))

@@ -102,9 +102,28 @@ def _levels(bounds: tuple[float, float, float, float], gsd_m: float) -> list[Ran
 
 def _tile_of(lon: float, lat: float, zoom: int) -> tuple[int, int]:
     n = 2**zoom
-    x = (lon + 180.0) / 360.0 * n
-    y = (1.0 - math.asinh(math.tan(math.radians(lat))) / math.pi) / 2.0 * n
+    x, y = _tiles_from_north_west(lon, lat, zoom)
     return min(max(int(x), 0), n - 1), min(max(int(y), 0), n - 1)
+
+
+def _tiles_from_north_west(lon: float, lat: float, zoom: int) -> tuple[float, float]:
+    n = 2**zoom
+    return (lon + 180.0) / 360.0 * n, (1.0 - math.asinh(math.tan(math.radians(lat))) / math.pi) / 2.0 * n
+
+
+def _whole_pixels(bounds: tuple[float, float, float, float], zoom: int) -> tuple[float, float, float, float]:
+    """West, south, east, north in degrees, moved outwards to the next pixel's edge.
+
+    GDAL (and so QGIS) takes the bounds for the corners of its raster and shows whole pixels from there: bounds within a
+    pixel would move the map by up to half of one.
+    """
+    west, south, east, north = bounds
+    (left, top), (right, bottom) = _tiles_from_north_west(west, north, zoom), _tiles_from_north_west(east, south, zoom)
+    n = _SIZE * 2**zoom
+    columns = math.floor(left * _SIZE) / n, math.ceil(right * _SIZE) / n
+    rows = math.floor(top * _SIZE) / n, math.ceil(bottom * _SIZE) / n
+    north, south = (math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * row)))) for row in rows)
+    return columns[0] * 360.0 - 180.0, south, columns[1] * 360.0 - 180.0, north
 
 
 class _Writer:
@@ -136,7 +155,7 @@ class _Writer:
             "type": "overlay",
             "version": "1.0",
             "description": "orthoimage made by OrthoSwarm",
-            "bounds": ",".join(f"{v:.7f}" for v in bounds),
+            "bounds": ",".join(f"{v:.10f}" for v in _whole_pixels(bounds, self.levels[0].zoom)),
             "center": middle,
             "minzoom": str(self.levels[-1].zoom),
             "maxzoom": str(self.levels[0].zoom),
