@@ -1,6 +1,7 @@
 """Finding strips and points on a map, and what is concluded from them."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from orthoswarm.swarm.coarse import correlate, orientation_field, register
 from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.patches import gradient_field, match, texture_field
 from orthoswarm.swarm.rig import Rig
-from orthoswarm.swarm.settle import mode_shift
+from orthoswarm.swarm.settle import accepted, edge_pull, mode_shift
 from orthoswarm.swarm.sights import one_per_cell
 from orthoswarm.swarm.ties import MapMatches, match_points, vote_lean
 
@@ -156,6 +157,35 @@ def test_shadows_of_another_hour_pull_less_where_texture_is_compared():
     edges, texture = (common_shift(field, pictures, maps) for field in (gradient_field, texture_field))
     assert edges > 0.03
     assert texture < 0.6 * edges
+
+
+def test_what_strong_edges_pull_more_is_what_they_pull_texture():
+    rng = np.random.default_rng(7)
+    ground = 60.0 + 0.4 * texture(1000, 3)
+    things = rng.integers(300, 700, (2500, 2))
+    before, after = FlatMap(in_light(ground, things, 0.0, 3.0)), FlatMap(in_light(ground, things, 3.0, 0.0))
+    rig, images = pictures_of(after, (0.0, 0.0))
+    points = np.array([[x, y, 0.0] for x in range(-84, 85, 8) for y in range(-16, 36, 8)], float)
+    camera = np.abs(points[:, None, 0] - rig.position[None, :, 0]).argmin(1).astype(np.int32)
+    flight = SimpleNamespace(
+        adjustment=SimpleNamespace(rig=rig, points=points),
+        pictures=SimpleNamespace(gray=lambda i: 255 - images[i]),
+        sights=lambda: SimpleNamespace(camera=camera),
+    )
+    level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
+    loaded = LoadedMap.load(before, np.zeros(2), (-160.0, -120.0, 160.0, 140.0), GSD)
+    chosen = np.arange(len(points))
+    found = accepted(
+        match_points(
+            rig, points, chosen, camera, flight.pictures.gray, loaded, 20, 10, np.zeros(len(points)), texture_field
+        )
+    )
+    off = found.shift.mean(0)
+    left = off - edge_pull(flight, level, loaded, found, 5.0)
+    assert np.hypot(*off) > 0.02
+    assert np.hypot(*left) < 0.6 * np.hypot(*off)
+    few = found.take(np.arange(10))
+    assert not edge_pull(flight, level, loaded, few, 5.0).any()  # so few tell nothing
 
 
 def test_the_lean_is_voted_among_outliers():

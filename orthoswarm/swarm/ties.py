@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.swarm.loadedmap import LoadedMap
-from orthoswarm.swarm.patches import gradient_field, match, rectify, texture_field
+from orthoswarm.swarm.patches import gradient_field, match, rectify
 from orthoswarm.swarm.rig import Rig
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Gray = NDArray[np.uint8]
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +45,21 @@ def match_points(
     half: int = 20,
     reach: int = 28,
     level: Array | None = None,
+    field: Callable[[Floats], Floats] = gradient_field,
 ) -> MapMatches:
     """Find the surroundings of points on the map.
 
     What surrounds a corner is mostly ground, although the corner itself sits on something raised: so the surroundings
-    are rectified on the ground where the camera sees the point, not at the point's own height. Ground is compared by
-    its texture, because strong edges belong to what leans and casts shadows; roofs by all their edges.
+    are rectified on the ground where the camera sees the point, not at the point's own height.
 
     Args:
         chosen: (Q,) indices of points; camera: (P,) the picture to take for each point.
         gray: working-scale picture of a camera (the rig's lenses are in its pixels).
         half: half the patch in map pixels; reach: search in map pixels.
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
+        field: what is compared of pictures.
     """
     order = np.argsort(camera[chosen], kind="stable")
-    field = gradient_field if level is None else texture_field
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
     rows: list[tuple[int, int, float, float, float, float]] = []
     for k in order:
