@@ -139,6 +139,14 @@ def test_a_damaged_picture_is_kept_and_said_to_be_damaged(served):
         assert answer.status_code == 422
 
 
+def test_a_picture_that_is_cut_short_is_rejected_under_its_own_name(served):
+    shot = line(1, "cut")[0]
+    shot.data = shot.data[: len(shot.data) // 2]
+    assert served.send(shot).status_code == 201
+    (row,) = served.until("/api/frames?vehicle=cut", lambda rows: rows[0]["stage"] == "rejected")
+    assert row["reason"].startswith(f"{row['image']} is a damaged JPEG")
+
+
 def test_pages_of_other_sites_are_refused(served):
     shot = line(1, "foreign")[0]
     bad = served.post("/api/frames", **form(shot), headers={"Origin": "https://evil.example"})

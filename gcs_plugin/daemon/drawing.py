@@ -270,7 +270,8 @@ class Drawer:
         except OrthoSwarmError as error:
             if "canvas" in str(error):  # the disk is full: later
                 raise
-            return self._told(pending, Drawn(pending.seq, str(error), None), None)
+            reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
+            return self._told(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
             return self._told(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
         return self._told(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
