@@ -31,6 +31,7 @@ from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.gains import estimate_gains
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.render import Layer, RenderStats, render, render_layers
+from orthoswarm.oblique import loose, strays, told
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
@@ -207,7 +208,8 @@ class _Batch:
 
     def realtime(self, state: _State) -> list[PlacedFrame]:
         """The picture from recorded poses; the frames that it holds."""
-        placed = state.recorded.placed
+        aside = strays(state.recorded.placed)
+        placed = [p for p in state.recorded.placed if p.frame.image not in aside]
         known = self.space.recall("realtime")
         if known is not None and (self.out / REALTIME).exists():
             stats, stage = known
@@ -220,9 +222,10 @@ class _Batch:
                 raise OrthoSwarmError(f"no picture could be drawn: {reason}")
             self.space.remember("realtime", (stats, stage))
         state.thumbnails, state.drawn = stats.thumbnails, (stats.drawn_m2, stats.covered_share)
-        state.undrawn = stats.rejected
+        state.undrawn = {**aside, **stats.rejected}
         if self.options.until == "realtime":
-            self.leave_out(state, state.undrawn, placed)
+            self.leave_out(state, state.undrawn, state.recorded.placed)
+            state.warnings += told(aside)
         return [p for p in placed if p.frame.image not in stats.rejected]
 
     def refine(self, state: _State) -> _Refinement | None:
@@ -298,7 +301,7 @@ class _Batch:
     def pictures(self, state: _State, refinement: _Refinement | None) -> list[PlacedFrame]:
         """coarse.tif and orthoimage.tif; gives the frames as last placed."""
         if refinement is None:
-            placed = state.recorded.placed
+            placed = self.looking_down(state, state.recorded.placed)
             name = ORTHOIMAGE if self.options.until == "fine" else COARSE
             with self.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
                 stats = self.draw(name, placed, Terrain.flat(), state)
@@ -318,8 +321,10 @@ class _Batch:
         with_map = state.basemap is not None and self.options.until == "fine"
         if with_map and not on_map:
             state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
+        fine = self.looking_down(state, [p for s in refinement.fine for p in s.placed] + state.still)
         coarse = [p for s in refinement.coarse for p in s.placed] + state.still
-        fine = [p for s in refinement.fine for p in s.placed] + state.still
+        coarse = [p for p in coarse if p.frame.image not in state.rejected]
+        state.warnings += loose(fine)
         if self.options.gsd_m is None and _heights_assumed(state.recorded.placed):
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:
@@ -333,6 +338,13 @@ class _Batch:
             self.picture(state, ORTHOIMAGE, fine, terrain)
             self.copy_coarse(state)
         return [p for p in fine if p.frame.image not in state.rejected]
+
+    def looking_down(self, state: _State, placed: Sequence[PlacedFrame]) -> list[PlacedFrame]:
+        """The frames without those that look far aside among others, which are left out."""
+        aside = strays(placed)
+        self.leave_out(state, aside, placed)
+        state.warnings += told(aside)
+        return [p for p in placed if p.frame.image not in aside]
 
     def ground(self, state: _State, refinement: _Refinement) -> Terrain | None:
         """The ground under the pictures: found from them, or an outside height model brought to their level."""

@@ -143,8 +143,9 @@ def test_a_frame_near_the_ground_among_high_ones(scene, basemap, tmp_path, mosai
     shots = [replace(s, height=120.0) for s in legs(count=2, photos=8, step=30)]
     shots[6] = replace(shots[6], height=5.0)
     scene.fly(tmp_path / "photos", shots)
-    code, rows, _, _ = mosaic(tmp_path / "photos", basemap=basemap)
+    code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
     assert code == 0
+    assert any("DJI_0006.JPG first" in w for w in report["warnings"])
     others = [i for i in range(16) if i != 6]
     names = [f"DJI_{i:04d}.JPG" for i in others]
     found = errors(scene, rows, [shots[i] for i in others], names)
@@ -157,15 +158,36 @@ def test_oblique_frames_do_not_spoil_the_others(scene, basemap, tmp_path, mosaic
     shots[11] = replace(shots[11], pitch=-5.0)  # looks at the horizon
     shots[13] = replace(shots[13], pitch=30.0)  # looks at the sky
     scene.fly(tmp_path / "photos", shots)
-    code, rows, _, _ = mosaic(tmp_path / "photos", basemap=basemap)
+    code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
     assert code == 0
+    assert "away from straight down" in rows["DJI_0004.JPG"]["reason"]
+    assert any("far aside" in w and "left out of the map" in w for w in report["warnings"])
     level = [i for i in range(16) if i not in (4, 11, 13)]
     names = [f"DJI_{i:04d}.JPG" for i in level]
     found = errors(scene, rows, [shots[i] for i in level], names)
     assert len(found) >= 11 and np.median(found) < 2.0
     assert rows["DJI_0013.JPG"]["stage"] == "rejected"
     with rasterio.open(tmp_path / "out" / "orthoimage.tif") as image:
-        assert max(image.shape) * image.res[0] < 1500
+        assert max(image.shape) * image.res[0] < 400
+
+
+@pytest.mark.parametrize("until", ["realtime", "coarse"])
+def test_oblique_frames_are_left_out_of_every_product(scene, tmp_path, mosaic, until):
+    shots = [replace(s, pitch=-40.0) if i in (3, 9) else s for i, s in enumerate(legs(count=2, photos=8))]
+    scene.fly(tmp_path / "photos", shots)
+    code, rows, report, _ = mosaic(tmp_path / "photos", until=until)
+    assert code == 0 and report["frames"] == {"input": 16, "used": 14, "rejected": 2}
+    assert {n for n, r in rows.items() if r["stage"] == "rejected"} == {"DJI_0003.JPG", "DJI_0009.JPG"}
+    for name in ("realtime.tif", "coarse.tif"):
+        if (tmp_path / "out" / name).exists():
+            with rasterio.open(tmp_path / "out" / name) as image:
+                assert max(image.shape) * image.res[0] < 400
+
+
+def test_a_flight_that_looks_aside_keeps_its_pictures(scene, tmp_path, mosaic):
+    scene.fly(tmp_path / "photos", legs(count=2, photos=8, pitch=-50.0))
+    code, _, report, _ = mosaic(tmp_path / "photos", until="realtime")
+    assert code == 0 and report["frames"]["used"] == 16 and not any("aside" in w for w in report["warnings"])
 
 
 def test_portrait_and_mixed_sizes(scene, basemap, tmp_path, mosaic):
