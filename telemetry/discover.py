@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -44,12 +45,14 @@ class Discovery:
     Attributes:
         root: names are relative to it. folders: those with something in them.
         left_out: files with a picture's suffix that are not looked into, and why.
+        videos: the vehicle of each video, unless its metadata names another.
         everywhere: tables and logs that were named, themselves or by a folder, apart from all pictures and videos.
     """
 
     root: Path
     folders: list[Folder]
     left_out: list[tuple[Path, str]] = field(default_factory=list)
+    videos: dict[Path, str] = field(default_factory=dict)
     everywhere: frozenset[Path] = frozenset()
 
     def scope(self, path: Path) -> Path:
@@ -124,7 +127,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     _name_vehicles(ordered, root)
     pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [(file, why) for file, why in pictures if file not in sorted_in]
-    return Discovery(root, ordered, left, _far_from_pictures(tops, ordered))
+    return Discovery(root, ordered, left, _video_vehicles(ordered, root), _far_from_pictures(tops, ordered))
 
 
 def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
@@ -195,3 +198,16 @@ def _name_vehicles(folders: list[Folder], root: Path) -> None:
             name += "_top"
         taken.add(name)
         folder.vehicle = name
+
+
+def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
+    """A video is a vehicle by its name; by its path where cameras of several drones gave the same name."""
+    videos = [path for folder in folders for path in folder.videos]
+    often = Counter([path.stem for path in videos] + [folder.vehicle for folder in folders if folder.pictures])
+    paths = {path: _text(os.path.relpath(path, root)) for path in videos}
+    twice = Counter(os.path.splitext(name)[0] for name in paths.values())
+    return {
+        path: _text(path.stem) if often[path.stem] == 1 else stem if twice[stem] == 1 else name
+        for path, name in paths.items()
+        for stem in [os.path.splitext(name)[0]]
+    }

@@ -178,6 +178,7 @@ def extract(
     every_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
     found: VideoScan | None = None,
+    vehicle: str | None = None,
 ) -> Extraction:
     """Take the pictures of a video and write them as JPEG files into a folder.
 
@@ -192,6 +193,7 @@ def extract(
         every_s: spacing in seconds.
         progress: called with pictures decoded and their number.
         found: the file's metadata if it was scanned already.
+        vehicle: id of the vehicle where the metadata names none; None for the file's name.
 
     Raises:
         telemetry.video.NotAVideo: it is none.
@@ -216,8 +218,8 @@ def extract(
     for one in taken.pictures:
         pose = None if one.packet is None else poses.of(one.packet)
         photo = _photo(folder / one.name, one, pose, lens)
-        vehicle = pose.sample.vehicle if pose is not None and pose.sample.vehicle else path.stem
-        result.photos.setdefault(vehicle, []).append(photo)
+        named = pose.sample.vehicle if pose is not None else None
+        result.photos.setdefault(named or vehicle or path.stem, []).append(photo)
         result.names[photo.path] = one.number
     if result.damaged:
         result.findings.append(

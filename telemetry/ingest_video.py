@@ -38,7 +38,7 @@ def read_videos(
         try:
             scanned = scan(path)
         except (NotAVideo, OSError) as reason:
-            result.rejected.append(Rejection(name, str(reason), path.stem))
+            result.rejected.append(Rejection(name, str(reason), found.videos[path]))
             continue
         source = SourceInfo(name, "video", Counter(frames=len(scanned.pictures)))
         source.counts["sei"] = scanned.sei_count
@@ -49,9 +49,9 @@ def read_videos(
         if near and not (poses.has_positions and poses.has_angles):
             poses.findings += add_log(poses, scanned, near)
         if options.decode:
-            _take(path, name, scanned, poses, options, progress, source, result)
+            _take(path, name, found.videos[path], scanned, poses, options, progress, source, result)
         else:
-            _look(path, scanned, poses, source)
+            _look(found.videos[path], scanned, poses, source)
     for path in beside.values():
         _lone_subtitles(path, found.name(path), result)
 
@@ -65,6 +65,7 @@ def cache_folder(root: Path) -> Path:
 def _take(
     path: Path,
     name: str,
+    vehicle: str,
     scanned: VideoScan,
     poses: Poses,
     options: LoadOptions,
@@ -74,7 +75,7 @@ def _take(
 ) -> None:
     """Take pictures and make frames of them."""
     if not poses.has_positions:
-        result.rejected.append(Rejection(name, NO_POSITION, path.stem))
+        result.rejected.append(Rejection(name, NO_POSITION, vehicle))
         return
     taken = extract(
         path,
@@ -85,18 +86,18 @@ def _take(
         every_s=options.every_s,
         progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
         found=scanned,
+        vehicle=vehicle,
     )
     source.findings += taken.findings
-    for vehicle, photos in taken.photos.items():
-        source.frames += frames_of(photos, vehicle, lambda jpeg: f"{name}#{taken.names[jpeg]:06d}", source.findings)
-        source.shown[vehicle] = len(photos)
+    for who, photos in taken.photos.items():
+        source.frames += frames_of(photos, who, lambda jpeg: f"{name}#{taken.names[jpeg]:06d}", source.findings)
+        source.shown[who] = len(photos)
 
 
-def _look(path: Path, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
+def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
     """Only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
-    vehicle = path.stem
     for index in order:
         pose = poses.of(index)
         sample = pose.sample if pose is not None else Sample()

@@ -1,5 +1,6 @@
 """Video: SEI written and read in every container, binding through B-frames, picking, damage."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -302,3 +303,21 @@ def test_a_zoom_begins_another_camera(tmp_path):
     frames = load([target], options=LoadOptions(cache=tmp_path / "c", every_m=1.0)).frames
     assert len({f.camera for f in frames[:20]}) == len({f.camera for f in frames[20:]}) == 1
     assert frames[0].camera != frames[-1].camera
+
+
+def test_videos_of_one_name_in_two_folders_are_two_vehicles_and_no_picture_is_lost(tmp_path, capsys):
+    for folder in ("one", "two"):
+        (tmp_path / "in" / folder).mkdir(parents=True)
+        make_video(tmp_path / "plain.mp4", count=3)
+        moved = {"one": 0.0, "two": 1e-3}[folder]
+        unnamed = replace(pose(0), vehicle=None, lat_deg=47.0 + moved)
+        add_sei(tmp_path / "plain.mp4", tmp_path / "in" / folder / "DJI_0001.MP4", lambda _, s=unnamed: s)
+    assert {f.vehicle for f in load([tmp_path / "in"]).frames} == {"one/DJI_0001", "two/DJI_0001"}
+    assert {f.vehicle for f in load([tmp_path / "in" / "one"]).frames} == {"DJI_0001"}
+    for folder in ("one", "two"):  # the same again, of one vehicle by its metadata
+        named = replace(pose(0), lat_deg=47.0 if folder == "one" else 47.001)
+        add_sei(tmp_path / "plain.mp4", tmp_path / "in" / folder / "DJI_0001.MP4", lambda _, s=named: s)
+    assert main(["frames", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)["written"]
+    assert len({row["image"] for row in written}) == len({row["file"] for row in written}) == len(written) > 1
+    assert {row["vehicle"] for row in written} == {"uav7"}

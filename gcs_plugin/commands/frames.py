@@ -47,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
             options = LoadOptions(args.every_m, args.every_s, Path(cache), exclude=(args.out,))
             found = load(args.inputs, progress=progress, options=options)
             require_frames(found)
-            written = [write(frame, args.out) for frame in found.frames]
+            taken: set[Path] = set()
+            written = [write(frame, args.out, taken) for frame in found.frames]
             progress("writing pictures", len(written), len(written))
     except OSError as error:
         raise OrthoSwarmError(
@@ -74,8 +75,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def write(frame: "Frame", out: Path) -> Path:
-    """Write one frame's picture with its pose; returns the file.
+def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
+    """Write one frame's picture with its pose; returns the file, which is none of those taken, and is one then.
 
     Raises:
         OSError: it cannot be written.
@@ -89,15 +90,25 @@ def write(frame: "Frame", out: Path) -> Path:
     folder = out.joinpath(*(_safe(part) for part in frame.vehicle.split("/")))
     folder.mkdir(parents=True, exist_ok=True)
     stem, _, number = frame.image.rsplit("/", 1)[-1].partition("#")
-    name = _safe(Path(stem).stem + (f"_{number}" if number else "")) + ".jpg"
+    name = _safe(Path(stem).stem + (f"_{number}" if number else ""))
+    target = folder / f"{name}.jpg"
+    again = 1
+    while _key(target) in taken:  # two files of that name, in folders of one vehicle or with other suffixes
+        again += 1
+        target = folder / f"{name}-{again}.jpg"
+    taken.add(_key(target))
     data = frame.path.read_bytes()
     if data[:2] != b"\xff\xd8":
         data = encode_jpeg(read_rgb(frame.path))
-    temporary = folder / f".{name}.part"
+    temporary = folder / f".{target.name}.part"
     temporary.write_bytes(with_pose(data, frame))
-    target = folder / name
     os.replace(temporary, target)
     return target
+
+
+def _key(path: Path) -> Path:
+    """The same for names that are one file's on systems that do not tell capitals from small letters."""
+    return path.with_name(path.name.casefold())
 
 
 def _safe(name: str) -> str:
