@@ -312,8 +312,9 @@ def test_videos_of_one_name_in_two_folders_are_two_vehicles_and_no_picture_is_lo
         moved = {"one": 0.0, "two": 1e-3}[folder]
         unnamed = replace(pose(0), vehicle=None, lat_deg=47.0 + moved)
         add_sei(tmp_path / "plain.mp4", tmp_path / "in" / folder / "DJI_0001.MP4", lambda _, s=unnamed: s)
-    assert {f.vehicle for f in load([tmp_path / "in"]).frames} == {"one/DJI_0001", "two/DJI_0001"}
-    assert {f.vehicle for f in load([tmp_path / "in" / "one"]).frames} == {"DJI_0001"}
+    options = LoadOptions(cache=tmp_path / "c")
+    assert {f.vehicle for f in load([tmp_path / "in"], options=options).frames} == {"one/DJI_0001", "two/DJI_0001"}
+    assert {f.vehicle for f in load([tmp_path / "in" / "one"], options=options).frames} == {"DJI_0001"}
     for folder in ("one", "two"):  # the same again, of one vehicle by its metadata
         named = replace(pose(0), lat_deg=47.0 if folder == "one" else 47.001)
         add_sei(tmp_path / "plain.mp4", tmp_path / "in" / folder / "DJI_0001.MP4", lambda _, s=named: s)
