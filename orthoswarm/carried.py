@@ -47,8 +47,9 @@ def sort_out(recorded: Sequence[PlacedFrame]) -> Sorted:
     few = odd_ones([p.frame for p in moving])
     odd = [p for p, alone in zip(moving, few, strict=True) if alone]
     if odd:
-        names = f"{len(odd)} pictures" if len(odd) > 1 else "1 picture"
-        warnings.append(f"{names} of another camera or size, too few to be refined, follow their neighbours")
+        some = len(odd) > 1
+        who, follow = (f"{len(odd)} pictures", "follow their") if some else ("1 picture", "follows its")
+        warnings.append(f"{who} of another camera or size, too few to be refined, {follow} neighbours")
     fit = [p for p, alone in zip(moving, few, strict=True) if not alone]
     return Sorted(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
 

@@ -53,10 +53,14 @@ def told(reasons: dict[str, str]) -> list[str]:
     return [f"{many} far aside among others that look straight down; left out of the map ({min(reasons)} first)"]
 
 
-def loose(placed: Sequence[PlacedFrame]) -> list[str]:
-    """The warning about pictures that too little holds in the adjustment; they are drawn where no other looks."""
-    weak = sorted(p.frame.image for p in placed if p.weak)
-    if not weak:
+def loose(placed: Sequence[PlacedFrame], told_already: Sequence[PlacedFrame] = ()) -> list[str]:
+    """The warning about pictures that too little holds in the adjustment; they are drawn where no other looks.
+
+    Those that were told already are left out, and so are all where none is better.
+    """
+    known = {p.frame.image for p in told_already}
+    weak = sorted(p.frame.image for p in placed if p.weak and p.frame.image not in known)
+    if not weak or all(p.weak for p in placed):
         return []
     many = f"{len(weak)} pictures have" if len(weak) > 1 else "1 picture has"
     return [

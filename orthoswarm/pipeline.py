@@ -106,6 +106,7 @@ class _State:
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
     gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     still: list[PlacedFrame] = field(default_factory=list)
+    odd: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     equation_5: dict[str, float] | None = None
@@ -231,9 +232,11 @@ class _Batch:
     def refine(self, state: _State) -> _Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
         by_kind = sort_out(state.recorded.placed)
-        state.still = by_kind.still
+        state.still, state.odd = by_kind.still, by_kind.odd
         state.warnings += by_kind.warnings
         if not by_kind.fit:
+            if state.basemap is not None and self.options.until == "fine":
+                state.warnings.append("the basemap was not used; the orthoimage lies where the receivers say")
             return None
         known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
         if known is not None:
@@ -324,7 +327,7 @@ class _Batch:
         fine = self.looking_down(state, [p for s in refinement.fine for p in s.placed] + state.still)
         coarse = [p for s in refinement.coarse for p in s.placed] + state.still
         coarse = [p for p in coarse if p.frame.image not in state.rejected]
-        state.warnings += loose(fine)
+        state.warnings += loose(fine, state.odd)
         if self.options.gsd_m is None and _heights_assumed(state.recorded.placed):
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:

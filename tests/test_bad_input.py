@@ -112,6 +112,7 @@ def test_one_photo_is_mapped(scene, basemap, tmp_path, mosaic):
     for using in (None, basemap):
         code, rows, report, _ = mosaic(tmp_path / "photos", basemap=using, fov_min=82)
         assert code == 0 and report["frames"]["used"] == 1
+        assert not any("in common" in w for w in report["warnings"])
         # one photo does not tell its field of view: what the flag says stays
         assert rows["DJI_0000.JPG"]["fov_deg"] == pytest.approx(82.0, abs=0.1)
         assert errors(scene, rows, [shot]).max() < 0.5
@@ -131,6 +132,7 @@ def test_many_photos_of_one_spot(scene, basemap, tmp_path, mosaic):
     scene.fly(tmp_path / "photos", shots)
     code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap, fov_min=80)
     assert code == 0 and report["frames"]["used"] + report["frames"]["rejected"] == 40
+    assert any("basemap was not used" in w for w in report["warnings"])
     assert report["frames"]["used"] >= 1
     assert np.median(errors(scene, rows, shots)) < 12.0
     out = tmp_path / "out"

@@ -175,7 +175,7 @@ def test_a_picture_of_another_size_or_turn_follows_the_others_of_its_vehicle(sce
     solution = alone(scene, frames, basemap)
     assert [p.frame.image for p in solution.placed if p.weak] == [frames[7].image]
     assert all(p.stage == "fine" for p in solution.placed)
-    assert any("follow their neighbours" in w for w in solution.warnings)
+    assert any("follows its neighbours" in w for w in solution.warnings)
     (odd,) = (p for p in solution.placed if p.weak)
     true = true_camera(truth[odd.frame.image], odd.frame, grid)
     # its own records place it: 1 m of receiver, some degrees of heading
