@@ -26,7 +26,7 @@ from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
 from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
-from orthoswarm.swarm.sigma import frame_sigmas, unexplained
+from orthoswarm.swarm.sigma import frame_sigmas, map_doubt, unexplained
 from orthoswarm.swarm.snapshot import Snapshot
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
 from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map
@@ -39,8 +39,6 @@ T = TypeVar("T")
 
 TAKEOFF_LEVEL_M = 2.0
 """How well the takeoff level is known to be the level of the ground, one sigma."""
-TIE_SHARE = 0.5
-"""Part of the ties' scatter that neighbouring ties have in common (terrain, map content), so that no number helps."""
 ONE_WAY_FOV_SIGMA_DEG = 5.0
 """Of photos on one straight way: tilt, height and lens stand for each other (11 such legs of a suburb: 5.6 rms)."""
 SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
@@ -62,8 +60,6 @@ AGREES = 0.08
 """Pictures that, set free, come to rest within this share of the recorded height do not contradict it."""
 COHERENT = 2.0
 """Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
-MAP_FLOOR_PX = 0.13
-"""What no residual tells (map content that stands above the ground everywhere), in pixels of the compared map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,8 +314,7 @@ def second_pass(
     ties = state.ties if state.on_map else None
     floor = 0.05
     if basemap is not None and state.on_map:
-        spread = float(np.median(state.ties.sigma_m)) if len(state.ties.sigma_m) else 0.0
-        floor = max(MAP_FLOOR_PX * map_gsd(flight, basemap), TIE_SHARE * spread)
+        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, map_gsd(flight, basemap))
     sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
