@@ -1,6 +1,11 @@
 """The demonstration: the whole swarm simulated, the map measured against the truth."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -44,6 +49,21 @@ def test_the_clock_runs_slower_while_cameras_are_behind(monkeypatch):
     clock.slow = True
     now[0] += 2.0
     assert 2.0 < clock() < 3.0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal to a group of processes")
+def test_a_ctrl_c_at_the_terminal_ends_all_of_it_in_a_sentence(tmp_path):
+    mark = tmp_path / "demo" / "demo.json"
+    command = [sys.executable, "-m", "gcs_plugin.cli", "demo", "--no-browser", "--out", str(mark.parent)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    while not mark.exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    time.sleep(1.0)  # there is nothing to wait for: any moment of its start will do
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in said and "interrupted" in said
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The simulated part of the demonstration, in a process of its own: vehicles on TCP links, cameras on TCP streams."""
 
+import signal
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -33,6 +34,7 @@ def simulate(setting: Setting, pipe: Connection) -> None:
 
     Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # not inherited everywhere
     from orthoswarm.workers import single_threaded
 
     single_threaded()

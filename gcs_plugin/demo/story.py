@@ -2,7 +2,9 @@
 
 import json
 import multiprocessing
+import multiprocessing.process
 import shutil
+import signal
 import socket
 import threading
 import time
@@ -48,7 +50,7 @@ def run_demo(
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=simulate, args=(setting, theirs), name="simulator", daemon=True)
-    process.start()
+    _start(process)
     theirs.close()
     try:
         tell("city", 0, 1)
@@ -61,6 +63,9 @@ def run_demo(
             ours.send("stop")
             end = ours.recv() if ours.poll(90.0) else {}
             _finish(daemon, tell)
+    except BaseException:
+        process.terminate()  # while it makes its city it does not listen
+        raise
     finally:
         ours.close()
         process.join(10.0)
@@ -73,6 +78,17 @@ def run_demo(
     report = _measure(setting, out, end, time.monotonic() - began)
     tell("measuring", 1, 1)
     return report
+
+
+def _start(process: multiprocessing.process.BaseProcess) -> None:
+    """Start a process that a Ctrl-C at the terminal does not reach: this one ends it."""
+    in_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
+    try:
+        process.start()
+    finally:
+        if in_main:
+            signal.signal(signal.SIGINT, before)
 
 
 def _clear(out: Path) -> None:
