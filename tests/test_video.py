@@ -257,6 +257,12 @@ def test_a_video_without_any_position_is_rejected_with_its_reason(tmp_path):
     assert [(r.image, "no position" in r.reason) for r in result.rejected] == [("a.mp4", True)]
 
 
+def test_nothing_is_left_where_no_picture_could_be_taken(tmp_path, capsys):
+    make_video(tmp_path / "a.mp4", count=5)
+    assert main(["frames", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
+    assert "no position" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("content", [b"", b"no video in here", b"\0\0\0\x18ftypisom" + b"\0" * 100])
 def test_files_that_are_no_video_are_rejected(tmp_path, content):
     (tmp_path / "a.mp4").write_bytes(content)

@@ -23,11 +23,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  orthoswarm bench peers sets/debris --every 3 --out bench"
     )
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="accuracy|scaling|peers")
-    accuracy = kinds.add_parser("accuracy", help="do nothing, the paper, swarm, true poses: error, cost, memory")
+    accuracy = kinds.add_parser(
+        "accuracy",
+        help="do nothing, the paper, swarm, true poses: error, cost, memory",
+        epilog="example:\n  orthoswarm bench accuracy sets/debris --methods swarm,truth --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     accuracy.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
     methods = "nothing,paper,swarm,truth"
     accuracy.add_argument("--methods", default=methods, metavar="LIST", help=f"some of {methods} (default all)")
-    scaling = kinds.add_parser("scaling", help="time against vehicles (Fig. 7) and pictures a vehicle (Fig. 8)")
+    scaling = kinds.add_parser(
+        "scaling",
+        help="time against vehicles (Fig. 7) and pictures a vehicle (Fig. 8)",
+        epilog="example:\n  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     scaling.add_argument("sets", nargs=1, type=Path, metavar="SET", help="a folder of `twin make`")
     scaling.add_argument(
         "--vehicles", default="1,2,3,4,8,16,32,64,96", help="numbers of vehicles (default %(default)s)"
@@ -39,6 +49,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="other programs on the same photos (Table I)",
         description="Runs other programs in environments of their own, made with pip on first use, and judges their "
         "maps by the true map. Linux only.",
+        epilog="example:\n  orthoswarm bench peers sets/debris --every 3 --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     peers.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
     programs = "swarm,paper,pyorthomosaic,stitcher,pycolmap"

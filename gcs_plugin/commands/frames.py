@@ -28,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
     import json
     import sys
     import tempfile
+    from contextlib import suppress
 
     from gcs_plugin.progress import ProgressBars
     from orthoswarm.errors import InputError, OrthoSwarmError
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name} must be larger than zero; leave it out for the default")
     if args.out.is_file():
         raise InputError(f"{args.out} is a file; choose a folder for --out")
+    new = not args.out.exists()
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=args.out, prefix=".taking-") as cache, ProgressBars() as progress:
@@ -54,6 +56,11 @@ def run(args: argparse.Namespace) -> int:
         raise OrthoSwarmError(
             f"{args.out} cannot be written ({error.strerror}); free space or choose another"
         ) from None
+    except InputError:
+        if new:
+            with suppress(OSError):
+                args.out.rmdir()
+        raise
     if args.json:
         document = {
             "written": [

@@ -13,14 +13,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  orthoswarm weights check"
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|import|check")
-    listing = actions.add_parser("list", help="which weights are known, where they lie, which matchers use them")
-    bring = actions.add_parser(
-        "import", help="copy a file of weights, or all known ones of a folder, to your own folder"
+    listing = _action(actions, "list", "which weights are known, where they lie, which matchers use them")
+    bring = _action(
+        actions,
+        "import",
+        "copy a file of weights, or all known ones of a folder, to your own folder",
+        " /media/stick/weights",
     )
     bring.add_argument("source", type=Path, metavar="FILE|DIR", help="file or folder with weights")
-    check = actions.add_parser("check", help="compare files with the published ones and run each matcher once")
+    check = _action(actions, "check", "compare files with the published ones and run each matcher once")
     for sub in (listing, bring, check):
         sub.add_argument("--json", action="store_true", help="one JSON document on stdout")
+
+
+def _action(actions: Any, name: str, text: str, example: str = "") -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        name,
+        help=text,
+        description=text[0].upper() + text[1:] + ".",
+        epilog=f"example:\n  orthoswarm weights {name}{example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return parser
 
 
 def run(args: argparse.Namespace) -> int:
