@@ -13,7 +13,7 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
 from orthoswarm.placement import PlacedFrame, Solution
 from orthoswarm.recorded import recorded_cameras
-from orthoswarm.swarm.late import lay_late, on_terrain, resected
+from orthoswarm.swarm.late import centre_sigma, lay_late, on_terrain, resected
 from tests.mosaic_scene import EAST, NORTH, hills, terrain_of
 
 EPSG = 32631
@@ -66,6 +66,10 @@ def moved(frame, east_m, north_m):
     return replace(frame, fix=replace(frame.fix, lat_deg=float(lat), lon_deg=float(lon)))
 
 
+def read_of(frame):
+    return read_gray(frame.path)
+
+
 def test_a_late_picture_lies_as_well_as_its_neighbours_whatever_its_record_says(flight):
     late = [moved(flight[4], 4.0, -3.0), moved(flight[20], -3.0, 2.0)]
     refined = solution_of([f for k, f in enumerate(flight) if k not in (4, 20)])
@@ -76,6 +80,30 @@ def test_a_late_picture_lies_as_well_as_its_neighbours_whatever_its_record_says(
         assert np.hypot(*(one.camera.corners() - true.corners()).T).max() < 0.5
         assert (one.stage, one.weak) == ("fine", False)
         assert 0.1 <= one.sigma_m < 0.5
+
+
+def test_beyond_its_neighbours_a_late_picture_is_less_sure_than_among_them(flight):
+    among, beyond = flight[20], flight[-1]
+    (sure,), _ = lay_late([among], solution_of([f for f in flight if f is not among]), EPSG, read_of)
+    (unsure,), _ = lay_late([beyond], solution_of(flight[:-4]), EPSG, read_of)
+    assert not unsure.weak
+    assert sure.sigma_m < 0.15 < unsure.sigma_m
+    true = recorded_cameras([beyond], GRID).placed[0].camera
+    middle = np.array([true.lens.principal_point])
+    assert np.hypot(*(unsure.camera.to_ground(middle) - true.to_ground(middle))[0]) < 2.0 * unsure.sigma_m
+
+
+def test_few_points_in_a_corner_hold_its_middle_badly():
+    camera = Camera(np.array([EAST, NORTH, 150.0]), rotation_from_angles(0.4, -1.5, 0.05), LENS)
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0.0, 0.3, (60, 2))
+    everywhere, corner = rng.uniform((10, 10), (630, 470), (60, 2)), rng.uniform((10, 10), (110, 90), (60, 2))
+    held, hanging = (
+        centre_sigma(camera, uv + noise, np.column_stack([camera.to_ground(uv, 0.0), np.zeros(60)]), 1.0)
+        for uv in (everywhere, corner)
+    )
+    assert 0.005 < held < 0.1
+    assert hanging > 3.0 * held
 
 
 def test_where_the_pictures_show_nothing_it_follows_its_neighbours_corrections(flight):

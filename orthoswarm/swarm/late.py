@@ -2,8 +2,8 @@
 
 First by what refinement changed in their neighbours (`carried.carry`), then by points followed into the neighbours'
 pictures and onto their ground: six numbers a picture, so a handful costs no second refinement. Measured on simulated
-flights over debris, water and haze (640x480 from 150 m): by correction alone 0.2 to 2.6 m off, by points as far off as
-the neighbours (0.2 to 0.4 m), 0.07 s a picture.
+flights over debris, water and haze (640x480 from 150 m): by correction alone 0.2 to 2.6 m off, by points no farther off
+than its neighbours in the midst of them, 0.1 to 0.3 m more beside them or beyond them, 0.07 s a picture.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,6 +20,7 @@ from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.recorded import recorded_cameras
+from orthoswarm.swarm.sigma import RADIAL
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -29,7 +30,10 @@ FEWEST = 25
 LEAST_SHARE = 0.4
 PRIOR_M, PRIOR_RAD = 5.0, 0.05
 """How far a carried camera is trusted: loosely, it only keeps what the points do not tell."""
+CORNERS_M = 0.5
+"""How far corners stand above the terrain that they are taken to lie on, all alike (measured: 0.1 to 0.5 m)."""
 _WORKING_PX, _CORNERS, _BACK_PX, _AGREE_PX = 640, 300, 0.7, 1.5
+_LEAST_PX = 0.1
 _SCALES_PX = (20.0, 8.0, 3.0, 1.5, 1.0, 1.0)
 _ROUNDS = 3
 
@@ -47,7 +51,9 @@ def lay_late(
 
     Returns:
         The placed frames in order of time, and image -> reason for those that cannot be placed. Those that the
-        neighbours' pictures do not hold are `weak`, placed by the neighbours' corrections alone.
+        neighbours' pictures do not hold are `weak`, placed by the neighbours' corrections alone. The sigma of the
+        others is that of the neighbours, with the resection's own, and with what corners that stand a little above the
+        terrain move a picture by that has its neighbours on one side: that much of their distance over the height.
     """
     late = {frame.image for frame in frames}
     everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))
@@ -77,9 +83,8 @@ def lay_late(
         except OrthoSwarmError as error:
             dropped[guess.frame.image] = str(error)
             continue
-        seen = [sights(guess, picture, other, small(other), terrain) for other in _nearest(guess, holds)]
-        uv, ground = (np.concatenate(parts) for parts in zip(*seen, strict=True)) if seen else (np.empty((0, 2)),) * 2
-        placed.append(_fitted(guess, uv, ground, _nearest(guess, holds)))
+        near = _nearest(guess, holds)
+        placed.append(_fitted(guess, [sights(guess, picture, other, small(other), terrain) for other in near], near))
     return placed, dropped
 
 
@@ -154,20 +159,42 @@ def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
     return np.column_stack([xy, z])
 
 
-def _fitted(guess: PlacedFrame, uv: Array, ground: Array, near: Sequence[PlacedFrame]) -> PlacedFrame:
-    """The frame with its camera fitted to ground points, the guess where they do not agree."""
-    if len(uv) < FEWEST:
+def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Sequence[PlacedFrame]) -> PlacedFrame:
+    """The frame with its camera fitted to what its neighbours see, the guess where they do not agree."""
+    if sum(len(uv) for uv, _ in seen) < FEWEST:
         return guess
+    uv, ground = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     camera = resected(guess.camera, uv, ground)
     scale = max(1.0, guess.camera.lens.width / _WORKING_PX)
     off = np.hypot(*(camera.project(ground) - uv).T) / scale
     agree = off < _AGREE_PX
     if agree.sum() < max(FEWEST, LEAST_SHARE * len(uv)):
         return guess
-    gsd = float(camera.position[2] - ground[:, 2].mean()) / camera.lens.focal_px * scale
+    source = np.repeat(np.arange(len(near)), [len(uv) for uv, _ in seen])[agree]
+    away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     beside = float(np.median([p.sigma_m for p in near]))
-    sigma = float(np.hypot(beside, gsd * float(np.median(off[agree]))))
-    return PlacedFrame(guess.frame, camera, near[0].stage, sigma)
+    leaning = CORNERS_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
+    own = RADIAL * float(np.sqrt(len(near))) * centre_sigma(camera, uv[agree], ground[agree], scale)
+    return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([beside, leaning, own])))
+
+
+def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> float:
+    """One sigma of an axis of where a picture's centre lies on the ground, by the scatter of its points, metres.
+
+    Args:
+        camera: as resected. uv, ground: pixels (M, 2) and ground points (M, 3). scale: pixels of the picture in one of
+            those in which it was compared.
+    """
+    off = (camera.project(ground) - uv) / scale
+    noise = max(float(np.sqrt((off**2).mean())), _LEAST_PX)
+    moved = [_moved(camera, step) for step in _STEPS]
+    size = _STEPS.sum(1)
+    jacobian = np.stack([(c.project(ground) - uv) / scale - off for c in moved], -1).reshape(-1, 6) / size
+    prior = np.diag(1.0 / np.array([PRIOR_M] * 3 + [PRIOR_RAD] * 3) ** 2)
+    covariance = np.linalg.inv(jacobian.T @ jacobian / noise**2 + prior)
+    middle, z = np.array([camera.lens.principal_point]), float(ground[:, 2].mean())
+    centre = np.stack([(c.to_ground(middle, z) - camera.to_ground(middle, z))[0] for c in moved], -1) / size
+    return float(np.sqrt(np.trace(centre @ covariance @ centre.T) / 2))
 
 
 def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
