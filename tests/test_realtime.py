@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthoswarm.camera import Lens
+from orthoswarm.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.errors import InputError
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.footprint import LEAST_DESCENT, default_gsd, footprint, footprint_boxes, rejection, rejections
@@ -251,6 +251,13 @@ def test_many_frames_are_judged_like_one():
     alone = {i: reason for i, c in enumerate(cameras) if (reason := rejection(c, 0.0, 1.0)) is not None}
     assert rejections(cameras, 0.0, 1.0) == alone
     assert sorted(alone) == [12, 13, 14]
+
+
+def test_a_frame_too_coarse_for_the_map_says_how_much_and_what_to_change():
+    camera = Camera(np.array([0.0, 0.0, 90.0]), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(320, 240, 150.0))
+    assert rejection(camera, 0.0, 0.5) is None
+    reason = rejection(camera, 0.0, 0.01)
+    assert reason is not None and "60 times" in reason and "--gsd" in reason
 
 
 def test_footprint_of_a_level_camera_is_its_corners():

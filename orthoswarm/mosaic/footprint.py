@@ -70,7 +70,11 @@ def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> st
     if height <= 0:
         return f"its camera is not above the ground (height {height:.1f} m)"
     if height > MAX_MAGNIFICATION * gsd_m * focal_px:
-        return f"its height of {height:.0f} m above the ground is far beyond the other frames'"
+        times = height / (gsd_m * focal_px)
+        return (
+            f"from {height:.0f} m above the ground its pixels are {times:.0f} times as large as the map's: "
+            "its height is wrong, or the map's pixel (--gsd) too small"
+        )
     if steepest < LEAST_DESCENT:
         return "it looks at the horizon or above, and not at the ground"
     return None
