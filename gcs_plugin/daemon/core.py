@@ -32,9 +32,9 @@ from gcs_plugin.daemon.store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.tiles import TileServer
 from gcs_plugin.daemon.together import Together
-from gcs_plugin.daemon.usage import resident_mb
 from orthoswarm.basemap import Basemap
 from orthoswarm.errors import InputError
+from orthoswarm.workers import peak_rss_mb
 from telemetry.sample import Sample
 
 _FEW: Final = 10
@@ -380,7 +380,7 @@ class Daemon:
         )
         facts = facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
-            time.process_time(), resident_mb(),
+            time.process_time(), (self.crew.usage(), self.background.usage()), peak_rss_mb(),
         )  # fmt: skip
         task = ExportTask(
             self.settings.workspace, tuple(job.detail["formats"]), canvases, area.epsg, area.gsd_m,

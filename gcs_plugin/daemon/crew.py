@@ -9,8 +9,9 @@ from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Final, TypeVar
 
+from gcs_plugin.daemon.usage import used_by
 from orthoswarm.errors import OrthoSwarmError
-from orthoswarm.workers import single_threaded
+from orthoswarm.workers import Usage, single_threaded
 
 Result = TypeVar("Result")
 
@@ -31,6 +32,7 @@ class Crew:
         self._lock = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
         self._closed = self._started = self._warm = False
+        self._ended_cpu_s = 0.0
 
     def warm_up(self) -> None:
         """Start the processes, once, and let them import what they will need."""
@@ -83,10 +85,17 @@ class Crew:
                     self._pool = None
             raise OrthoSwarmError("a worker process was stopped from outside, mostly for lack of memory") from None
 
+    def usage(self) -> Usage:
+        """CPU time of all its processes so far, and the largest memory of each one that lives, added up."""
+        with self._lock:
+            living = _used(self._pool)
+            return Usage(self._ended_cpu_s + living.cpu_s, living.peak_rss_mb)
+
     def abandon(self) -> None:
         """Give up what is under way, at once; the processes start anew with the next work."""
         with self._lock:
             pool, self._pool = self._pool, None
+            self._ended_cpu_s += _used(pool).cpu_s
         if pool is not None:
             _end(pool)
 
@@ -97,6 +106,11 @@ class Crew:
         if pool is not None:
             for process in _end(pool):
                 process.join(5.0)
+
+
+def _used(pool: ProcessPoolExecutor | None) -> Usage:
+    parts = [used_by(pid) for pid in list(getattr(pool, "_processes", None) or {})]
+    return Usage(sum(part.cpu_s for part in parts), sum(part.peak_rss_mb for part in parts))
 
 
 def _end(pool: ProcessPoolExecutor) -> list[Any]:

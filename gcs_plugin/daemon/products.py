@@ -1,7 +1,7 @@
 """The workspace's products: the same files as those of a batch run, made in a worker from what the journal holds."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from orthoswarm.frame import Frame, Rejection
 from orthoswarm.geo import LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.placement import PlacedFrame, Solution
+from orthoswarm.workers import Usage
 
 FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm")
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
@@ -216,9 +217,19 @@ def _find(paths: dict[tuple[str, str], Path], row: Mapping[str, Any]) -> Path | 
 
 
 def facts_of(
-    jobs: list[dict[str, Any]], completions: list[dict[str, Any]], wall_s: float, cpu_s: float, rss_mb: float
+    jobs: list[dict[str, Any]],
+    completions: list[dict[str, Any]],
+    wall_s: float,
+    cpu_s: float,
+    others: Sequence[Usage],
+    rss_mb: float,
 ) -> dict[str, Any]:
-    """What only the daemon knows for the report: stage timings from its jobs, completions, its own use."""
+    """What only the daemon knows for the report: stage timings from its jobs, completions, and what it uses.
+
+    Args:
+        jobs: all, as JSON values. completions: the same.
+        wall_s: since its start. cpu_s, rss_mb: of the daemon's own process. others: of its other processes.
+    """
     stages = [
         {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},  # counted when the report is written
         *(
@@ -233,7 +244,10 @@ def facts_of(
         *_summed("coarse: in flight", "coarse", jobs),
         *_summed("fine: neighbours together", "together", jobs),
     ]  # fmt: skip
-    document = {"stages": stages, "wall_s": wall_s, "cpu_s": cpu_s, "peak_rss_mb": rss_mb, "completions": completions}
+    document = {
+        "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),
+        "peak_rss_mb": rss_mb + sum(other.peak_rss_mb for other in others), "completions": completions,
+    }  # fmt: skip
     return dict(json.loads(json.dumps(document)))
 
 
