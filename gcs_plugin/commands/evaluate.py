@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
+        "completeness is the covered share of the ground within the convex hull of what is covered: holes count, what\n"
+        "is missing at the edge does not; with --truth, seen_share is that of all ground that the cameras saw.\n\n"
         "example:\n  orthoswarm evaluate out/orthoimage.tif --reference twin/truth/reference.tif \\\n"
         "      --poses out/frames.jsonl --truth twin/truth/frames.csv --json"
     )

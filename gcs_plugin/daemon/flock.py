@@ -92,13 +92,13 @@ class Flock:
         return self._names.get(system, f"v{system}")
 
     def system_of(self, vehicle: str) -> int:
-        """The MAVLink system id of a vehicle.
+        """The MAVLink system id of a vehicle, by its id or that number.
 
         Raises:
             OrthoSwarmError: it was not heard on any link.
         """
         for system in list(self.fleet.vehicles):
-            if self.name_of(system) == vehicle:
+            if vehicle in (self.name_of(system), str(system)):
                 return system
         known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
         raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")

@@ -395,7 +395,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/plans/{number}/map", routes.plan_map)
     add("/api/plans/{number}/start", routes.start_plan, methods=["POST"], status_code=202)
     add("/api/missions/{vehicle}/{verb}", routes.mission, methods=["POST"])
-    add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile)
+    add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
     app.add_api_websocket_route("/api/events", routes.events)
     if STATIC.is_dir():
         app.mount("/static", StaticFiles(directory=STATIC), name="static")
