@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
+from gcs_plugin.daemon.ground import open_basemap
 from gcs_plugin.daemon.layers import Area, Layer, successor
 from gcs_plugin.daemon.tiles import TileAddress, TileServer, canvas_tile, encode, ground_patch, over, resampled
-from orthoswarm.errors import OrthoSwarmError
+from gcs_plugin.daemon.warmup import made_up_ground, write_map
+from orthoswarm.errors import InputError, OrthoSwarmError
 from orthoswarm.geo import GroundGrid
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.realtime import RealtimeMosaic
@@ -159,3 +161,12 @@ def test_edges_do_not_darken(value, alpha):
     assert np.abs(tile[..., :3][shown].astype(int) - value).max() <= 2
     lower = np.full((256, 256, 4), (10, 20, 30, alpha), np.uint8)
     np.testing.assert_array_equal(over(tile, lower)[..., :3][tile[..., 3] == 255], tile[..., :3][tile[..., 3] == 255])
+
+
+def test_a_basemap_that_is_cut_short_is_refused_before_anybody_flies(tmp_path):
+    write_map(made_up_ground(), tmp_path / "map.tif")
+    whole = (tmp_path / "map.tif").read_bytes()
+    assert open_basemap(tmp_path / "map.tif") is not None
+    (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.tif is cut short"):
+        open_basemap(tmp_path / "cut.tif")

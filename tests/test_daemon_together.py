@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from gcs_plugin.daemon.kept import load_kept
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.together import Together
 from gcs_plugin.daemon.warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.work import without_strays
+from orthoswarm.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.placement import PlacedFrame, Solution
 from tests.made_up import LIMIT_S, after_job, complete, post, truth
 
 
@@ -91,6 +95,18 @@ def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights
     assert solution(daemon, "v1")[0] == first
     kept = {row["path"] for t in ("solutions", "coarse") for row in daemon.journal.rows(f"SELECT path FROM {t}")}
     assert {path.name for path in (daemon.settings.workspace / "solutions").iterdir()} == kept  # nothing is left over
+
+
+def test_pictures_that_look_far_aside_are_left_out_of_the_refined_map(flights):
+    frames, _ = flights
+    down = Camera(np.array([0.0, 0.0, 60.0]), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(240, 180, 171.0))
+    aside = replace(down, rotation=rotation_from_angles(0.0, np.radians(-40.0), 0.0))
+    placed = [PlacedFrame(f, aside if k == 5 else down, "fine", 0.1) for k, f in enumerate(frames["v1"])]
+    found = Solution("v1", placed, {"x.jpg": "damaged"}, [], 70.0, 1.0, None, warnings=["a word"])
+    left = without_strays(found)
+    assert set(left.dropped) == {"x.jpg", frames["v1"][5].image} and len(left.placed) == len(placed) - 1
+    assert len(left.warnings) == 2 and "far aside" in left.warnings[1]
+    assert without_strays(replace(found, placed=placed[:5])) == replace(found, placed=placed[:5])
 
 
 # -- the queue --------------------------------------------------------------------------------------------------------

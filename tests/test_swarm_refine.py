@@ -307,8 +307,11 @@ def test_a_vehicle_over_a_hole_of_the_map_is_carried_once_its_neighbour_is_there
     assert refiner.again(alone, [], basemap) is alone
     lone = replace(alone.placed[-1], frame=replace(alone.placed[-1].frame, image="late.jpg"), sigma_m=0.7)
     alone.placed.append(lone)  # laid beside the refined ones
+    left_out = alone.placed.pop(0).frame.image
+    alone = replace(alone, dropped={left_out: "it looks aside"})
     first = refiner.refine(vehicles["uav01"], [], basemap)
     carried = refiner.again(alone, [first], Blank(basemap, box))
+    assert carried.dropped == alone.dropped and left_out not in {p.frame.image for p in carried.placed}
     assert {leg.state for leg in alone.legs} == {"failed"} and {leg.state for leg in carried.legs} == {"carried"}
     assert {p.stage for p in carried.placed} == {"fine"}
     *own, follower = carried.placed

@@ -98,4 +98,6 @@ def open_basemap(path: Path) -> Basemap | None:
             west, south, east, north = transform_bounds(raster.crs, 4326, *raster.bounds)
     except RasterioError as error:
         raise InputError(f"the basemap {path.name} cannot be read ({error}); check the file") from None
-    return Basemap.open(path, utm_epsg(0.5 * (south + north), 0.5 * (west + east)))
+    basemap = Basemap.open(path, utm_epsg(0.5 * (south + north), 0.5 * (west + east)))
+    basemap.require_readable(basemap.bounds)  # now, and not when the first vehicle completes
+    return basemap

@@ -19,6 +19,7 @@ from orthoswarm.frame import Frame
 from orthoswarm.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.canvas import Canvas
 from orthoswarm.mosaic.render import render
+from orthoswarm.oblique import strays, told
 from orthoswarm.placement import Leg, PlacedFrame, Solution
 
 
@@ -90,7 +91,7 @@ def solve(task: SolveTask) -> Solved:
     watch = _Watch()
     others = [load_kept(path) for path in task.neighbours]
     refiner = SwarmRefiner(task.epsg, np.array(task.origin))
-    solution = refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task))
+    solution = without_strays(refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task)))
     kept = Kept(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     kept.write(task.target)
     return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
@@ -114,6 +115,19 @@ def lay_beside(task: SolveTask) -> Solved:
     kept.write(task.target)
     new = replace(whole, placed=placed, dropped=dropped, legs=[])
     return watch.solved(new, [], kept, seen(placed, kept.terrain))
+
+
+def without_strays(solution: Solution) -> Solution:
+    """The solution without pictures that look far aside among others that look straight down, which would smear."""
+    out = strays(solution.placed)
+    if not out:
+        return solution
+    return replace(
+        solution,
+        placed=[p for p in solution.placed if p.frame.image not in out],
+        dropped={**solution.dropped, **out},
+        warnings=[*solution.warnings, *told(out)],
+    )
 
 
 @dataclass(frozen=True, slots=True)

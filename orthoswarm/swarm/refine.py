@@ -120,9 +120,10 @@ class SwarmRefiner:
         now = self._beside(own, others, basemap)
         there = {p.frame.image for p in now.placed}
         extra = [p for p in solution.placed if p.frame.image not in there]
+        own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]  # what was left out stays out
         return replace(
             now,
-            placed=[*now.placed, *follow(extra, solution.placed, now.placed)],
+            placed=[*own_frames, *follow(extra, solution.placed, now.placed)],
             dropped=dict(solution.dropped),
             warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in told)])),
         )
