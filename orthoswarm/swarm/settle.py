@@ -102,7 +102,7 @@ def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: 
     again. (Regressed over simulated cities with exact truth: 1.0 to 1.1 times this is what is left in the ties.) So
     taking it off extrapolates to no edges at all.
     """
-    some = matches.take(np.arange(0, len(matches.point), max(1, len(matches.point) // MOST_FOR_PULL)))
+    some = matches.take(np.arange(0, len(matches.point), max(1, -(-len(matches.point) // MOST_FOR_PULL))))
     edges = accepted(_ground_matches(flight, surface, ground, some.point, reach_m, TIE_HALF_M, gradient_field))
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
