@@ -61,8 +61,14 @@ def test_a_ctrl_c_at_the_terminal_ends_all_of_it_in_a_sentence(tmp_path):
         time.sleep(0.02)
     time.sleep(1.0)  # there is nothing to wait for: any moment of its start will do
     os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
+    try:
+        _, said = process.communicate(timeout=60)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+    # Interrupted inside exec(), as imports use it, Python ends by the signal itself; a shell shows 130 in both cases.
+    assert process.returncode in (130, -signal.SIGINT)
     assert "Traceback" not in said and "interrupted" in said
 
 

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import multiprocessing.process
+import multiprocessing.resource_tracker
 import shutil
 import signal
 import socket
@@ -81,14 +82,19 @@ def run_demo(
 
 
 def _start(process: multiprocessing.process.BaseProcess) -> None:
-    """Start a process that a Ctrl-C at the terminal does not reach: this one ends it."""
-    in_main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
+    """Start a process that a Ctrl-C at the terminal does not reach: this one ends it.
+
+    The signal is held back meanwhile, not ignored: one that comes just now is heard afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # there the simulator itself ignores it, as soon as it runs
+        process.start()
+        return
+    multiprocessing.resource_tracker.ensure_running()  # it would let the signal through while it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process.start()
     finally:
-        if in_main:
-            signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _clear(out: Path) -> None:
