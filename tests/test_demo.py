@@ -55,7 +55,10 @@ def test_the_clock_runs_slower_while_cameras_are_behind(monkeypatch):
 def test_a_ctrl_c_at_the_terminal_ends_all_of_it_in_a_sentence(tmp_path):
     mark = tmp_path / "demo" / "demo.json"
     command = [sys.executable, "-m", "gcs_plugin.cli", "demo", "--no-browser", "--out", str(mark.parent)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it for what runs behind them
+    )  # fmt: skip
     while not mark.exists():
         assert process.poll() is None
         time.sleep(0.02)
