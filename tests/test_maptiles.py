@@ -45,7 +45,8 @@ def test_a_tiled_map_gives_what_the_map_gives(
     expected, known = plane.gray(bounds, gsd)
     assert np.array_equal(valid, known)
     inner = np.abs(gray - expected) < 1e-2
-    assert inner.mean() > 0.999, "but for rounding where the pattern jumps"
+    # But for rounding where the pattern jumps: at most a row and a column, however small the window is.
+    assert (~inner).sum() <= max(sum(gray.shape), 0.001 * inner.size)
 
 
 def test_tiles_are_read_once_and_other_sizes_go_to_the_map() -> None:
