@@ -5,7 +5,6 @@ load -> real time (paper III.B) -> coarse and fine refinement, vehicle by vehicl
 
 import logging
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,7 +33,15 @@ from orthoswarm.mosaic.render import Layer, RenderStats, render, render_layers
 from orthoswarm.oblique import loose, strays, told
 from orthoswarm.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
-from orthoswarm.recorded import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
+from orthoswarm.recorded import (
+    Recorded,
+    area_grid,
+    heights_assumed,
+    nothing_to_map,
+    recorded_cameras,
+    told_of_lone_ones,
+)
+from orthoswarm.refinement import Refinement, append_carried, named, shared_terrain, split_time
 from orthoswarm.report.page import write_page
 from orthoswarm.stages import Clock, Stage
 from orthoswarm.vehicles import legs_as_vehicles
@@ -75,20 +82,6 @@ class Options:
     dem: Path | None = None
     split_legs: bool = False
     gains: bool = True
-
-
-@dataclass(slots=True)
-class _Refinement:
-    """What the refiner made: cameras before and after the map, the ground, and what concerns all vehicles.
-
-    map_lost: the map that was asked for turned out to be unreadable, so that it was not used.
-    """
-
-    coarse: list[Solution]
-    fine: list[Solution]
-    terrain: Terrain | None
-    warnings: list[str] = field(default_factory=list)
-    map_lost: bool = False
 
 
 @dataclass(slots=True)
@@ -229,7 +222,7 @@ class _Batch:
             state.warnings += told(aside)
         return [p for p in placed if p.frame.image not in stats.rejected]
 
-    def refine(self, state: _State) -> _Refinement | None:
+    def refine(self, state: _State) -> Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
         by_kind = sort_out(state.recorded.placed)
         state.still, state.odd = by_kind.still, by_kind.odd
@@ -238,7 +231,7 @@ class _Batch:
             if state.basemap is not None and self.options.until == "fine":
                 state.warnings.append("the basemap was not used; the orthoimage lies where the receivers say")
             return None
-        known: tuple[_Refinement, list[Stage]] | None = self.space.recall("refinement")
+        known: tuple[Refinement, list[Stage]] | None = self.space.recall("refinement")
         if known is not None:
             self.clock.stages += known[1]
             state.basemap = None if known[0].map_lost else state.basemap
@@ -257,13 +250,13 @@ class _Batch:
                 state.warnings.append(f"{state.fault}; the map is the real-time one")
                 return None
         for solutions in (refinement.coarse, refinement.fine):
-            _append(solutions, carry(by_kind.odd, by_kind.fit, [p for s in solutions for p in s.placed]))
-        stages = _split_time(stage, refinement, self.options.until, state.basemap is not None)
+            append_carried(solutions, carry(by_kind.odd, by_kind.fit, [p for s in solutions for p in s.placed]))
+        stages = split_time(stage, refinement, self.options.until, state.basemap is not None)
         self.clock.stages += stages
         self.space.remember("refinement", (refinement, stages))
         return refinement
 
-    def refined(self, frames: Sequence[Frame], state: _State) -> _Refinement:
+    def refined(self, frames: Sequence[Frame], state: _State) -> Refinement:
         """The refinement; without the map where that turns out to be unreadable after its check.
 
         The photos adjusted to each other are worth more than the real-time picture, and hours may have gone into it.
@@ -278,7 +271,7 @@ class _Batch:
         refinement.map_lost = True
         return refinement
 
-    def call_refiner(self, frames: Sequence[Frame], state: _State) -> _Refinement:
+    def call_refiner(self, frames: Sequence[Frame], state: _State) -> Refinement:
         # Only the one that is asked for: the other's imports would cost memory in every run.
         refine: Any = import_module(f"orthoswarm.{self.options.refine}.refine").refine_all
         vehicles: dict[str, list[Frame]] = {}
@@ -299,9 +292,9 @@ class _Batch:
         terrain, warnings = refined.terrain, list(getattr(refined, "warnings", []))
         del refined  # with the states of all vehicles
         trim_memory()
-        return _Refinement(strip[0], strip[1], terrain, warnings)
+        return Refinement(strip[0], strip[1], terrain, warnings)
 
-    def pictures(self, state: _State, refinement: _Refinement | None) -> list[PlacedFrame]:
+    def pictures(self, state: _State, refinement: Refinement | None) -> list[PlacedFrame]:
         """coarse.tif and orthoimage.tif; gives the frames as last placed."""
         if refinement is None:
             placed = self.looking_down(state, state.recorded.placed)
@@ -318,7 +311,7 @@ class _Batch:
         for solution in refinement.fine:
             reasons = dict(solution.dropped)
             self.leave_out(state, reasons, state.recorded.placed)
-            state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
+            state.warnings += [named(solution.vehicle, w) for w in solution.warnings]
         on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
         state.warnings += map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
         with_map = state.basemap is not None and self.options.until == "fine"
@@ -328,7 +321,7 @@ class _Batch:
         coarse = [p for s in refinement.coarse for p in s.placed] + state.still
         coarse = [p for p in coarse if p.frame.image not in state.rejected]
         state.warnings += loose(fine, state.odd)
-        if self.options.gsd_m is None and _heights_assumed(state.recorded.placed):
+        if self.options.gsd_m is None and heights_assumed(state.recorded.placed):
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):
@@ -336,7 +329,7 @@ class _Batch:
         if self.options.until != "fine":
             self.picture(state, COARSE, fine, terrain)
         elif with_map:
-            self.both(state, (coarse, _coarse_terrain(refinement.coarse)), (fine, terrain))
+            self.both(state, (coarse, shared_terrain(refinement.coarse)), (fine, terrain))
         else:
             self.picture(state, ORTHOIMAGE, fine, terrain)
             self.copy_coarse(state)
@@ -349,7 +342,7 @@ class _Batch:
         state.warnings += told(aside)
         return [p for p in placed if p.frame.image not in aside]
 
-    def ground(self, state: _State, refinement: _Refinement) -> Terrain | None:
+    def ground(self, state: _State, refinement: Refinement) -> Terrain | None:
         """The ground under the pictures: found from them, or an outside height model brought to their level."""
         if self.options.dem is None or state.dem is not None:  # the refiner has used it
             return refinement.terrain
@@ -449,7 +442,7 @@ class _Batch:
 
     # -- products -------------------------------------------------------------------------------------------------
 
-    def finish(self, state: _State, placed: list[PlacedFrame], refinement: _Refinement | None) -> dict[str, Any]:
+    def finish(self, state: _State, placed: list[PlacedFrame], refinement: Refinement | None) -> dict[str, Any]:
         """frames.jsonl, footprints and the report."""
         for name in PRODUCTS:  # of an earlier run with other options
             if name not in self.made(state.fault is not None):
@@ -505,41 +498,3 @@ class _Batch:
             "root": image_root(state.ingest.frames),
             **({"equation_5": state.equation_5} if state.equation_5 else {}),
         }
-
-
-# -- helpers ------------------------------------------------------------------------------------------------------
-
-
-def _append(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
-    """Add frames to the solutions of their vehicles (to the first one if a vehicle has none)."""
-    for p in carried:
-        own = next((i for i, s in enumerate(solutions) if s.vehicle == p.frame.vehicle), 0)
-        solutions[own] = replace(solutions[own], placed=[*solutions[own].placed, p])
-
-
-def _heights_assumed(recorded: Sequence[PlacedFrame]) -> bool:
-    """True if most pictures told no height, so that the ground pixel of the real-time picture was a guess."""
-    return sum(p.frame.fix.height_m is None for p in recorded) > 0.5 * len(recorded)
-
-
-def _coarse_terrain(solutions: Sequence[Solution]) -> Terrain | None:
-    return next((s.terrain for s in solutions if s.terrain is not None), None)
-
-
-def _split_time(stage: Stage, refinement: _Refinement, until: str, with_map: bool) -> list[Stage]:
-    """The refinement's time by stage: what was done before the map counts as coarse."""
-    laps: Counter[str] = Counter()
-    for solution in refinement.fine:
-        laps.update(solution.timings)
-    total = sum(laps.values())
-    if until == "coarse" or not with_map or total <= 0:
-        return [replace(stage, name="coarse: refinement")]
-    share = sum(laps[name] for name in ("tracks", "relative")) / total
-    return [
-        Stage("coarse: refinement", share * stage.wall_s, share * stage.cpu_s, stage.items),
-        Stage("fine: refinement", (1 - share) * stage.wall_s, (1 - share) * stage.cpu_s, stage.items),
-    ]
-
-
-def _named(vehicle: str, warning: str) -> str:
-    return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"

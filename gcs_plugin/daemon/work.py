@@ -174,7 +174,7 @@ def _moved_m(before: Solution, now: Solution) -> float:
     """How far the ground under pictures moved, 95 % of their middles and corners."""
     was = {p.frame.image: p.camera for p in before.placed}
     moved = [
-        np.hypot(*(ground_of(p.camera, now.ground_z_m) - ground_of(was[p.frame.image], before.ground_z_m)).T)
+        np.hypot(*(_ground_of(p.camera, now.ground_z_m) - _ground_of(was[p.frame.image], before.ground_z_m)).T)
         for p in now.placed
         if p.frame.image in was and not p.weak
     ]
@@ -182,12 +182,9 @@ def _moved_m(before: Solution, now: Solution) -> float:
     return float(np.nanpercentile(found, 95))
 
 
-def ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float64]]:
     """East and north (5, 2) of a picture's middle and corners on a level plane."""
-    lens = camera.lens
-    right, low = lens.width - 1.0, lens.height - 1.0
-    uv = np.array([lens.principal_point, (0.0, 0.0), (right, 0.0), (0.0, low), (right, low)])
-    return camera.to_ground(uv, z_m)
+    return np.vstack([camera.to_ground(np.array(camera.lens.principal_point), z_m), camera.corners(z_m)])
 
 
 def place(task: SolveTask) -> Solved:
