@@ -54,11 +54,21 @@ def halted(served):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
     try:
+        while not all(map(stands_still, pids)):  # what is writing stops only when its system call is done
+            time.sleep(0.01)
         yield
     finally:
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
+
+
+def stands_still(pid):
+    """Whether every thread of a process is stopped, or it is gone."""
+    with contextlib.suppress(OSError):
+        stats = [(task / "stat").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
+        return all(stat.rpartition(")")[2].split()[0] in "TtZX" for stat in stats)
+    return not Path(f"/proc/{pid}").exists()
 
 
 def children(pid):
