@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.maptiles import TiledMap
 from orthoswarm.placement import MapWindow
-from orthoswarm.swarm.coarse import Match, by_learning, register
+from orthoswarm.swarm.coarse import Match, by_learning, register, stacked, strip_and_map
 from orthoswarm.swarm.flight import Flight
 
 Array = NDArray[np.float64]
@@ -32,7 +32,8 @@ class CoarseFit:
 
     Attributes:
         correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
-        confidence: share of the windows that agree.
+        confidence: share of the windows that agree; where only all together were found, how far the second peak of
+            their sum is below the first.
     """
 
     correction: Array
@@ -42,12 +43,29 @@ class CoarseFit:
 
 
 def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
-    """Register windows of each leg near their records, then farther off; None where no consensus is found."""
+    """Register windows of each leg near their records, then all together, then farther off; None without consensus."""
     rig = flight.rig()
     width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
     gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
     tiles = TiledMap(basemap, gsd)
-    return next((f for reach in REACHES_M if (f := _fit_within(reach, flight, tiles, origin, gsd)) is not None), None)
+    near, far = REACHES_M
+    return (
+        _fit_within(near, flight, tiles, origin, gsd)
+        or _fit_together(near, flight, tiles, origin, gsd)
+        or _fit_within(far, flight, tiles, origin, gsd)
+    )
+
+
+def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+    """One shift for the whole flight, from what all its windows say together (see `stacked`)."""
+    rig, windows = flight.rig(), _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    strips = [strip_and_map(rig, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
+    found = stacked([s for s in strips if s is not None])
+    if found is None:
+        return None
+    shift, z, ratio = found
+    match = Match(0, len(rig) - 1, (float(shift[0]), float(shift[1])), z, ratio)
+    return CoarseFit(np.tile(shift, (len(rig), 1)), [match], np.ones(1, bool), 1.0 - ratio)
 
 
 def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
