@@ -19,8 +19,9 @@ demo: $(STAMP)
 	@$(BIN)/orthoswarm demo --out $(DEMO) --median 0.5
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
+# PYTEST="-m 'not sitl'" runs the slow tests as well (half an hour instead of ten minutes).
 test: check
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest $(PYTEST)
 
 check: $(STAMP)
 	@$(BIN)/ruff format --check .

@@ -22,7 +22,7 @@ import pytest
 from gcs_plugin.daemon.plans import Plans
 from gcs_plugin.web.guard import take_token
 from orthoswarm.errors import InputError
-from tests.daemon_kit import line, serving, start, stop
+from tests.daemon_kit import line, serving, start, stop, tile_over
 from tests.test_daemon_crash import check, post_until_gone
 from tests.test_daemon_flight import square
 
@@ -149,7 +149,7 @@ def goes_on(workspace, acknowledged, asked, shots):
             folder = workspace / "plans" / plan["id"]
             assert (folder / "v1.waypoints").read_text().count("\n") > 5
             assert "mission" in json.loads((folder / "v1.plan").read_text())
-            assert not layers["coarse"]["empty"]
+            assert not layers["coarse"]["empty"]  # drawn again by a job, if it had been drawn before
             served.until("/api/jobs", lambda jobs: all(job["state"] in ("done", "failed") for job in jobs))
             export = [job for job in served.get("/api/jobs").json() if job["kind"] == "export"]
             assert export and export[-1]["state"] == "done", export
@@ -202,6 +202,37 @@ def cut_on_a_copy(tmp_path, monkeypatch, seed, refine, count=12):
     monkeypatch.delenv("SYNC_LOG")
     goes_on(copy, known, asked, shots)
     return len(known), lost
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_refined_layer_is_drawn_again_after_a_power_cut_or_when_its_canvas_is_damaged(tmp_path, damaged):
+    workspace, shots = tmp_path / "w", line(6)
+    z, x, y = tile_over(shots[2].camera)
+    tile = f"/tiles/coarse/{z}/{x}/{y}.png"
+    with serving(workspace) as served:
+        post_until_gone(served, shots, {}, threading.Lock())
+        assert served.command("/api/refine", {"vehicle": "v1"}).status_code == 202
+        served.until("/api/jobs", refined_and_exported)
+        before = served.get(tile).content
+    if damaged:
+        for canvas in (workspace / "layers").glob("coarse-*/canvas.json"):
+            canvas.write_bytes(canvas.read_bytes()[:20])
+    else:
+        after_a_power_cut(workspace)
+        with contextlib.closing(sqlite3.connect(workspace / "journal.db")) as db, db:
+            db.execute("UPDATE meta SET value = 'false' WHERE key = 'clean'")
+    with serving(workspace) as served:
+        jobs = served.until("/api/jobs", lambda rows: any(r["kind"] == "redraw" and r["state"] == "done" for r in rows))
+        assert [r["kind"] for r in jobs].count("refine") == 1
+        assert served.get(tile).content == before
+    with serving(workspace) as served:
+        assert [r["kind"] for r in served.get("/api/jobs").json()].count("redraw") == 1  # once is enough
+        assert served.get(tile).content == before
+
+
+def refined_and_exported(rows):
+    kinds = {row["kind"] for row in rows}
+    return {"refine", "export"} <= kinds and all(row["state"] == "done" for row in rows)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="watches what is synced through /proc")

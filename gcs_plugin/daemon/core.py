@@ -75,7 +75,7 @@ class Daemon:
         self.tiles = TileServer(self.layers)
         canvases = folder / "layers"
         canvases.mkdir(exist_ok=True)
-        distrust_after_power_cut(self.journal)
+        trusted = distrust_after_power_cut(self.journal)
         self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
         fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
@@ -83,7 +83,7 @@ class Daemon:
             fov_rad=fov, on_area=self._area_changed,
         )  # fmt: skip
         self.crew, self.background = Crew(settings.workers), Crew(1, LAST)
-        press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer)
+        press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
         self.coarse = Coarse(self.journal, self.store, press, self.background, settings.basemap, self._published)
         self.refinement = Refinement(
             self.journal, self.store, press, self.crew, self.drawer, settings.basemap, self._published,
@@ -92,12 +92,14 @@ class Daemon:
         self.together = Together(self.journal, press, self.background, settings.basemap, self._published)
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
-            "export": self._export,
+            "redraw": lambda job, tell: press.draw_again(self.background, tell), "export": self._export,
         }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
         )
         self.jobs.on_end(self._after_job)
+        if press.lost:
+            self.jobs.add("redraw")
         self.legwatch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
         self.plans = Plans(folder / "plans")
@@ -329,9 +331,9 @@ class Daemon:
         if job.kind == "refine":
             self._note_refined(job)
             self.jobs.wake()
-        elif job.kind != "together" and (job.kind != "coarse" or "after" not in job.detail):
+        elif job.kind not in ("together", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
             return
-        if not self.jobs.open("refine", "together", "coarse"):
+        if not self.jobs.open("refine", "together", "coarse", "redraw"):
             self.jobs.add("export", formats=["cog", "gpkg"])
 
     def _note_refined(self, job: Job) -> None:

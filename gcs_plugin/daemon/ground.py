@@ -49,10 +49,14 @@ def require_space(workspace: Path, size: int) -> None:
         raise OrthoSwarmError(f"the disk is nearly full ({free / 1e6:.0f} MB left); free some space")
 
 
-def distrust_after_power_cut(journal: Journal) -> None:
+def distrust_after_power_cut(journal: Journal) -> bool:
     """After the machine went down without the daemon, draw the real-time layer again: its last pixels may be lost.
 
-    Pictures and journal are synced before they are acknowledged; canvases are not, for speed.
+    Pictures and journal are synced before they are acknowledged, kept sorties before they are published; canvases are
+    not, for speed.
+
+    Returns:
+        Whether canvases can be trusted.
     """
     boot = _boot_id()
     clean = journal.fact("clean") or journal.fact("boot") in (None, boot)
@@ -67,6 +71,7 @@ def distrust_after_power_cut(journal: Journal) -> None:
     journal.write(change)
     if not clean:
         _log.warning("the machine went down without warning; the real-time layer is drawn again")
+    return bool(clean)
 
 
 def _boot_id() -> str:

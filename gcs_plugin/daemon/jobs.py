@@ -22,7 +22,7 @@ from orthoswarm.errors import OrthoSwarmError
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
 _KEPT: Final = 1000
-_BACKGROUND: Final = frozenset({"coarse", "together", "export"})
+_BACKGROUND: Final = frozenset({"coarse", "together", "redraw", "export"})
 _ORDER: Final = (
     "CASE WHEN kind = 'refine' THEN 0 WHEN kind = 'coarse' AND detail NOT LIKE '%\"after\"%' THEN 2 ELSE 1 END, id"
 )
@@ -34,7 +34,7 @@ class Job:
     """One job.
 
     Attributes:
-        id: number. kind: refine, together, coarse or export. vehicle: whose, None for all. sortie: which.
+        id: number. kind: refine, together, coarse, redraw or export. vehicle: whose, None for all. sortie: which.
         state: queued, running, done or failed. progress: 0 to 1. message: what is being done, or why it failed.
         created, started, ended: UTC epoch seconds. attempts: how often it was begun. detail: JSON values.
     """

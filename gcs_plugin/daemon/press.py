@@ -5,6 +5,7 @@ the layer's new generation and whatever else became true with it.
 """
 
 import json
+import logging
 import shutil
 import sqlite3
 import threading
@@ -15,13 +16,14 @@ from typing import Any
 
 from gcs_plugin.daemon.crew import Crew
 from gcs_plugin.daemon.drawing import Drawer
-from gcs_plugin.daemon.journal import Change, Journal, fact_change, packed
+from gcs_plugin.daemon.journal import Change, Journal, fact_change, packed, unpacked
 from gcs_plugin.daemon.layers import Area, Bounds, Layer, new_name
 from gcs_plugin.daemon.work import DrawTask, draw
 from orthoswarm.errors import OrthoSwarmError
 from orthoswarm.mosaic.canvas import Canvas
 
 REFINED = ("coarse", "fine")
+_log = logging.getLogger(__name__)
 
 
 class Press:
@@ -29,19 +31,53 @@ class Press:
 
     Attributes:
         folder: of the layers' canvases. kept: folder of kept sorties.
+        lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
     """
 
-    def __init__(self, journal: Journal, layers: dict[str, Layer], folder: Path, kept: Path, drawer: Drawer) -> None:
-        """Remove what a killed daemon left half made, and open what it had published."""
+    def __init__(
+        self, journal: Journal, layers: dict[str, Layer], folder: Path, kept: Path, drawer: Drawer, *, trusted: bool
+    ) -> None:
+        """Remove what a killed daemon left half made, and open what it had published.
+
+        Args:
+            trusted: False after a power cut: canvases are not synced, for speed.
+        """
         self.journal, self.layers, self.folder, self.kept, self._drawer = journal, layers, folder, kept, drawer
         self._turns = {name: threading.Lock() for name in REFINED}
         self.printing: set[str] = set()
         self.kept.mkdir(parents=True, exist_ok=True)
-        for name in REFINED:
-            generation = journal.fact(name)
-            if generation is not None and (folder / generation / "canvas.json").exists():
-                layers[name].replace(Canvas.open(folder / generation))
+        begun = journal.fact("lost") or []
+        self.lost = [name for name in REFINED if not self._opened(name, trusted) or name in begun]
+        journal.write(fact_change("lost", self.lost))
         self.sweep()
+
+    def _opened(self, layer: str, trusted: bool) -> bool:
+        """Open what was published of a layer; False if that cannot be trusted, and is forgotten."""
+        generation = self.journal.fact(layer)
+        if generation is None:
+            return not self.shown(layer)
+        try:
+            if not trusted:
+                raise OrthoSwarmError("it may have lost its last pixels in the power cut")
+            self.layers[layer].replace(Canvas.open(self.folder / generation))
+        except (OrthoSwarmError, OSError) as error:
+            _log.warning("the layer %s is drawn again: %s", layer, error)
+            self.journal.write(fact_change(layer, None))
+            return False
+        return True
+
+    def draw_again(self, crew: Crew, tell: Callable[[float, str], None]) -> Change:
+        """Draw the layers that were lost from the kept sorties, one after the other; gives the change that says so."""
+        todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
+        for n, (layer, (vehicle, sortie)) in enumerate(todo):
+            with self.turn(layer):
+                row = self.shown(layer).get((vehicle, sortie))
+                if row is None:
+                    continue  # refined, or drawn anew, meanwhile
+                tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
+                whose = (unpacked(vehicle), sortie)
+                self.print(layer, crew, whose, row[0], row[1], lambda rejected: lambda db: None)
+        return fact_change("lost", [])
 
     def sweep(self) -> None:
         """Remove canvases and pickles that nothing names."""
