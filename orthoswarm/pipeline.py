@@ -36,7 +36,6 @@ from orthoswarm.products import image_root, leg_rows, stage_row, vehicle_rows, w
 from orthoswarm.recorded import (
     Recorded,
     area_grid,
-    heights_assumed,
     nothing_to_map,
     recorded_cameras,
     told_of_lone_ones,
@@ -321,7 +320,7 @@ class _Batch:
         coarse = [p for s in refinement.coarse for p in s.placed] + state.still
         coarse = [p for p in coarse if p.frame.image not in state.rejected]
         state.warnings += loose(fine, state.odd)
-        if self.options.gsd_m is None and heights_assumed(state.recorded.placed):
+        if self.options.gsd_m is None:
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):

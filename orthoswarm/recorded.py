@@ -190,8 +190,3 @@ def nothing_to_map(ingest: Ingest) -> str:
         return "no picture was found in the input; name a folder of photos or a video"
     reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
     return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
-
-
-def heights_assumed(recorded: Sequence[PlacedFrame]) -> bool:
-    """True if most pictures told no height, so that the ground pixel of the real-time picture was a guess."""
-    return sum(p.frame.fix.height_m is None for p in recorded) > 0.5 * len(recorded)

@@ -26,7 +26,7 @@ DRAWN_NODES = 4_000_000
 """Nodes of the ground that pictures are drawn on; tasks get the part that they need."""
 WHOLE = 0.97
 """A height model that covers more than this of the area covers it."""
-DRAWN = FitSettings(held_out_se=1.0)
+DRAWN = FitSettings(held_out_se=1.0, floor_sigma_m=0.15)
 """The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
 
 

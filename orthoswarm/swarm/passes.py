@@ -22,10 +22,11 @@ from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.groundwork import dense_points
 from orthoswarm.swarm.heights import contradicted, height_doubt, release_heights
 from orthoswarm.swarm.legs import leads_one_way
+from orthoswarm.swarm.mapheights import map_heights
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
-from orthoswarm.swarm.settle import map_gsd, resettle, settle, working_gsd
+from orthoswarm.swarm.settle import load_map, map_gsd, resettle, settle, working_gsd
 from orthoswarm.swarm.sigma import frame_sigmas, map_doubt, unexplained
 from orthoswarm.swarm.snapshot import Snapshot
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
@@ -303,9 +304,10 @@ def second_pass(
     if held is not None:
         link_to_held(flight, held, working_gsd(flight))
     watch.lap("links to neighbours")
+    ground = None
     if state.on_map and basemap is not None:
-        again = resettle(flight, basemap, origin, state.surface, state.ties)
-        state.surface, state.ties, state.matches = again
+        ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
+        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties)
     else:
         for _ in range(4):
             flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
@@ -313,8 +315,8 @@ def second_pass(
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
     floor = 0.05
-    if basemap is not None and state.on_map:
-        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, map_gsd(flight, basemap))
+    if ground is not None:
+        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
     sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
@@ -332,6 +334,12 @@ def second_pass(
         steady_weak(flight, state.sigma_m)
     watch.lap("sigma")
     state.dense = dense_points(flight, state.surface)
+    if ground is not None:
+        paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
+        more = map_heights(
+            flight, state.surface, ground, np.concatenate([np.zeros((0, 2)), *paths]), state.ties.sigma_m
+        )
+        state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])
     watch.lap("denser terrain")
     flight.pictures.drop()
     for other in others:

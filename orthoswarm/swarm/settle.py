@@ -263,12 +263,12 @@ def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundMod
 
 
 def resettle(
-    flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel, ties: Ties
+    flight: Flight, ground: LoadedMap, surface: GroundModel, ties: Ties
 ) -> tuple[GroundModel, Ties, MapMatches]:
     """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved)."""
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    return _second_round(flight, load_map(flight, basemap, origin, map_gsd(flight, basemap)), surface, 4)
+    return _second_round(flight, ground, surface, 4)
 
 
 def _second_round(
