@@ -1,6 +1,6 @@
 """Finding strips and points on a map, and what is concluded from them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import cv2
@@ -9,8 +9,10 @@ import pytest
 
 from orthoswarm.camera import rotation_from_angles
 from orthoswarm.geo import GroundGrid
-from orthoswarm.swarm.coarse import correlate, orientation_field, register
+from orthoswarm.swarm.coarse import Strip, by_edges, correlate, orientation_field, register, stacked
+from orthoswarm.swarm.ground import GroundModel
 from orthoswarm.swarm.loadedmap import LoadedMap
+from orthoswarm.swarm.mapheights import map_heights
 from orthoswarm.swarm.patches import gradient_field, match, texture_field
 from orthoswarm.swarm.rig import Rig
 from orthoswarm.swarm.settle import accepted, edge_pull, mode_shift
@@ -92,6 +94,85 @@ def test_correlation_finds_fractions_of_a_pixel():
     assert column == pytest.approx(3.4, abs=0.2)
     assert row == pytest.approx(-2.7, abs=0.2)
     assert ratio < 0.5
+
+
+def faint_strips(shift, count=4, reach=30, seed=0):
+    """Strips of one flight that show little of their map under their noise, all displaced alike (but for a pixel)."""
+    rng = np.random.default_rng(seed)
+    whole = texture(600, seed=9)
+    strips = []
+    for k in range(count):
+        r, c = 40 + 130 * k, 200
+        dc, dr = shift + rng.integers(-1, 2, 2)
+        view = whole[r + dr : r + dr + 100, c + dc : c + dc + 160]
+        noise = cv2.GaussianBlur(rng.normal(0, 1, view.shape).astype(np.float32), (0, 0), 1.0)
+        gray = view + 2.0 * view.std() * noise / noise.std()
+        ground = whole[r - reach : r + 100 + reach, c - reach : c + 160 + reach]
+        mask = np.ones(view.shape, bool), np.ones(ground.shape, bool)
+        strips.append(Strip(gray.astype(np.float32), mask[0], ground.copy(), mask[1], reach, 2.0, (0.0, 0.0)))
+    return strips
+
+
+def mirrored(strip):
+    return replace(strip, ground=np.ascontiguousarray(strip.ground[::-1, ::-1]))
+
+
+def test_strips_that_say_little_each_are_found_together():
+    shift = np.array([9, -12])
+    strips = faint_strips(shift)
+    assert all(by_edges(strip)[3] > 0.5 for strip in strips)  # no one of them is clear
+    east_north, z, ratio = stacked(strips)
+    np.testing.assert_allclose(east_north, [18.0, 24.0], atol=3.0)
+    assert z > 5.0
+    assert ratio < 0.9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_strips_of_other_ground_are_not_found_together(seed):
+    strips = faint_strips(np.array([9, -12]), seed=seed)
+    assert stacked([mirrored(strip) for strip in strips]) is None
+    assert stacked([]) is None
+
+
+def raised_ground(height_m):
+    """Rig, pictures and map of ground that is `height_m` above where it is believed, seen from 100 m."""
+    world = FlatMap(texture(1000, seed=3))
+    rotation = np.repeat(rotation_from_angles([0.0], [-np.pi / 2], [0.0]), 5, axis=0)
+    position = np.array([[x, 0.0, 100.0] for x in np.linspace(-60, 60, 5)])
+    rig = Rig(position, rotation, np.zeros(5, np.int32), np.array([[160.0, 0, 0, 0, 0, 0, 320, 320]]))
+    columns, rows = np.meshgrid(np.arange(320), np.arange(320))
+    images = []
+    for i in range(5):
+        ground = rig.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float), height_m)
+        u, v = (ground[..., 0] + 250) / GSD - 0.5, (250 - ground[..., 1]) / GSD - 0.5
+        images.append(cv2.remap(world.values, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR))
+    flight = SimpleNamespace(
+        rig=lambda: rig,
+        leg=np.zeros(5, np.int32),
+        pictures=SimpleNamespace(gray=lambda i: np.clip(images[i], 0, 255).astype(np.uint8)),
+    )
+    return flight, LoadedMap.load(world, np.zeros(2), (-240.0, -240.0, 240.0, 240.0), GSD)
+
+
+@pytest.mark.parametrize("height_m", [-2.5, 0.0, 3.0])
+def test_the_map_tells_the_height_of_what_is_seen_obliquely(height_m):
+    flight, ground = raised_ground(height_m)
+    points, sigma = map_heights(flight, GroundModel(), ground, np.zeros((0, 2)), np.full(50, 0.1))
+    assert len(points) > 50
+    assert np.median(np.abs(points[:, 2] - height_m)) < 0.15
+    assert np.percentile(np.abs(points[:, 2] - height_m), 90) < 0.5
+    off_path = np.hypot(np.maximum(np.abs(points[:, 0]) - 60.0, 0.0), points[:, 1])
+    assert (off_path > 30.0).all()  # what is seen from above is left to the pictures
+    assert sigma.min() > 0.0
+
+
+def test_ground_that_another_vehicle_sees_better_is_left_to_it():
+    flight, ground = raised_ground(0.0)
+    other = np.array([[x, 80.0] for x in np.linspace(-100, 100, 9)])
+    points, _ = map_heights(flight, GroundModel(), ground, other, np.full(50, 0.1))
+    assert len(points)
+    assert (points[:, 1] < 45.0).all()
+    assert not len(map_heights(flight, GroundModel(), ground, other, np.zeros(0))[0])  # no ties, no heights
 
 
 def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):

@@ -26,8 +26,11 @@ DRAWN_NODES = 4_000_000
 """Nodes of the ground that pictures are drawn on; tasks get the part that they need."""
 WHOLE = 0.97
 """A height model that covers more than this of the area covers it."""
-DRAWN = FitSettings(held_out_se=1.0, floor_sigma_m=0.15)
+DRAWN = FitSettings(held_out_se=1.0)
 """The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
+DRAWN_ON_MAP = FitSettings(held_out_se=1.0, floor_sigma_m=0.15, render_flat_sd_m=0.0)
+"""Where the map told heights they hold the border, and take out what is wrong with the cameras there on flat ground, too:
+nothing is taken for noise."""
 
 
 class Run(Protocol):
@@ -96,9 +99,10 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     lift = float(np.median([s.surface.lift_m for s in states]))
     fit, off = None, 0.0
+    how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN
     if given is not None:
-        fit, off = fit_given(given, points, sigma, bounds, settings=DRAWN, most_nodes=DRAWN_NODES)
-    drawn = fit or fit_terrain(points, sigma, bounds, settings=DRAWN)
+        fit, off = fit_given(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
+    drawn = fit or fit_terrain(points, sigma, bounds, settings=how)
     return drawn.rendering(lift), _doubts(given, fit is None, off, states) if given is not None else []
 
 
