@@ -29,8 +29,8 @@ WHOLE = 0.97
 DRAWN = FitSettings(held_out_se=1.0)
 """The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
 DRAWN_ON_MAP = FitSettings(held_out_se=1.0, floor_sigma_m=0.15, render_flat_sd_m=0.0)
-"""Where the map told heights they hold the border, and take out what is wrong with the cameras there on flat ground, too:
-nothing is taken for noise."""
+"""Where the map told heights they hold the border, and on flat ground they take out what is wrong with the cameras
+there: nothing is taken for noise."""
 
 
 class Run(Protocol):
