@@ -142,7 +142,7 @@ function countLegs(features) {
 // -- jobs and exports ------------------------------------------------------------------------------------------------
 
 const jobs = new Map();
-const NAMES = { refine: "Refine", together: "Neighbours", export: "Export", coarse: "Coarse" };
+const NAMES = { refine: "Refine", together: "Neighbours", redraw: "Draw again", export: "Export", coarse: "Coarse" };
 
 function drawJobs() {
   // What is done in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
