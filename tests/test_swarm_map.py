@@ -149,7 +149,7 @@ def raised_ground(height_m):
     flight = SimpleNamespace(
         rig=lambda: rig,
         leg=np.zeros(5, np.int32),
-        pictures=SimpleNamespace(gray=lambda i: np.clip(images[i], 0, 255).astype(np.uint8)),
+        pictures=SimpleNamespace(size=(320, 320), gray=lambda i: np.clip(images[i], 0, 255).astype(np.uint8)),
     )
     return flight, LoadedMap.load(world, np.zeros(2), (-240.0, -240.0, 240.0, 240.0), GSD)
 
@@ -173,6 +173,8 @@ def test_ground_that_another_vehicle_sees_better_is_left_to_it():
     assert len(points)
     assert (points[:, 1] < 45.0).all()
     assert not len(map_heights(flight, GroundModel(), ground, other, np.zeros(0))[0])  # no ties, no heights
+    flight.leg = np.full(5, -1, np.int32)
+    assert not len(map_heights(flight, GroundModel(), ground, other, np.full(50, 0.1))[0])  # nor without a leg
 
 
 def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
@@ -250,7 +252,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
     camera = np.abs(points[:, None, 0] - rig.position[None, :, 0]).argmin(1).astype(np.int32)
     flight = SimpleNamespace(
         adjustment=SimpleNamespace(rig=rig, points=points),
-        pictures=SimpleNamespace(gray=lambda i: 255 - images[i]),
+        pictures=SimpleNamespace(size=(320, 320), gray=lambda i: 255 - images[i]),
         sights=lambda: SimpleNamespace(camera=camera),
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))

@@ -27,7 +27,7 @@ def refit(flight: Flight, surface: GroundModel) -> GroundModel:
         if surface.fit is None:
             return surface
     rig = flight.rig()
-    positions = draw_positions(rig.position[:, :2], spread_m=100.0 * _height(flight, surface) / USUAL_HEIGHT_M)
+    positions = draw_positions(rig.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M)
     gray = flight.pictures.gray
     free = ground_lift(rig, gray, positions, surface.terrain(), flight.leg).points
     surface = replace(surface, lift_m=0.0)
@@ -37,22 +37,22 @@ def refit(flight: Flight, surface: GroundModel) -> GroundModel:
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array]:
     """Ground points (K, 3) and their sigmas, one in each cell that shows its height."""
     rig = flight.rig()
-    cell = CELL_M * _height(flight, surface) / USUAL_HEIGHT_M
-    cells = _cells(rig.position[:, :2], cell, _reach(flight))
+    cell = CELL_M * flying_height(flight, surface) / USUAL_HEIGHT_M
+    cells = cells_near(rig.position[:, :2], cell, sight_reach(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0)
     found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg)
     return found.points, found.sigma_z
 
 
-def _reach(flight: Flight) -> float:
+def sight_reach(flight: Flight) -> float:
     """How far from below the camera a vehicle's pictures show the ground, to their corners, metres."""
     rig = flight.rig()
     diagonal = float(np.hypot(*flight.pictures.size))
     return float(0.5 * diagonal / rig.lens[0, 0] * np.median(rig.position[:, 2]))
 
 
-def _cells(path: Array, cell_m: float, reach_m: float) -> Array:
+def cells_near(path: Array, cell_m: float, reach_m: float) -> Array:
     """Centres of the cells within reach of the path."""
     low = np.floor((path.min(0) - reach_m) / cell_m).astype(int)
     high = np.ceil((path.max(0) + reach_m) / cell_m).astype(int)
@@ -66,6 +66,6 @@ def _cells(path: Array, cell_m: float, reach_m: float) -> Array:
     return np.asarray((np.argwhere(near) + low + 0.5) * cell_m)
 
 
-def _height(flight: Flight, surface: GroundModel) -> float:
+def flying_height(flight: Flight, surface: GroundModel) -> float:
     """Flying height above the ground, metres."""
     return max(1.0, float(np.median(flight.rig().position[:, 2])) - surface.level_m)

@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.ground import GroundModel
+from orthoswarm.swarm.groundwork import cells_near, flying_height, sight_reach
 from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.patches import texture_field
 from orthoswarm.swarm.rig import HEIGHT, WIDTH, Rig
+from orthoswarm.swarm.settle import TIE_HALF_M, accepted
 from orthoswarm.swarm.ties import match_points
 
 Array = NDArray[np.float64]
@@ -22,8 +24,7 @@ CELL_SHARE, LEAST_CELL_M = 0.06, 5.0
 """Distance of the positions, as a share of the flying height, and at least."""
 LEAST_SLOPE = 0.35
 """Horizontal distance over height from which on a view counts as oblique."""
-HALF_M, REACH_M = 10.0, 6.0
-LEAST_PEAK, LARGEST_RATIO = 0.2, 0.75
+REACH_M = 6.0
 ACROSS_M = 0.6
 """What is found must lie on the line of sight."""
 SIGMA_SHARE = 1.5
@@ -42,42 +43,35 @@ def map_heights(
         others: float64 (M, 2), where other vehicles' cameras were; ground that they see better is left to them.
         tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
     """
-    rig = flight.rig()
-    if not len(tie_sigma_m):
+    rig, own = flight.rig(), np.flatnonzero(flight.leg >= 0)
+    if not len(tie_sigma_m) or not len(own):
         return np.zeros((0, 3)), np.zeros(0)
-    height = max(1.0, float(np.median(rig.position[:, 2])) - surface.level_m)
-    cells = _positions(rig, max(CELL_SHARE * height, LEAST_CELL_M), flight.leg >= 0, others, LEAST_SLOPE * height)
-    terrain = surface.terrain()
-    points = np.column_stack([cells, terrain.height(cells)])
-    camera = _best_views(rig, points, np.flatnonzero(flight.leg >= 0))
+    cells = _positions(flight, flying_height(flight, surface), own, others)
+    points = np.column_stack([cells, surface.terrain().height(cells)])
+    camera = _best_views(rig, points, own)
     chosen = np.flatnonzero(camera >= 0)
-    half, reach = max(8, round(HALF_M / ground.gsd_m)), max(4, round(REACH_M / ground.gsd_m))
-    found = match_points(
-        rig, points, chosen, camera, flight.pictures.gray, ground, half, reach, points[:, 2], texture_field
-    )
+    half, reach = max(8, round(TIE_HALF_M / ground.gsd_m)), max(4, round(REACH_M / ground.gsd_m))
+    gray, level = flight.pictures.gray, points[:, 2]
+    found = accepted(match_points(rig, points, chosen, camera, gray, ground, half, reach, level, texture_field))
     sight = points[found.point] - rig.position[found.camera]
     out = np.hypot(sight[:, 0], sight[:, 1])
     slope = out / np.maximum(-sight[:, 2], 1.0)
     east, north = (sight[:, :2] / np.maximum(out, 1.0)[:, None]).T
     along = found.shift[:, 0] * east + found.shift[:, 1] * north
     across = found.shift[:, 1] * east - found.shift[:, 0] * north
-    good = (found.peak > LEAST_PEAK) & (found.ratio < LARGEST_RATIO) & (np.abs(across) < ACROSS_M)
-    good &= slope > LEAST_SLOPE
+    good = (np.abs(across) < ACROSS_M) & (slope > LEAST_SLOPE)
     where = points[found.point[good]].copy()
     where[:, :2] += found.shift[good]
     where[:, 2] -= along[good] / slope[good]
     return where, SIGMA_SHARE * float(np.median(tie_sigma_m)) / slope[good]
 
 
-def _positions(rig: Rig, cell_m: float, own: NDArray[np.bool_], others: Array, least_m: float) -> Array:
+def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
     """Centres (K, 2) of cells that own cameras see obliquely and nobody sees better."""
-    path = rig.position[own, :2]
-    reach = 0.5 * np.hypot(*rig.lens[0, [WIDTH, HEIGHT]]) / rig.lens[0, 0] * float(np.median(rig.position[:, 2]))
-    low, high = np.floor((path.min(0) - reach) / cell_m), np.ceil((path.max(0) + reach) / cell_m)
-    columns, rows = (np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True))
-    cells = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2) * cell_m
-    mine, _ = cKDTree(path).query(cells)
-    keep = (mine > least_m) & (mine < reach)
+    path, cell, reach = flight.rig().position[:, :2], max(CELL_SHARE * height_m, LEAST_CELL_M), sight_reach(flight)
+    cells = cells_near(path, cell, reach + cell)
+    mine, _ = cKDTree(path[own]).query(cells)
+    keep = (mine > LEAST_SLOPE * height_m) & (mine < reach)
     if len(others):
         keep &= mine <= cKDTree(others).query(cells)[0]
     return np.asarray(cells[keep])
