@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.lift import draw_positions, ground_lift
-from orthoswarm.swarm.locus import dense_ground
+from orthoswarm.swarm.locus import LARGE, SMALL, dense_ground
 
 Array = NDArray[np.float64]
 
 CELL_M = 14.0
 USUAL_HEIGHT_M = 150.0
+HIGH_FROM_M, HIGH_SHARE = 6.0, 0.25
+"""Heights over the ground, metres and a share of the flying height, between which cells without ground are searched."""
+HIGH_SMALL, HIGH_LARGE = (replace(s, baselines_m=(25.0, 50.0, 75.0)) for s in (SMALL, LARGE))
+"""What stands high is near the cameras: fewer pictures show it."""
 
 
 def refit(flight: Flight, surface: GroundModel) -> GroundModel:
@@ -34,15 +38,27 @@ def refit(flight: Flight, surface: GroundModel) -> GroundModel:
     return fit_surface(flight.adjustment, surface, extra=(free.points, free.sigma_z))
 
 
-def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array]:
-    """Ground points (K, 3) and their sigmas, one in each cell that shows its height."""
-    rig = flight.rig()
-    cell = CELL_M * flying_height(flight, surface) / USUAL_HEIGHT_M
-    cells = cells_near(rig.position[:, :2], cell, sight_reach(flight))
+def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Array]:
+    """Ground points (K, 3) and their sigmas, one in each cell that shows its height; points (H, 3) high above it."""
+    rig, height = flight.rig(), flying_height(flight, surface)
+    cells = cells_near(rig.position[:, :2], dense_cell(height), sight_reach(flight))
     if not len(cells):
-        return np.zeros((0, 3)), np.zeros(0)
-    found = dense_ground(rig, flight.pictures.gray, cells, surface.terrain(), flight.leg)
-    return found.points, found.sigma_z
+        return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
+    ground, gray = surface.terrain(), flight.pictures.gray
+    found = dense_ground(rig, gray, cells, ground, flight.leg)
+    high = np.zeros((0, 3))
+    above = 0.5 * (HIGH_FROM_M + HIGH_SHARE * height), 0.5 * (HIGH_SHARE * height - HIGH_FROM_M)
+    if above[1] > 0.0:
+        left = np.delete(cells, found.cell, axis=0)
+        raised = replace(ground, z=ground.z + np.float32(above[0]))
+        sweeps = [replace(s.at_height(height), reach_m=above[1]) for s in (HIGH_SMALL, HIGH_LARGE)]
+        high = dense_ground(rig, gray, left, raised, flight.leg, sweeps).points
+    return found.points, found.sigma_z, high
+
+
+def dense_cell(height_m: float) -> float:
+    """Distance of the cells at a flying height, metres."""
+    return CELL_M * height_m / USUAL_HEIGHT_M
 
 
 def sight_reach(flight: Flight) -> float:

@@ -10,9 +10,11 @@ from scipy.spatial import cKDTree
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Terrain
+from orthoswarm.swarm.broad import with_broad_tops
 from orthoswarm.swarm.given import Given, fit_given
 from orthoswarm.swarm.ground import ground_points
-from orthoswarm.swarm.state import VehicleState
+from orthoswarm.swarm.groundwork import dense_cell, flying_height
+from orthoswarm.swarm.state import VehicleState, seen_from_above
 from orthoswarm.swarm.surface import FitSettings
 from orthoswarm.swarm.terrain import fit_terrain
 from orthoswarm.swarm.ties import MapMatches, vote_lean
@@ -102,8 +104,11 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
     how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN
     if given is not None:
         fit, off = fit_given(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
-    drawn = fit or fit_terrain(points, sigma, bounds, settings=how)
-    return drawn.rendering(lift), _doubts(given, fit is None, off, states) if given is not None else []
+    drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
+    tops = np.concatenate([seen_from_above(s) for s in states])
+    cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
+    drawn = with_broad_tops(drawn, tops, cell, DRAWN_NODES)
+    return drawn, _doubts(given, fit is None, off, states) if given is not None else []
 
 
 def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:

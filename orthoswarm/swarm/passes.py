@@ -333,7 +333,8 @@ def second_pass(
     if not flight.sparse:
         steady_weak(flight, state.sigma_m)
     watch.lap("sigma")
-    state.dense = dense_points(flight, state.surface)
+    points, sigmas, state.high = dense_points(flight, state.surface)
+    state.dense = points, sigmas
     if ground is not None:
         paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
         more = map_heights(

@@ -294,6 +294,7 @@ def _level(states: Sequence[VehicleState]) -> None:
         adj.rig.position[:, 2] += correction
         adj.points[:, 2] += correction
         state.dense[0][:, 2] += correction
+        state.high[:, 2] += correction
 
 
 def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:

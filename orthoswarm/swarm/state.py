@@ -32,7 +32,7 @@ class VehicleState:
         roofs: raised points on the map and their heights;
             ground_shift: float64 (2,) what ground points were off by then.
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
-        dense: extra ground points (K, 3) and sigmas (K,).
+        dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
             were carry it.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
@@ -58,11 +58,18 @@ class VehicleState:
     carried: bool = False
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
     coarse_surface: GroundModel | None = None
+    high: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def lies_on_map(state: VehicleState) -> bool:
     """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
     return state.on_map or getattr(state, "carried", False)  # states that were kept by an earlier version lack it
+
+
+def seen_from_above(state: VehicleState) -> Array:
+    """Points (K, 3) at free positions, on whatever is seen there: ground, and what stands on it."""
+    high = getattr(state, "high", np.zeros((0, 3)))  # states that were kept by an earlier version lack it
+    return np.concatenate([state.dense[0], high])
 
 
 class Stopwatch:
