@@ -102,6 +102,9 @@ class Solution:
         state: what a second pass needs (refiner's own, picklable).
         warnings: findings in plain words (yaw flips, wrong altitude, lag...).
         timings: stage name -> CPU seconds, for the report.
+        gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count as
+            ground (rubble and hedges among them, so it is a little above the plane of the homographies) over the
+            focal length. NaN where not known.
     """
 
     vehicle: str
@@ -116,6 +119,7 @@ class Solution:
     state: Any = None
     warnings: list[str] = field(default_factory=list)
     timings: dict[str, float] = field(default_factory=dict)
+    gsd_m: float = float("nan")
 
 
 class MapWindow(Protocol):

@@ -208,13 +208,14 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
             "fov_deg": finite(s.fov_deg),
             "fov_sigma_deg": finite(s.fov_sigma_deg),
             "legs": len(s.legs),
+            "gsd_m": finite(getattr(s, "gsd_m", math.nan)),  # solutions that an earlier version kept lack it
         }
         for s in solutions
     ]
     for vehicle, count in used.items():
         assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
         fov = statistics.median(assumed)
-        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0})
+        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None})
     return rows
 
 

@@ -124,7 +124,7 @@ def test_the_report_has_its_keys(mapped):
     assert report == json.loads((out / "report.json").read_text())
     assert report["frames"] == {"input": 33, "used": 32, "rejected": 1}
     assert {v["id"] for v in report["vehicles"]} == {"a", "b"}
-    assert all({"id", "frames", "fov_deg", "fov_sigma_deg", "legs"} <= set(v) for v in report["vehicles"])
+    assert all({"id", "frames", "fov_deg", "fov_sigma_deg", "legs", "gsd_m"} <= set(v) for v in report["vehicles"])
     for leg in report["legs"]:
         assert {"vehicle", "first", "last", "state", "confidence", "sigma_m"} <= set(leg)
         assert leg["state"] in {"matched", "carried", "failed"}

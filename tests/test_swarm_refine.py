@@ -236,6 +236,19 @@ def test_sparse_flights_are_refined_one_at_a_time(real_data, name, fov_deg):
         assert abs(solution.fov_deg - fov_deg) < max(0.4, 1.5 * solution.fov_sigma_deg)
 
 
+@pytest.mark.slow
+def test_mean_ground_pixel_is_right_although_the_tags_say_nothing_of_the_lens(real_data):
+    frames = [replace(f, fov_hint_rad=None) for f in load([real_data("mirafiori_rtk")]).frames]
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    solution = SwarmRefiner(grid.epsg, local_origin(grid, frames)).refine(frames, [], None)
+    assert 1.0 / solution.gsd_m == pytest.approx(42.12, rel=0.01)
+    # On bare ground, the concrete slab, pixels are larger: the mean is that of rubble and hedges, too.
+    lens = solution.placed[0].camera.lens
+    heights = np.array([p.camera.position[2] for p in solution.placed])
+    slab = solution.terrain.height(np.array([p.camera.nadir for p in solution.placed]))
+    assert 40.5 < lens.focal_px / np.mean(heights - slab) < 1.0 / solution.gsd_m
+
+
 class Blank:
     """A map that shows nothing under a box (west, south, east, north)."""
 

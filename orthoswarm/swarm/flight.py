@@ -61,10 +61,12 @@ class Flight:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
         return self.adjustment.rig.take(slice(0, len(self.frames)))
 
-    def sights(self) -> Sights:
-        """Summaries of the points' observations; pictures are chosen among the vehicle's own."""
+    def sights(self, some: NDArray[np.bool_] | None = None) -> Sights:
+        """Summaries of the points' observations; pictures are chosen among the vehicle's own, or some (N,) of them."""
         adj = self.adjustment
-        return sights(adj.rig, adj.tracks, adj.points, adj.obs_weight, np.arange(len(adj.rig)) < len(self.frames))
+        own = np.zeros(len(adj.rig), bool)
+        own[: len(self.frames)] = True if some is None else some
+        return sights(adj.rig, adj.tracks, adj.points, adj.obs_weight, own)
 
 
 def open_flight(

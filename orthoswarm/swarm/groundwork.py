@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.ground import GroundModel, fit_surface
 from orthoswarm.swarm.lift import draw_positions, ground_lift
-from orthoswarm.swarm.locus import LARGE, SMALL, dense_ground
+from orthoswarm.swarm.locus import LARGE, SMALL, dense_ground, spaced
+from orthoswarm.swarm.terrain import TerrainFit
 
 Array = NDArray[np.float64]
 
@@ -20,11 +21,11 @@ HIGH_SMALL, HIGH_LARGE = (replace(s, baselines_m=(25.0, 50.0, 75.0)) for s in (S
 """What stands high is near the cameras: fewer pictures show it."""
 
 
-def refit(flight: Flight, surface: GroundModel) -> GroundModel:
+def refit(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
     """The ground fitted to the points now and to heights at free positions between them.
 
     Corners sit on raised things; small patches at free positions tell the ground itself, so that what is left over
-    (the lift) is small.
+    (the lift) is small. as_smooth: the ground stays as smooth as it is, which saves the search for its smoothness.
     """
     if surface.fit is None:
         surface = fit_surface(flight.adjustment, surface)
@@ -34,8 +35,9 @@ def refit(flight: Flight, surface: GroundModel) -> GroundModel:
     positions = draw_positions(rig.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M)
     gray = flight.pictures.gray
     free = ground_lift(rig, gray, positions, surface.terrain(), flight.leg).points
+    kappa = surface.fit.kappa if as_smooth and isinstance(surface.fit, TerrainFit) else None
     surface = replace(surface, lift_m=0.0)
-    return fit_surface(flight.adjustment, surface, extra=(free.points, free.sigma_z))
+    return fit_surface(flight.adjustment, surface, kappa=kappa, extra=(free.points, free.sigma_z))
 
 
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Array]:
@@ -54,6 +56,17 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
         sweeps = [replace(s.at_height(height), reach_m=above[1]) for s in (HIGH_SMALL, HIGH_LARGE)]
         high = dense_ground(rig, gray, left, raised, flight.leg, sweeps).points
     return found.points, found.sigma_z, high
+
+
+def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
+    """The pictures from which `dense_points` takes heights, bool (N,), and those between legs.
+
+    They show all that there is to see: what needs no more than these has fewer to decode.
+    """
+    _, camera, _ = spaced(flight.rig(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m)
+    out = np.asarray(flight.leg < 0)
+    out[camera] = True
+    return out
 
 
 def dense_cell(height_m: float) -> float:

@@ -161,7 +161,10 @@ class _Keys:
     order: NDArray[np.int64]
 
 
-def _key_cameras(rig: Rig, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
+def spaced(
+    rig: Rig, leg_of_camera: NDArray[np.integer], spacing_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
+    """Cameras at least so far apart along their legs, and each leg's last one: leg, camera and way along it, sorted."""
     camera: list[int] = []
     leg: list[int] = []
     along: list[float] = []
@@ -174,14 +177,19 @@ def _key_cameras(rig: Rig, leg_of_camera: NDArray[np.integer], spacing: float) -
         last = -np.inf
         rank = np.argsort(way)
         for i in rank:
-            if way[i] >= last + spacing or i == rank[-1]:
+            if way[i] >= last + spacing_m or i == rank[-1]:
                 camera.append(int(members[i]))
                 leg.append(int(number))
                 along.append(float(way[i]))
                 last = way[i]
+    return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
+
+
+def _key_cameras(rig: Rig, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
+    leg, camera, along = spaced(rig, leg_of_camera, spacing)
     order = np.full(len(rig), -1, np.int64)
     order[camera] = np.arange(len(camera))
-    return _Keys(np.array(camera, np.int32), np.array(leg, np.int64), np.array(along, np.float64), order)
+    return _Keys(camera, leg, along, order)
 
 
 def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:

@@ -33,7 +33,12 @@ _TRIED = 8
 
 
 def map_heights(
-    flight: Flight, surface: GroundModel, ground: LoadedMap, others: Array, tie_sigma_m: Array
+    flight: Flight,
+    surface: GroundModel,
+    ground: LoadedMap,
+    others: Array,
+    tie_sigma_m: Array,
+    pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[Array, Array]:
     """Ground points (K, 3) and one sigma of their heights (K,), where this flight's views are oblique.
 
@@ -42,8 +47,9 @@ def map_heights(
         ground: the map under it.
         others: float64 (M, 2), where other vehicles' cameras were; ground that they see better is left to them.
         tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
+        pictures: bool (N,), the ones to compare with the map, None for all on legs.
     """
-    rig, own = flight.rig(), np.flatnonzero(flight.leg >= 0)
+    rig, own = flight.rig(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
     if not len(tie_sigma_m) or not len(own):
         return np.zeros((0, 3)), np.zeros(0)
     cells = _positions(flight, flying_height(flight, surface), own, others)

@@ -67,16 +67,19 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     )
 
 
-def link_to_held(flight: Flight, held: Held, gsd_m: float, reach_px: int = 6) -> int:
+def link_to_held(
+    flight: Flight, held: Held, gsd_m: float, reach_px: int = 6, pictures: NDArray[np.bool_] | None = None
+) -> int:
     """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended.
 
     Args:
         gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
+        pictures: bool (N,), own ones to compare, None for all.
     """
     adj = flight.adjustment
     n = len(adj.rig)
     joint = _joined(adj.rig, held.rig)
-    seen = flight.sights()
+    seen = flight.sights(pictures)
     usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + held.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)

@@ -19,9 +19,10 @@ from orthoswarm.swarm.findings import contradiction
 from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
 from orthoswarm.swarm.given import Given
 from orthoswarm.swarm.ground import GroundModel, fit_surface
-from orthoswarm.swarm.groundwork import dense_points
+from orthoswarm.swarm.groundwork import dense_points, spaced_pictures
 from orthoswarm.swarm.heights import contradicted, height_doubt, release_heights
 from orthoswarm.swarm.legs import leads_one_way
+from orthoswarm.swarm.loadedmap import LoadedMap
 from orthoswarm.swarm.mapheights import map_heights
 from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
 from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
@@ -300,18 +301,38 @@ def second_pass(
     watch = Stopwatch()
     flight = state.flight
     state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
+    # The pictures were let go since: few of those that were followed are enough, and must be decoded again.
+    pictures = None if flight.sparse else spaced_pictures(flight, state.surface)
     held = held_cameras(state, others)
     if held is not None:
-        link_to_held(flight, held, working_gsd(flight))
+        link_to_held(flight, held, working_gsd(flight), pictures=pictures)
     watch.lap("links to neighbours")
     ground = None
     if state.on_map and basemap is not None:
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties)
+        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
     else:
         for _ in range(4):
             flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
     watch.lap("second adjustment")
+    _own_errors(state, others, ground)
+    release(flight)
+    if not flight.sparse:
+        steady_weak(flight, state.sigma_m)
+    watch.lap("sigma")
+    _denser_ground(state, others, ground, pictures)
+    watch.lap("denser terrain")
+    flight.pictures.drop()
+    for other in others:
+        other.flight.pictures.drop()
+    for name, seconds in watch.seconds.items():
+        state.timings[name] = state.timings.get(name, 0.0) + seconds
+    return state
+
+
+def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: LoadedMap | None) -> None:
+    """The frames' sigmas and that of the field of view, with what the map's ties tell of errors beside them."""
+    flight = state.flight
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
     floor = 0.05
@@ -329,22 +350,20 @@ def second_pass(
         off = unexplained(flight.leg, state.matches.camera, adj.tie_residual)
         off[off < COHERENT * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)
-    release(flight)
-    if not flight.sparse:
-        steady_weak(flight, state.sigma_m)
-    watch.lap("sigma")
+
+
+def _denser_ground(
+    state: VehicleState,
+    others: Sequence[VehicleState],
+    ground: LoadedMap | None,
+    pictures: NDArray[np.bool_] | None,
+) -> None:
+    """Ground points for drawing: between the tracks, and where only oblique views show it, from the map."""
+    flight = state.flight
     points, sigmas, state.high = dense_points(flight, state.surface)
     state.dense = points, sigmas
     if ground is not None:
         paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
-        more = map_heights(
-            flight, state.surface, ground, np.concatenate([np.zeros((0, 2)), *paths]), state.ties.sigma_m
-        )
+        elsewhere = np.concatenate([np.zeros((0, 2)), *paths])
+        more = map_heights(flight, state.surface, ground, elsewhere, state.ties.sigma_m, pictures)
         state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])
-    watch.lap("denser terrain")
-    flight.pictures.drop()
-    for other in others:
-        other.flight.pictures.drop()
-    for name, seconds in watch.seconds.items():
-        state.timings[name] = state.timings.get(name, 0.0) + seconds
-    return state

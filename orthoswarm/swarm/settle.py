@@ -63,20 +63,27 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
 
 
 def tie_round(
-    flight: Flight, surface: GroundModel, ground: LoadedMap, cell_m: float, reach_m: float, half_m: float = TIE_HALF_M
+    flight: Flight,
+    surface: GroundModel,
+    ground: LoadedMap,
+    cell_m: float,
+    reach_m: float,
+    half_m: float = TIE_HALF_M,
+    pictures: NDArray[np.bool_] | None = None,
 ) -> MapMatches:
     """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`.
 
-    Ground is compared by its texture: strong edges belong to what leans and casts shadows.
+    Ground is compared by its texture: strong edges belong to what leans and casts shadows. pictures: bool (N,), the
+    ones to compare, None for all.
     """
     adj = flight.adjustment
-    seen = flight.sights()
+    seen = flight.sights(pictures)
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
     fewest = 2 if flight.sparse else 3
     usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
-    return _ground_matches(flight, surface, ground, chosen, reach_m, half_m, texture_field)
+    return _ground_matches(flight, surface, ground, chosen, seen.camera, reach_m, half_m, texture_field)
 
 
 def _ground_matches(
@@ -84,6 +91,7 @@ def _ground_matches(
     surface: GroundModel,
     ground: LoadedMap,
     chosen: NDArray[np.integer],
+    camera: NDArray[np.int32],
     reach_m: float,
     half_m: float,
     field: Callable[[Floats], Floats],
@@ -91,8 +99,7 @@ def _ground_matches(
     adj = flight.adjustment
     half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
     level = surface.height(adj.points[:, :2])
-    camera, gray = flight.sights().camera, flight.pictures.gray
-    return match_points(adj.rig, adj.points, chosen, camera, gray, ground, half, reach, level, field)
+    return match_points(adj.rig, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field)
 
 
 def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float) -> Array:
@@ -103,7 +110,9 @@ def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: 
     taking it off extrapolates to no edges at all.
     """
     some = matches.take(np.arange(0, len(matches.point), max(1, -(-len(matches.point) // MOST_FOR_PULL))))
-    edges = accepted(_ground_matches(flight, surface, ground, some.point, reach_m, TIE_HALF_M, gradient_field))
+    camera = np.full(len(flight.adjustment.points), -1, np.int32)
+    camera[some.point] = some.camera
+    edges = accepted(_ground_matches(flight, surface, ground, some.point, camera, reach_m, TIE_HALF_M, gradient_field))
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
     if len(away) < FEWEST_FOR_PULL:
@@ -253,29 +262,41 @@ def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundMod
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
         if k in (1, 3):
-            surface = refit(flight, surface)
+            surface = refit(flight, surface, as_smooth=k == 3)
     roofs = roof_round(flight, surface, ground)
     ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    surface = refit(flight, surface, as_smooth=True)
     surface, ties, matches = _second_round(flight, ground, surface, 3)
     return Settled(surface, ties, matches, roofs, ground_shift, links)
 
 
 def resettle(
-    flight: Flight, ground: LoadedMap, surface: GroundModel, ties: Ties
+    flight: Flight,
+    ground: LoadedMap,
+    surface: GroundModel,
+    ties: Ties,
+    pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, Ties, MapMatches]:
-    """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved)."""
+    """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved).
+
+    pictures: bool (N,), the ones to compare with the map, None for all.
+    """
     for _ in range(2):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    return _second_round(flight, ground, surface, 4)
+    return _second_round(flight, ground, refit(flight, surface), 4, pictures)
 
 
 def _second_round(
-    flight: Flight, ground: LoadedMap, surface: GroundModel, rounds: int
+    flight: Flight,
+    ground: LoadedMap,
+    surface: GroundModel,
+    rounds: int,
+    pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, Ties, MapMatches]:
-    surface = refit(flight, surface)  # the points moved, with their level too: ties are compared on the ground as it is
-    matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, NEAR_M))
+    """Ties compared on the ground as it is now (fitted by the caller: the points moved, with their level, too)."""
+    matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, NEAR_M, pictures=pictures))
     matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, NEAR_M))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
@@ -283,7 +304,7 @@ def _second_round(
         if k in (0, 1):
             ties = weighed(ties, flight.adjustment.tie_residual)
         if k == rounds - 2:
-            surface = refit(flight, surface)
+            surface = refit(flight, surface, as_smooth=True)
     return surface, ties, matches
 
 

@@ -10,7 +10,7 @@ from orthoswarm.camera import fov_rad
 from orthoswarm.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight
-from orthoswarm.swarm.ground import GroundModel
+from orthoswarm.swarm.ground import GroundModel, ground_points
 from orthoswarm.swarm.rig import CX, CY, WIDTH, F, Rig
 from orthoswarm.swarm.ties import MapMatches
 from orthoswarm.swarm.weak import ENOUGH, observations_per_camera
@@ -121,7 +121,17 @@ def to_solution(
         state,
         list(flight.warnings),
         dict(state.timings),
+        _mean_gsd(rig, flight),
     )
+
+
+def _mean_gsd(rig: Rig, flight: Flight) -> float:
+    """Mean height above the ground's points over the focal length (rig: full resolution), metres a pixel."""
+    points, _ = ground_points(flight.adjustment)
+    if not len(points):
+        return float("nan")
+    heights = flight.rig().position[:, 2]  # points and cameras of one state, also where the rig is that before the map
+    return float((heights.mean() - points[:, 2].mean()) / rig.lens[0, F])
 
 
 def full_resolution(rig: Rig, flight: Flight) -> Rig:
