@@ -34,10 +34,10 @@ def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bou
 
 
 def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:
-    """Height of the plane on which homographies are stated: the middle of the ground below the cameras."""
+    """Height of the plane on which homographies are stated: the middle of the bare ground below the cameras."""
     if terrain is None or not placed:
         return 0.0
-    return float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+    return float(np.median(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))))
 
 
 def from_takeoff(placed: Sequence[PlacedFrame], level: float) -> tuple[Sequence[PlacedFrame], float]:

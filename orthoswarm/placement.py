@@ -1,7 +1,7 @@
 """Placed frames and what belongs to them: the refiner's result and the renderer's input."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.camera import Camera
 from orthoswarm.frame import Frame
+from orthoswarm.oldpickles import set_fields
 
 Array = NDArray[np.float64]
 Stage = Literal["realtime", "coarse", "fine"]
@@ -60,17 +61,27 @@ class Terrain:
         west: easting of node column 0; south: northing of node row 0 (rows go north), metres.
         step_m: distance of nodes.
         z: float32 (rows, columns), metres over the datum of the cameras.
+        bare: the same without what is broad and stands on the ground (halls, woods); None where z has no such tops.
     """
 
     west: float
     south: float
     step_m: float
     z: NDArray[np.float32]
+    bare: NDArray[np.float32] | None = None
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
 
     @classmethod
     def flat(cls, z_m: float = 0.0) -> "Terrain":
         """A level plane."""
         return cls(0.0, 0.0, 1e6, np.full((2, 2), z_m, np.float32))
+
+    def bare_ground(self) -> "Terrain":
+        """The ground without the tops of what stands on it."""
+        return self if self.bare is None else replace(self, z=self.bare, bare=None)
 
     def height(self, east_north: NDArray[Any]) -> Array:
         """Heights (...,) at ground points (..., 2)."""
@@ -120,6 +131,10 @@ class Solution:
     warnings: list[str] = field(default_factory=list)
     timings: dict[str, float] = field(default_factory=dict)
     gsd_m: float = float("nan")
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
 
 
 class MapWindow(Protocol):

@@ -208,7 +208,7 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
             "fov_deg": finite(s.fov_deg),
             "fov_sigma_deg": finite(s.fov_sigma_deg),
             "legs": len(s.legs),
-            "gsd_m": finite(getattr(s, "gsd_m", math.nan)),  # solutions that an earlier version kept lack it
+            "gsd_m": finite(s.gsd_m),
         }
         for s in solutions
     ]

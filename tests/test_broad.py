@@ -40,6 +40,8 @@ def test_hall_is_drawn_on_its_roof_and_the_street_beside_it_on_the_ground() -> N
     there = np.column_stack([x, y])[beside]
     assert np.abs(drawn.height(there) - ground.height(there)).max() < 0.05
     assert drawn.step_m == NODE_M
+    middle = np.array([300.0, 200.0])
+    assert abs(float(drawn.bare_ground().height(middle) - ground.height(middle))) < 0.01
 
 
 def test_stand_keeps_its_slope() -> None:

@@ -6,6 +6,7 @@ and 40 degrees off the vertical, would be drawn 8 m beside its place.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,9 +52,8 @@ def with_broad_tops(ground: Terrain, points: Array, cell_m: float, most_nodes: i
     while parts > 1 and ground.z.size * parts**2 > most_nodes:
         parts -= 1
     fine = _finer(ground, parts)
-    return Terrain(
-        fine.west, fine.south, fine.step_m, fine.z + _spread(points[counts, :2], top[counts], fine, HOLE_CELLS * cell_m)
-    )
+    tops = _spread(points[counts, :2], top[counts], fine, HOLE_CELLS * cell_m)
+    return replace(fine, z=fine.z + tops, bare=fine.z)
 
 
 def _broad(xy: Array, over: Array, reach_m: float) -> tuple[Array, NDArray[np.bool_]]:

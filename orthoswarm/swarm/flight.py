@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from orthoswarm.camera import fov_rad
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
+from orthoswarm.oldpickles import set_fields
 from orthoswarm.swarm.adjust import Adjustment, log_rotation
 from orthoswarm.swarm.calibrate import Calibration, calibrate
 from orthoswarm.swarm.heights import FREE_SIGMA_M
@@ -56,6 +58,10 @@ class Flight:
     warnings: list[str]
     sparse: bool = False
     focal_sigma: float = 0.0
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
 
     def rig(self) -> Rig:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""

@@ -1,11 +1,12 @@
 """The ground under one vehicle during its adjustment: fitted to the points, used as their height prior."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.oldpickles import set_fields
 from orthoswarm.placement import Terrain
 from orthoswarm.swarm.adjust import Adjustment, Ground
 from orthoswarm.swarm.given import Given, GivenFit, fit_given
@@ -34,11 +35,9 @@ class GroundModel:
     given: Given | None = None
     contradicted_m: float = 0.0
 
-    def __setstate__(self, state: list[Any]) -> None:
-        """From a pickle; what an earlier version kept has fewer fields, and the others their defaults."""
-        own = fields(self)
-        for f, value in zip(own, [*state, *(f.default for f in own[len(state) :])], strict=True):
-            object.__setattr__(self, f.name, value)
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
 
     def height(self, xy: Array) -> Array:
         """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""

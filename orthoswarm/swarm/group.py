@@ -117,7 +117,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     Each vehicle's ground belongs to its own cameras, on a level that no other shares yet, and the nearest camera is the
     one that is drawn. None where no vehicle has found its ground.
     """
-    found = [getattr(s, "coarse_surface", None) for s in states]  # states of an earlier version lack it
+    found = [s.coarse_surface for s in states]
     grounds = [None if surface is None or surface.fit is None else surface.terrain() for surface in found]
     steps = [ground.step_m for ground in grounds if ground is not None]
     if not steps:

@@ -279,7 +279,7 @@ def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     if flight.sparse and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
         return ONE_WAY_FOV_SIGMA_DEG
     rig = flight.rig()
-    held = getattr(flight, "focal_sigma", 0.0)  # flights that were kept by an earlier version lack it
+    held = flight.focal_sigma
     share = float(np.hypot(held, DECENTRED_SHARE if strong_lens(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m

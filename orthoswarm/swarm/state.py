@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass, field, replace
 from time import process_time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.camera import fov_rad
+from orthoswarm.oldpickles import set_fields
 from orthoswarm.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.swarm.adjust import Ties
 from orthoswarm.swarm.flight import Flight
@@ -60,16 +62,19 @@ class VehicleState:
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
+
 
 def lies_on_map(state: VehicleState) -> bool:
     """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
-    return state.on_map or getattr(state, "carried", False)  # states that were kept by an earlier version lack it
+    return state.on_map or state.carried
 
 
 def seen_from_above(state: VehicleState) -> Array:
     """Points (K, 3) at free positions, on whatever is seen there: ground, and what stands on it."""
-    high = getattr(state, "high", np.zeros((0, 3)))  # states that were kept by an earlier version lack it
-    return np.concatenate([state.dense[0], high])
+    return np.concatenate([state.dense[0], state.high])
 
 
 class Stopwatch:
