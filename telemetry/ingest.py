@@ -6,7 +6,9 @@ angles, and an absolute altitude never becomes a height.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 
 from orthoswarm.errors import InputError
@@ -65,9 +67,12 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         if progress is not None:
             progress("reading photos", done, total)
 
-    for folder in found.folders:
-        if folder.pictures:
-            _photo_folder(folder, found, tables, logs, options, advance, result)
+    # One sequence over all folders: with a call for each, processes would wait at every folder's end.
+    pictures = [picture for folder in found.folders for picture in folder.pictures]
+    with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
+        for folder in found.folders:
+            if folder.pictures:
+                _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result)
         if folder.videos or folder.subtitles:
             read_videos(folder, found, logs, options, progress, result)
     _check_vehicles(result)
@@ -112,19 +117,17 @@ def _table_findings(path: Path, folder: Path, table: posetable.PoseTable, found:
 
 def _photo_folder(
     folder: Folder,
+    tags: Iterable[PhotoTags | NotAPicture | None],
     found: Discovery,
     tables: Sequence[tuple[Path, str, posetable.PoseTable]],
     logs: Sequence[LogSource],
-    options: LoadOptions,
-    advance: Callable[[int], None],
     result: Survey,
 ) -> None:
-    """Read one folder's photos into one source."""
+    """Make one folder's photos, of which these are the tags, one source."""
     at_root = folder.path == found.root
     source = SourceInfo(folder.path.name if at_root else found.name(folder.path), "photos")
     groups: dict[str, list[PhotoTags]] = {}
     seen = 0
-    tags = read_photos(folder.pictures, workers=options.workers, run=options.run, progress=advance)
     for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
             continue

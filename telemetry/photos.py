@@ -5,7 +5,7 @@ yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,7 +84,7 @@ def read_photo(path: Path) -> PhotoTags | None:
 
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
-) -> Iterator[PhotoTags | NotAPicture | None]:
+) -> Generator[PhotoTags | NotAPicture | None, None, None]:
     """Read many photos in parallel, in order; a file that is no picture gives its exception.
 
     Args:
