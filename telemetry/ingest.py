@@ -73,8 +73,8 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         for folder in found.folders:
             if folder.pictures:
                 _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result)
-        if folder.videos or folder.subtitles:
-            read_videos(folder, found, logs, options, progress, result)
+            if folder.videos or folder.subtitles:
+                read_videos(folder, found, logs, options, progress, result)
     _check_vehicles(result)
     return result
 

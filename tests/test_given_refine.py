@@ -62,11 +62,11 @@ def through_pickle(function, items):
 
 
 def off_ground(refined, scene, terrain=None):
-    """The drawn ground under the pictures (or another) less the true one, about its median."""
+    """The bare ground under the pictures (or another) less the true one, about its median."""
     heights, transform = scene[4]
     xy = np.concatenate([[p.camera.nadir for p in s.placed] for s in refined.fine])
     column, row = (np.floor(v).astype(int) for v in ~transform * (xy[:, 0], xy[:, 1]))
-    error = (terrain or refined.terrain).height(xy) - heights[row, column]
+    error = (terrain or refined.terrain.bare_ground()).height(xy) - heights[row, column]
     return error - np.median(error)
 
 
