@@ -1,9 +1,7 @@
 """The two passes of one vehicle: by itself, then on the common level beside neighbours that are held."""
 
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,24 +17,18 @@ from orthoswarm.swarm.findings import contradiction
 from orthoswarm.swarm.flight import FEW, Flight, free_strong_lens, open_flight, strong_lens, weigh_records
 from orthoswarm.swarm.given import Given
 from orthoswarm.swarm.ground import GroundModel, fit_surface
-from orthoswarm.swarm.groundwork import dense_points, spaced_pictures
 from orthoswarm.swarm.heights import contradicted, height_doubt, release_heights
 from orthoswarm.swarm.legs import leads_one_way
-from orthoswarm.swarm.loadedmap import LoadedMap
-from orthoswarm.swarm.mapheights import map_heights
-from orthoswarm.swarm.neighbours import held_cameras, link_to_held, release
-from orthoswarm.swarm.onmap import coarse_fit, second_look, shift_cameras
+from orthoswarm.swarm.onmap import CoarseFit, coarse_fit, second_look, shift_cameras
 from orthoswarm.swarm.rig import WIDTH, F
-from orthoswarm.swarm.settle import load_map, map_gsd, resettle, settle, working_gsd
-from orthoswarm.swarm.sigma import frame_sigmas, map_doubt, unexplained
+from orthoswarm.swarm.settle import settle
+from orthoswarm.swarm.sigma import frame_sigmas
 from orthoswarm.swarm.snapshot import Snapshot
 from orthoswarm.swarm.sparse_flight import open_sparse_flight
-from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map
+from orthoswarm.swarm.state import Stopwatch, VehicleState
 from orthoswarm.swarm.ties import MapMatches
-from orthoswarm.swarm.weak import steady_weak
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 
 TAKEOFF_LEVEL_M = 2.0
@@ -55,13 +47,12 @@ NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
 """Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
 DECENTRED_SHARE = 0.02
 """What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
+NOT_FOUND = "no part of this flight was found on the map; it lies in the GPS frame"
 REST_STEPS, FREE_STEPS, FREE_ROUNDS = 3, 6, 4
 AT_REST = 0.03
 """A focal length that still moves by this share in three steps is not at rest."""
 AGREES = 0.08
 """Pictures that, set free, come to rest within this share of the recorded height do not contradict it."""
-COHERENT = 2.0
-"""Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +95,18 @@ def solo(
 
 
 def followed(
-    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
+    frames: Sequence[Frame],
+    *,
+    epsg: int,
+    origin: Array,
+    basemap: MapWindow | None,
+    options: Options,
+    learned: bool = True,
 ) -> VehicleState | None:
-    """Refine one vehicle by itself; None where its pictures cannot be followed from one to the next."""
+    """Refine one vehicle by itself; None where its pictures cannot be followed from one to the next.
+
+    learned: where edges do not find it on the map, ask learned matching at once (else see `look_again`).
+    """
     watch = Stopwatch()
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
@@ -119,16 +119,24 @@ def followed(
         return None  # the recorded height that is behind such a lens cannot be right
     if len(frames) < FEW and strong_lens(flight):
         return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
-    return from_flight(flight, surface, origin, basemap, watch)
+    return from_flight(flight, surface, origin, basemap, watch, learned)
 
 
-def matched(flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options) -> VehicleState:
+def matched(
+    flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options, learned: bool = True
+) -> VehicleState:
     """Refine one vehicle whose photos were matched and adjusted together with those of others."""
-    return from_flight(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, Stopwatch())
+    surface = fit_surface(flight.adjustment, options.ground(origin))
+    return from_flight(flight, surface, origin, basemap, Stopwatch(), learned)
 
 
 def from_flight(
-    flight: Flight, surface: GroundModel, origin: Array, basemap: MapWindow | None, watch: Stopwatch
+    flight: Flight,
+    surface: GroundModel,
+    origin: Array,
+    basemap: MapWindow | None,
+    watch: Stopwatch,
+    learned: bool = True,
 ) -> VehicleState:
     """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
     adj = flight.adjustment
@@ -146,7 +154,15 @@ def from_flight(
     )  # fmt: skip
     if basemap is not None:
         state.had_map = True
-        _onto_map(state, basemap, origin, watch)
+        fit = coarse_fit(flight, basemap, origin)
+        if fit is None and learned:
+            fit = second_look(flight, basemap, origin)
+        watch.lap("coarse registration")
+        state.unfound = fit is None
+        if fit is not None:
+            _onto_map(state, fit, basemap, origin, watch)
+        elif learned:
+            flight.warnings.append(NOT_FOUND)
     flight.pictures.drop()
     state.timings = watch.seconds
     return state
@@ -234,15 +250,38 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     return surface, focal_px
 
 
-def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
-    flight = state.flight
-    fit = coarse_fit(flight, basemap, origin)
-    if fit is None:
-        fit = second_look(flight, basemap, origin)
+def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """Where learned matching finds a flight that edges did not find on the map.
+
+    PyTorch and the network stay in memory, 400 MB: so one process looks for all flights, one after the other.
+    """
+    watch = Stopwatch()
+    fit = second_look(state.flight, basemap, origin)
+    state.flight.pictures.drop()
     watch.lap("coarse registration")
-    if fit is None:
-        flight.warnings.append("no part of this flight was found on the map; it lies in the GPS frame")
-        return
+    watch.add_to(state.timings)
+    return fit
+
+
+def placed_again(
+    item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
+) -> VehicleState:
+    """A flight that edges did not find, after `look_again`: settled where it was found, else told of."""
+    state, fit = item
+    if fit is None or basemap is None:
+        state.flight.warnings.append(NOT_FOUND)
+        return state
+    watch = Stopwatch()
+    state.unfound = False
+    _onto_map(state, fit, basemap, origin, watch)
+    state.flight.pictures.drop()
+    watch.add_to(state.timings)
+    return state
+
+
+def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
+    """Settle a flight where it was found; it stays as it was where that would need another field of view."""
+    flight = state.flight
     before, alone, sigma = Snapshot.of(flight.adjustment), state.surface, state.fov_sigma_deg
     shift_cameras(flight, fit.correction)
     settled = settle(flight, basemap, origin, state.surface)
@@ -250,7 +289,7 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
         float(np.degrees(fov_rad(float(a.rig.lens[0, F]), flight.pictures.size[0])))
         for a in (before, flight.adjustment)
     )
-    if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, _level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
+    if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
         flight.adjustment = before.restored()
         flight.warnings.append(
             f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
@@ -268,7 +307,7 @@ def _onto_map(state: VehicleState, basemap: MapWindow, origin: Array, watch: Sto
     watch.lap("ties and absolute")
 
 
-def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
+def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     """How far the field of view may be off by what the adjustment takes for granted.
 
     The takeoff spot need not be at the ground's middle level: over flat ground straight down only f / h is observable;
@@ -287,83 +326,3 @@ def _level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
         share = float(np.linalg.norm([share, level, height_doubt(flight.adjustment)]))
     half = 0.5 * fov_rad(float(rig.lens[0, F]), int(rig.lens[0, WIDTH]))
     return float(np.degrees(np.sin(2 * half))) * share
-
-
-def second_pass(
-    item: tuple[VehicleState, list[VehicleState], float],
-    *,
-    basemap: MapWindow | None,
-    origin: Array,
-) -> VehicleState:
-    """One vehicle again: common level, links into held neighbours, fresh ties; then denser ground."""
-    state, others, correction = item
-    state = deepcopy(state)  # neighbours see this vehicle as its solo pass left it, in whatever order they are run
-    watch = Stopwatch()
-    flight = state.flight
-    state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
-    # The pictures were let go since: few of those that were followed are enough, and must be decoded again.
-    pictures = None if flight.sparse else spaced_pictures(flight, state.surface)
-    held = held_cameras(state, others)
-    if held is not None:
-        link_to_held(flight, held, working_gsd(flight), pictures=pictures)
-    watch.lap("links to neighbours")
-    ground = None
-    if state.on_map and basemap is not None:
-        ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
-    else:
-        for _ in range(4):
-            flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
-    watch.lap("second adjustment")
-    _own_errors(state, others, ground)
-    release(flight)
-    if not flight.sparse:
-        steady_weak(flight, state.sigma_m)
-    watch.lap("sigma")
-    _denser_ground(state, others, ground, pictures)
-    watch.lap("denser terrain")
-    flight.pictures.drop()
-    for other in others:
-        other.flight.pictures.drop()
-    for name, seconds in watch.seconds.items():
-        state.timings[name] = state.timings.get(name, 0.0) + seconds
-    return state
-
-
-def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: LoadedMap | None) -> None:
-    """The frames' sigmas and that of the field of view, with what the map's ties tell of errors beside them."""
-    flight = state.flight
-    adj = flight.adjustment
-    ties = state.ties if state.on_map else None
-    floor = 0.05
-    if ground is not None:
-        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
-    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
-    state.fov_sigma_deg = float(np.hypot(fov_sigma, _level_sigma_deg(flight, state.surface)))
-    state.sigma_m = sigma[: len(flight.frames)]
-    if not lies_on_map(state):
-        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours are no better than oneself
-    elif not state.on_map:
-        theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
-        state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
-    if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
-        off = unexplained(flight.leg, state.matches.camera, adj.tie_residual)
-        off[off < COHERENT * state.sigma_m] = 0.0
-        state.sigma_m = np.hypot(state.sigma_m, off)
-
-
-def _denser_ground(
-    state: VehicleState,
-    others: Sequence[VehicleState],
-    ground: LoadedMap | None,
-    pictures: NDArray[np.bool_] | None,
-) -> None:
-    """Ground points for drawing: between the tracks, and where only oblique views show it, from the map."""
-    flight = state.flight
-    points, sigmas, state.high = dense_points(flight, state.surface)
-    state.dense = points, sigmas
-    if ground is not None:
-        paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
-        elsewhere = np.concatenate([np.zeros((0, 2)), *paths])
-        more = map_heights(flight, state.surface, ground, elsewhere, state.ties.sigma_m, pictures)
-        state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])

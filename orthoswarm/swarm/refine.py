@@ -24,7 +24,8 @@ from orthoswarm.swarm.beside import lay_beside
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.group import Run, coarse_terrain, common_terrain, local_origin, neighbours_of, pooled_lean, serial
 from orthoswarm.swarm.levels import level_network
-from orthoswarm.swarm.passes import Options, followed, matched, read_frame, second_pass, solo
+from orthoswarm.swarm.passes import Options, followed, look_again, matched, placed_again, read_frame, solo
+from orthoswarm.swarm.second import second_pass
 from orthoswarm.swarm.sparse_joint import open_sparse_flights
 from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map, to_solution
 from orthoswarm.swarm.units import merge_units, split_units
@@ -202,7 +203,8 @@ def _first_passes(
     progress: Callable[[str, int, int], None] | None,
 ) -> list[VehicleState]:
     """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first."""
-    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options)
+    # The network for the second look is loaded by one process only, afterwards.
+    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
@@ -214,11 +216,34 @@ def _first_passes(
         flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, run, progress)
         watch.lap("tracks")
         for k, state in zip(
-            waiting, run(partial(matched, origin=origin, basemap=basemap, options=options), flights), strict=True
+            waiting,
+            run(partial(matched, origin=origin, basemap=basemap, options=options, learned=False), flights),
+            strict=True,
         ):
             state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
             states[k] = state
-    return [state for state in states if state is not None]
+    return _second_looks([state for state in states if state is not None], basemap, origin, run, progress)
+
+
+def _second_looks(
+    states: list[VehicleState],
+    basemap: MapWindow | None,
+    origin: Array,
+    run: Run,
+    progress: Callable[[str, int, int], None] | None,
+) -> list[VehicleState]:
+    """Learned matching for the flights that edges did not find, here, one after the other; then settled as usual."""
+    lost = [k for k, state in enumerate(states) if state.unfound]
+    found = []
+    for n, k in enumerate(lost):
+        found.append(None if basemap is None else look_again(states[k], basemap, origin))
+        if progress:
+            progress("second look", n + 1, len(lost))
+    items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
+    out = list(states)
+    for k, state in zip(lost, run(partial(placed_again, basemap=basemap, origin=origin), items), strict=True):
+        out[k] = state
+    return out
 
 
 def lay_lost_beside(

@@ -33,6 +33,7 @@ class VehicleState:
         surface: its ground. ties, matches: of the last round (empty without a map).
         roofs: raised points on the map and their heights;
             ground_shift: float64 (2,) what ground points were off by then.
+        unfound: True where there is a map and the flight was not found on it yet.
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
@@ -61,6 +62,7 @@ class VehicleState:
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    unfound: bool = False
 
     def __setstate__(self, state: Any) -> None:
         """From a pickle, perhaps of an earlier version."""
@@ -89,6 +91,11 @@ class Stopwatch:
         now = process_time()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
+
+    def add_to(self, timings: dict[str, float]) -> None:
+        """Add what was measured to others' times."""
+        for name, seconds in self.seconds.items():
+            timings[name] = timings.get(name, 0.0) + seconds
 
 
 def to_solution(

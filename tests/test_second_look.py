@@ -1,0 +1,84 @@
+"""Flights that edges do not find on the map: learned matching asks for them in one process, then they are settled."""
+
+import csv
+import pickle
+
+import numpy as np
+import pytest
+
+from orthoswarm.basemap import Basemap
+from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.swarm import passes
+from orthoswarm.swarm.refine import SwarmRefiner, local_origin, refine_all
+from orthoswarm.twin.make import make_twin
+from orthoswarm.twin.presets import spec
+from telemetry import load
+from tests.test_swarm_refine import errors
+
+LOST = "uav01"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("twin") / "tiny"
+    make_twin(spec("tiny", seed=5), folder)
+    frames = load([folder / "photos"]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
+    with (folder / "truth" / "frames.csv").open() as file:
+        truth = {row["image"]: row for row in csv.DictReader(file)}
+    return vehicles, grid, Basemap.open(folder / "basemap.tif", grid.epsg), truth
+
+
+@pytest.fixture
+def blind(monkeypatch):
+    """Edges do not find one vehicle, the second look does (here: edges again); gives the vehicles it was asked for."""
+    by_edges, asked = passes.coarse_fit, []
+
+    def first(flight, basemap, origin):
+        return None if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
+
+    def second(flight, basemap, origin):
+        asked.append(flight.frames[0].vehicle)
+        return by_edges(flight, basemap, origin)
+
+    monkeypatch.setattr(passes, "coarse_fit", first)
+    monkeypatch.setattr(passes, "second_look", second)
+    return asked
+
+
+def through_pickle(function, items):
+    """Run tasks as processes would; one that asks the second look would show."""
+    for item in items:
+        f, i = pickle.loads(pickle.dumps((function, item)))
+        yield pickle.loads(pickle.dumps(f(i)))
+
+
+def test_a_flight_that_only_the_second_look_finds_is_mapped_as_well(scene, blind):
+    vehicles, grid, basemap, truth = scene
+    steps = []
+    refined = refine_all(
+        vehicles, basemap, grid, run=through_pickle, progress=lambda what, done, of: steps.append((what, done, of))
+    )
+    assert blind == [LOST]
+    assert ("second look", 1, 1) in steps
+    lost = next(s for s in refined.fine if s.vehicle == LOST)
+    assert any(leg.state == "matched" for leg in lost.legs)
+    assert not any("no part of this flight" in w for w in lost.warnings)
+    assert np.median(errors(lost, truth, grid)) < 0.3
+
+
+def test_a_flight_that_nothing_finds_is_told_of_once(scene, blind, monkeypatch):
+    vehicles, grid, basemap, _ = scene
+    monkeypatch.setattr(passes, "second_look", lambda *_: None)
+    refined = refine_all({LOST: vehicles[LOST]}, basemap, grid)
+    assert sum("no part of this flight" in w for w in refined.fine[0].warnings) == 1
+    assert {leg.state for leg in refined.fine[0].legs} == {"failed"}
+
+
+def test_a_single_vehicle_asks_at_once(scene, blind):
+    vehicles, grid, basemap, truth = scene
+    origin = local_origin(grid, vehicles[LOST])
+    solution = SwarmRefiner(grid.epsg, origin).refine(vehicles[LOST], [], basemap)
+    assert blind == [LOST]
+    assert np.median(errors(solution, truth, grid)) < 0.5
