@@ -24,6 +24,8 @@ REACH_M, REACH_CELLS = 25.0, 1.8
 """Half of what counts as broad, metres; at least so many distances of the points."""
 FEWEST, MOST_SHARE = 5, 0.5
 """So many points within that reach, and this share of them, must stand as high."""
+TALL_M, TALL_SHARE = 6.0, 0.7
+"""From this height on it must be this share: haze that drifts along has a false parallax where the ground fails."""
 RIM_SHARE = 0.3
 """At a rim this share of the points within reach must belong to something broad and stand as high."""
 AS_HIGH_M = 4.0
@@ -65,7 +67,8 @@ def _broad(xy: Array, over: Array, reach_m: float) -> tuple[Array, NDArray[np.bo
         own, other = _pairs(tree, xy[some], reach_m)
         as_high = np.abs(over[other] - over[some][own]) < AS_HIGH_M
         count = np.bincount(own, minlength=len(some))
-        core[some] = (count >= FEWEST) & (np.bincount(own, as_high, len(some)) >= MOST_SHARE * count)
+        most = np.where(np.abs(over[some]) > TALL_M, TALL_SHARE, MOST_SHARE)
+        core[some] = (count >= FEWEST) & (np.bincount(own, as_high, len(some)) >= most * count)
         weight = as_high / (1.0 + ((xy[other] - xy[some][own]) ** 2).sum(1) / (0.5 * reach_m) ** 2)
         top[some] = np.bincount(own, weight * over[other], len(some)) / np.bincount(own, weight, len(some))
     counts = core | ~raised
