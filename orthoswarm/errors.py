@@ -11,3 +11,7 @@ class InputError(OrthoSwarmError):
     """An argument or an input file is wrong (exit code 2)."""
 
     exit_code = 2
+
+
+class AdjustmentError(OrthoSwarmError):
+    """Pictures of a vehicle do not hold together: their adjustment is singular."""

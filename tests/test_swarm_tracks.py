@@ -84,6 +84,23 @@ def test_a_far_off_prediction_is_rescued_by_the_whole_picture(ground):
     assert np.median(error_of(tracker, matrices)[1]) < 0.15
 
 
+def test_angles_that_are_wrong_by_degrees_do_not_end_tracks(ground):
+    """As of a camera that sways and whose angles were recorded late: 3 degrees each way, once 15 in the heading."""
+    rng = np.random.default_rng(2)
+    matrices = [placed(0.05 * np.sin(i), 420 + 16.3 * i, 700) for i in range(30)]
+    tracker, shares = Tracker(), []
+    for i, m in enumerate(matrices):
+        turned = placed(
+            np.radians(15.0 if i == 12 else rng.normal(0, 3.0)), *(np.array([320, 240]) + rng.normal(0, 17, 2))
+        )
+        predicted = turned @ np.linalg.inv(m) @ matrices[i - 1] if i else None
+        shares.append(tracker.add(i, view(ground, m), predicted))
+    tracks, error = error_of(tracker, matrices)
+    assert min(shares[1:]) > 0.6
+    assert np.median(error) < 0.15
+    assert np.bincount(tracks.point).mean() > 8  # as with right angles
+
+
 def test_there_is_at_most_one_track_in_a_cell(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(8)]
     tracker, _ = follow(ground, matrices)

@@ -13,7 +13,7 @@ from scipy.linalg import lapack, solve_triangular
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.errors import AdjustmentError
 from orthoswarm.swarm import normal
 from orthoswarm.swarm.priors import Layout, Priors
 from orthoswarm.swarm.rig import CX, CY, K1, K2, K3, F, Ints, Rig, Tracks
@@ -120,7 +120,7 @@ class Adjustment:
         """One Gauss-Newton step with robust scale c (squared sigmas); returns the largest camera move in metres.
 
         Raises:
-            OrthoSwarmError: if the system is singular even with its priors (NaN in the input).
+            AdjustmentError: if the system is singular even with its priors (NaN in the input).
         """
         system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
         system.band[0] *= 1.0 + damping
@@ -369,7 +369,7 @@ class _System:
 def _factor(band: Array) -> Array:
     factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
     if info != 0:
-        raise OrthoSwarmError("the adjustment is singular; check the records for NaN or repeated pictures")
+        raise AdjustmentError("the adjustment is singular; check the records for NaN or repeated pictures")
     return np.asarray(factor)
 
 

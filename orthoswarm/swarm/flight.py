@@ -31,6 +31,9 @@ FEW = 100
 FEWEST = 10
 FOLLOWED_OVERLAP = 0.78
 """Fewer pictures, or less forward overlap, are matched in pairs instead of being followed."""
+UNBROKEN = 0.3
+"""Share of tracks that survive into each picture of an unbroken chain. Photos without a height mostly have no angles
+either, and what lies behind a break is then held by positions alone."""
 HEIGHT_SIGMA_M = (0.1, 2.0)
 ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
 """Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
@@ -80,8 +83,8 @@ def open_flight(
 ) -> Flight | None:
     """Track a vehicle's pictures and set up its adjustment; nothing is solved yet.
 
-    None where the pictures cannot be followed from one to the next: too little overlap, or no height and scale that
-    agree (those are matched in pairs instead, see `sparse_flight`).
+    None where the pictures cannot be followed from one to the next: too little overlap, a height that contradicts the
+    scale, a chain that breaks where no height was recorded (those are matched in pairs instead, see `sparse_flight`).
     """
     if len(frames) < FEWEST:
         return None
@@ -91,11 +94,14 @@ def open_flight(
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
     flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
-    if not calibration.trusted_height or calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
+    lied = records.has_height.any() and not calibration.trusted_height
+    if lied or calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
         return None
     records = records.with_yaw(records.yaw + calibration.yaw_offset)
     tracks, survived = _track(records, pictures, calibration)
     if np.median(survived[1:]) < 0.5 or tracks.count < 3 * len(frames) ** 0.5:
+        return None
+    if not records.has_height.any() and survived[1:].min() < UNBROKEN:
         return None
     adjustment = _begin(records, pictures, calibration, tracks)
     return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))

@@ -9,25 +9,24 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.carried import carry, follow, sort_out
-from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.errors import AdjustmentError, OrthoSwarmError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.recorded import recorded_cameras, told_of_lone_ones
 from orthoswarm.swarm.beside import lay_beside
+from orthoswarm.swarm.first import first_passes
 from orthoswarm.swarm.ground import ground_points
 from orthoswarm.swarm.group import Run, coarse_terrain, common_terrain, local_origin, neighbours_of, pooled_lean, serial
 from orthoswarm.swarm.levels import level_network
-from orthoswarm.swarm.passes import Options, followed, look_again, matched, placed_again, read_frame, solo
+from orthoswarm.swarm.passes import Options, solo
 from orthoswarm.swarm.second import second_pass
-from orthoswarm.swarm.sparse_joint import open_sparse_flights
-from orthoswarm.swarm.state import Stopwatch, VehicleState, lies_on_map, to_solution
+from orthoswarm.swarm.state import VehicleState, lies_on_map, to_solution
 from orthoswarm.swarm.units import merge_units, split_units
 
 __all__ = [
@@ -43,7 +42,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +178,10 @@ def refine_all(
         raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
     origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
     options = options or Options()
-    states = _first_passes(split_units(vehicles), basemap, grid, origin, options, run, progress)
+    units = split_units(vehicles)
+    states, lost = first_passes(units, basemap, grid, origin, options, run, progress)
+    if not states:
+        raise AdjustmentError(lost[0])
     below = _shifted(coarse_terrain(states), origin)
     coarse = [to_solution(s, origin, below, coarse=True) for s in states]
     states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
@@ -190,60 +191,15 @@ def refine_all(
     terrain = _shifted(terrain, origin)
     lean = pooled_lean(states)
     fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
-    return Refined(merge_units(coarse), merge_units(fine), terrain, warnings)
+    left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
+    return Refined(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
-def _first_passes(
-    units: list[list[Frame]],
-    basemap: MapWindow | None,
-    grid: LocalGrid,
-    origin: Array,
-    options: Options,
-    run: Run,
-    progress: Callable[[str, int, int], None] | None,
-) -> list[VehicleState]:
-    """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first."""
-    # The network for the second look is loaded by one process only, afterwards.
-    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
-    states: list[VehicleState | None] = []
-    for n, state in enumerate(run(task, units)):
-        states.append(state)
-        if progress:
-            progress("solo", n + 1, len(units))
-    waiting = [k for k, state in enumerate(states) if state is None]
-    if waiting:
-        watch = Stopwatch()
-        flights = open_sparse_flights([units[k] for k in waiting], grid, origin, read_frame, run, progress)
-        watch.lap("tracks")
-        for k, state in zip(
-            waiting,
-            run(partial(matched, origin=origin, basemap=basemap, options=options, learned=False), flights),
-            strict=True,
-        ):
-            state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
-            states[k] = state
-    return _second_looks([state for state in states if state is not None], basemap, origin, run, progress)
-
-
-def _second_looks(
-    states: list[VehicleState],
-    basemap: MapWindow | None,
-    origin: Array,
-    run: Run,
-    progress: Callable[[str, int, int], None] | None,
-) -> list[VehicleState]:
-    """Learned matching for the flights that edges did not find, here, one after the other; then settled as usual."""
-    lost = [k for k, state in enumerate(states) if state.unfound]
-    found = []
-    for n, k in enumerate(lost):
-        found.append(None if basemap is None else look_again(states[k], basemap, origin))
-        if progress:
-            progress("second look", n + 1, len(lost))
-    items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
-    out = list(states)
-    for k, state in zip(lost, run(partial(placed_again, basemap=basemap, origin=origin), items), strict=True):
-        out[k] = state
-    return out
+def _left(frames: Sequence[Frame], why: str, grid: LocalGrid, had_map: bool) -> Solution:
+    """A vehicle that could not be refined, as it was recorded; the others are worth having all the same."""
+    placed = recorded_cameras(frames, grid).placed
+    said = f"it could not be refined ({why}); it stays where its receiver says"
+    return replace(_as_recorded(frames[0].vehicle, placed, had_map), warnings=[said])
 
 
 def lay_lost_beside(

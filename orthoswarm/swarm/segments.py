@@ -11,14 +11,16 @@ JUMP_M = 5.0
 LEG_GAP_S = 60.0
 STILL_M = 1.5
 TILT_JUMP_RAD = float(np.radians(1.5))
+JUMP_SIGMAS = 5.0
+"""A jump must stand out of the record's own noise as well: a camera that sways is not turned at every photo."""
 
 
 def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, pitch_rad: Array) -> Ints:
     """Number of the segment of each photo, int32 (N,), from 0 in order of first appearance.
 
     A segment ends at a pause of more than 180 s (landing, battery), at a jump of the recorded height of more than 5 m
-    and at a jump of the recorded tilt of more than 1.5 degrees (the gimbal was turned). A jump that the very next photo
-    takes back is one wrong tag and ends nothing.
+    and at a jump of the recorded tilt of more than 1.5 degrees (the gimbal was turned), or of more than five sigmas of
+    the record's own noise if that is more. A jump that the very next photo takes back is one wrong tag and ends nothing.
 
     Args:
         group: integers (N,), vehicle and lens; photos of a group stand in order of time.
@@ -44,6 +46,9 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
     jump = np.zeros(len(value), bool)
     known = np.flatnonzero(np.isfinite(value))
     v = value[known]
+    if len(v) > 2:
+        noise = 1.4826 * float(np.median(np.abs(np.diff(v)))) / np.sqrt(2.0)
+        limit = max(limit, JUMP_SIGMAS * noise)
     level = 0
     for k in range(1, len(v)):
         if abs(v[k] - v[level]) <= limit:

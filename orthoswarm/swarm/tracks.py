@@ -24,6 +24,10 @@ FLOW_SIGMA_PX = 0.35
 HELD = 48
 """Pictures that are held for comparison with first sights."""
 ANCHOR_PX = 1.5
+MISSED = 0.6
+"""Where fewer tracks are followed, the recorded angles are not what the pictures show (3 degrees are 17 pixels)."""
+SEEN_PX, SEEN_SHARE, SEEN_LEAST = 3.0, 0.4, 12
+"""How near to a homography flow must lie, the share of it that must, and the fewest."""
 
 
 @dataclass(slots=True)
@@ -109,14 +113,25 @@ class Tracker:
             shift = _global_shift(self._gray, gray, predicted)
             if shift is not None:
                 moved = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ predicted
-                good2, found2 = self._flow(gray, half, moved, _apply(moved, live.uv))
-                if good2.sum() > good.sum():
-                    good, found = good2, found2
+                good, found, predicted = self._better(gray, half, moved, (good, found, predicted))
+        if good.sum() < MISSED * inside.sum():
+            seen = _seen_homography(self._gray, gray, live.uv, predicted)
+            if seen is not None:
+                good, found, predicted = self._better(gray, half, seen, (good, found, predicted))
+                self._chain[-1] = predicted @ self._chain[-2]
+                self._chain[-1] /= self._chain[-1][2, 2]
         kept = live.take(good)
         kept.uv, kept.age = found[good], kept.age + 1
         self._to_first_sight(kept, gray)
         self._live = _oldest_per_cell(kept, gray.shape, self.cell_px)
         return float(good.sum()) / max(before, 1)
+
+    def _better(
+        self, gray: Gray, half: Gray, other: Array, now: tuple[NDArray[np.bool_], NDArray[np.float32], Array]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], Array]:
+        """Flow as it is now or, where that keeps more tracks, from another prediction; with its prediction."""
+        good, found = self._flow(gray, half, other, _apply(other, self._live.uv))
+        return (good, found, other) if good.sum() > now[0].sum() else now
 
     def _to_first_sight(self, live: _Live, gray: Gray) -> None:
         """Compare with the first sight; where it is no longer recognised, the present sight becomes the first."""
@@ -258,6 +273,38 @@ def _global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
     return (4.0 * dx, 4.0 * dy) if response > 0.05 else None
+
+
+def _seen_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
+    """The homography that flow over several octaves shows, whatever was recorded; None where it shows none.
+
+    For angles that are wrong by degrees, or that nobody recorded of a camera that sways. Begun from the prediction
+    and, where that leads nowhere (a heading that is wrong by more than ten degrees), from no motion at all.
+    """
+    if previous is None or len(uv) < SEEN_LEAST:
+        return None
+    for start in (predicted, np.eye(3)):
+        shift = _global_shift(previous, gray, start)
+        if shift is not None:
+            start = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ start
+        seen = _flow_homography(previous, gray, uv, start)
+        if seen is not None:
+            return seen
+    return None
+
+
+def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
+    """The homography from one picture to the next that most flow from a start agrees on, None without agreement."""
+    guess = _apply(start, uv)
+    warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=(21, 21), maxLevel=4)
+    ok = _inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & _inside(found, gray.shape, 0.0)
+    if ok.sum() < SEEN_LEAST:
+        return None
+    homography, inlier = cv2.findHomography(uv[ok], found[ok], cv2.RANSAC, SEEN_PX)
+    if homography is None or inlier.sum() < max(SEEN_LEAST, SEEN_SHARE * ok.sum()):
+        return None
+    return np.asarray(homography, np.float64)
 
 
 def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:

@@ -77,7 +77,7 @@ def _merged(parts: Sequence[Solution]) -> Solution:
         placed=[p for part in parts for p in part.placed],
         dropped={image: reason for part in parts for image, reason in part.dropped.items()},
         legs=legs,
-        state=[part.state for part in parts],
+        state=[part.state for part in parts if part.state is not None],
         warnings=list(dict.fromkeys(w for part in parts for w in part.warnings)),
         timings=timings,
     )

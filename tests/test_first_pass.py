@@ -1,0 +1,85 @@
+"""The first pass of a batch: one vehicle's photos that do not hold together do not cost the others theirs."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from orthoswarm.basemap import Basemap
+from orthoswarm.errors import AdjustmentError
+from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.swarm import first
+from orthoswarm.swarm.refine import refine_all
+from orthoswarm.twin.make import make_twin
+from orthoswarm.twin.presets import spec
+from telemetry import load
+from tests.test_swarm_refine import errors
+
+BROKEN = "uav01"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("twin") / "tiny"
+    make_twin(spec("tiny", seed=6), folder)
+    frames = load([folder / "photos"]).frames
+    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
+    with (folder / "truth" / "frames.csv").open() as file:
+        truth = {row["image"]: row for row in csv.DictReader(file)}
+    return vehicles, grid, Basemap.open(folder / "basemap.tif", grid.epsg), truth
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """No vehicle can be followed, and matched photos that the test names do not hold together; what was asked for."""
+    asked, breaks = [], []
+
+    def singular(frames, **_):
+        raise AdjustmentError("the adjustment is singular")
+
+    def sparse(units, *rest):
+        names = [unit[0].vehicle for unit in units]
+        asked.append(names)
+        if any(test(names) for test in breaks):
+            raise AdjustmentError("the adjustment is singular")
+        return open_together(units, *rest)
+
+    open_together = first.open_sparse_flights
+    monkeypatch.setattr(first, "followed", singular)
+    monkeypatch.setattr(first, "open_sparse_flights", sparse)
+    return asked, breaks
+
+
+def test_photos_that_do_not_hold_together_with_others_are_matched_by_vehicle(scene, opened):
+    vehicles, grid, basemap, truth = scene
+    asked, breaks = opened
+    breaks.append(lambda names: len(names) > 1)
+    refined = refine_all(vehicles, basemap, grid)
+    assert asked == [list(vehicles), *([v] for v in vehicles)]
+    for solution in refined.fine:
+        assert {p.stage for p in solution.placed} == {"fine"}
+        assert np.median(errors(solution, truth, grid)) < 0.5
+
+
+def test_a_vehicle_that_cannot_be_refined_stays_where_its_receiver_says(scene, opened):
+    vehicles, grid, basemap, truth = scene
+    _, breaks = opened
+    breaks.append(lambda names: BROKEN in names)
+    refined = refine_all(vehicles, basemap, grid)
+    assert {s.vehicle for s in refined.fine} == {s.vehicle for s in refined.coarse} == set(vehicles)
+    for solution in refined.fine:
+        assert len(solution.placed) == len(vehicles[solution.vehicle])
+        if solution.vehicle == BROKEN:
+            assert {p.stage for p in solution.placed} == {"realtime"} and {g.state for g in solution.legs} == {"failed"}
+            assert any("could not be refined (the adjustment is singular)" in w for w in solution.warnings)
+        else:
+            assert {p.stage for p in solution.placed} == {"fine"}
+            assert np.median(errors(solution, truth, grid)) < 0.5
+
+
+def test_where_no_vehicle_can_be_refined_the_reason_is_told(scene, opened):
+    vehicles, grid, basemap, _ = scene
+    opened[1].append(lambda names: True)
+    with pytest.raises(AdjustmentError, match="singular"):
+        refine_all(vehicles, basemap, grid)
