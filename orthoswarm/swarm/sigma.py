@@ -17,12 +17,14 @@ RADIAL = 1.25
 
 Of Gaussian errors 79 and 98.8 % of each axis lie within one and two of it, and 54 and 95.6 % of their lengths.
 """
-TIE_SHARE = 0.7
+TIE_SHARE = 0.4
 """Part of the ties' scatter that a picture's ties have in common (terrain, lens, what the map shows): no number of
-ties takes it away. Fitted with MAP_FLOOR_PX to simulated flights of eleven seeds: debris, water and haze, three kinds
-of noise, relief, lens, a real orthoimage."""
-MAP_FLOOR_PX = 0.035
+ties takes it away. Fitted with the two below to 30 simulated sets of 15 to 339 pictures a vehicle: heights of 80 to
+250 m, lenses, noise, maps of 0.2 to 2 m, blurred and noisy ones."""
+MAP_FLOOR_PX = 0.058
 """What no residual tells, in pixels of the compared map."""
+HELD_SHARE = 0.8
+"""Corners are followed better than the adjustment is told (0.05 and not 0.35 px, with a drift in between)."""
 
 
 def frame_sigmas(
@@ -34,7 +36,8 @@ def frame_sigmas(
     chosen = np.unique(np.r_[free[::EVERY], free[-1]])
     covariance, common = adjustment.covariance(chosen, c, ground, ties, tie_c)
     variance = np.array([_ground_variance(adjustment, int(i), q) for i, q in zip(chosen, covariance)])
-    sigma = np.sqrt(np.interp(np.arange(n), chosen, variance) + floor_m**2)
+    share = 1.0 if ties is None else HELD_SHARE
+    sigma = np.hypot(share * np.sqrt(np.interp(np.arange(n), chosen, variance)), floor_m)
     lens = adjustment.rig.lens[0]
     spread = float(np.sqrt(max(common[0, 0], 0.0)))
     f, width = float(lens[F]), int(lens[WIDTH])
