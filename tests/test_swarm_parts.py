@@ -163,3 +163,14 @@ def test_a_weak_picture_with_an_outlier_of_a_record_stays_on_its_leg_and_says_ho
     placed, sigma = weak_at(way, recorded, [0] * 9, [4])
     np.testing.assert_allclose(placed[4], [0.0, 40.0, 5.0], atol=1e-9)
     assert sigma[4] == pytest.approx(9.0)
+
+
+def test_an_outlier_within_a_long_gap_is_not_followed():
+    """The line across the gap is off by as much (drift): only the records around it tell that one of them has leapt."""
+    rng = np.random.default_rng(4)
+    way = np.c_[6.0 * np.sin(np.arange(30) / 7), 10.0 * np.arange(30), np.full(30, 100.0)]
+    recorded = way + np.c_[rng.normal(0, 0.4, (30, 2)), np.zeros(30)]
+    recorded[15, :2] += [9.0, -7.0]
+    placed, sigma = weak_at(way, recorded, [0] * 30, list(range(6, 24)))
+    assert np.hypot(*(placed - way)[6:24, :2].T).max() < 2.0
+    assert 3.0 < sigma[15] < 7.0 and np.delete(sigma, 15)[6:24].max() < 2.0

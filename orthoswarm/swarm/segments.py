@@ -20,7 +20,7 @@ def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, p
 
     A segment ends at a pause of more than 180 s (landing, battery), at a jump of the recorded height of more than 5 m
     and at a jump of the recorded tilt of more than 1.5 degrees (the gimbal was turned), or of more than five sigmas of
-    the record's own noise if that is more. A jump that the very next photo takes back is one wrong tag and ends nothing.
+    the record's own noise if that is more. A jump that the very next photo takes back is a wrong tag and ends nothing.
 
     Args:
         group: integers (N,), vehicle and lens; photos of a group stand in order of time.

@@ -9,6 +9,9 @@ Array = NDArray[np.float64]
 
 ENOUGH = 8
 FARTHEST = 40
+LEAP_M, LEAP_SIGMAS, LEAP_REACH = 4.0, 6.0, 2
+"""A record farther than this from the middle of those around it (and so many sigmas of how far records usually are)
+has leapt; so many before and after it are asked."""
 
 
 def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
@@ -17,6 +20,27 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
     n = len(flight.frames)
     good = (adj.obs_weight > 0.3) & (adj.tracks.camera < n)
     return np.bincount(adj.tracks.camera[good], minlength=n)
+
+
+def without_leaps(recorded: Array, leg: NDArray[np.int32]) -> Array:
+    """Records (N, 3) with single positions that leave their leg's own course sideways or along it put back (2 of 3).
+
+    Within a long gap a position 5 to 20 m off looks like the aircraft's own way when only the gap's ends are asked.
+    """
+    out, n = recorded.copy(), len(recorded)
+    middle, known = np.zeros((n, 2)), np.zeros(n, bool)
+    for i in range(LEAP_REACH, n - LEAP_REACH):
+        if leg[i] < 0 or (leg[i - LEAP_REACH : i + LEAP_REACH + 1] != leg[i]).any():
+            continue
+        sides = [0.5 * (recorded[i - k, :2] + recorded[i + k, :2]) for k in range(1, LEAP_REACH + 1)]
+        # the nearer of them: one of the four may have leapt itself
+        middle[i] = min(sides, key=lambda m: float(np.hypot(*(m - recorded[i, :2]))))
+        known[i] = True
+    away = np.hypot(*(recorded[:, :2] - middle).T)
+    if known.any():
+        leapt = known & (away > max(LEAP_M, LEAP_SIGMAS * float(np.median(away[known]))))
+        out[leapt, :2] = middle[leapt]
+    return out
 
 
 def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
@@ -33,7 +57,7 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
     if len(strong) < 2:
         return weak
     time = flight.records.time_s
-    recorded = adj.priors.position[:n]
+    recorded = without_leaps(adj.priors.position[:n], flight.leg)
     for i in np.flatnonzero(weak):
         k = int(np.searchsorted(strong, i))
         a, b = strong[max(k - 1, 0)], strong[min(k, len(strong) - 1)]
@@ -50,5 +74,7 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         near = a if i - a <= b - i else b
         turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
         adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
-        sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST), 0.0 if believed else 0.5 * gap)
+        leapt = float(np.hypot(*(adj.priors.position[i] - recorded[i])[:2]))
+        told = max(leapt, 0.0 if believed else gap)
+        sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST), 0.5 * told)
     return weak
