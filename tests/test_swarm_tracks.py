@@ -101,6 +101,22 @@ def test_angles_that_are_wrong_by_degrees_do_not_end_tracks(ground):
     assert np.bincount(tracks.point).mean() > 8  # as with right angles
 
 
+def test_a_turn_that_nobody_recorded_is_survived(ground):
+    turns = [0.0, 0.0, 0.9, 2.5, 2.5]
+    matrices = [placed(turn, 700 + 12 * i, 700) for i, turn in enumerate(turns)]
+    tracker = Tracker()
+    shares = [tracker.add(i, view(ground, m), np.eye(3) if i else None) for i, m in enumerate(matrices)]
+    assert min(shares[1:]) > 0.4
+    _, error = error_of(tracker, matrices)
+    assert np.median(error) < 0.15
+
+
+def test_pictures_of_different_ground_are_not_followed(ground):
+    tracker = Tracker()
+    tracker.add(0, view(ground, placed(0.0, 500, 500)), None)
+    assert tracker.add(1, view(ground, placed(0.0, 1200, 1200)), np.eye(3)) < 0.3  # some corners look alike
+
+
 def test_there_is_at_most_one_track_in_a_cell(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(8)]
     tracker, _ = follow(ground, matrices)

@@ -14,7 +14,7 @@ from orthoswarm.oldpickles import set_fields
 from orthoswarm.swarm.adjust import Adjustment, log_rotation
 from orthoswarm.swarm.calibrate import Calibration, calibrate
 from orthoswarm.swarm.heights import FREE_SIGMA_M
-from orthoswarm.swarm.legs import split_legs
+from orthoswarm.swarm.legs import leads_one_way, split_legs
 from orthoswarm.swarm.pictures import Pictures
 from orthoswarm.swarm.priors import GroupModel, Priors
 from orthoswarm.swarm.records import Records, read_records
@@ -83,8 +83,9 @@ def open_flight(
 ) -> Flight | None:
     """Track a vehicle's pictures and set up its adjustment; nothing is solved yet.
 
-    None where the pictures cannot be followed from one to the next: too little overlap, a height that contradicts the
-    scale, a chain that breaks where no height was recorded (those are matched in pairs instead, see `sparse_flight`).
+    None where the pictures cannot be followed from one to the next (those are matched in pairs instead, see
+    `sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a chain
+    that breaks and a single straight way, on which drift and scale stand for each other.
     """
     if len(frames) < FEWEST:
         return None
@@ -94,14 +95,16 @@ def open_flight(
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
     flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
-    lied = records.has_height.any() and not calibration.trusted_height
-    if lied or calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
+    if calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
+        return None
+    unknown = not records.has_height.any()
+    if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
     records = records.with_yaw(records.yaw + calibration.yaw_offset)
     tracks, survived = _track(records, pictures, calibration)
     if np.median(survived[1:]) < 0.5 or tracks.count < 3 * len(frames) ** 0.5:
         return None
-    if not records.has_height.any() and survived[1:].min() < UNBROKEN:
+    if unknown and survived[1:].min() < UNBROKEN:
         return None
     adjustment = _begin(records, pictures, calibration, tracks)
     return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))

@@ -29,6 +29,9 @@ MISSED = 0.6
 SEEN_PX, SEEN_SHARE, SEEN_LEAST = 3.0, 0.4, 12
 """How near to a homography flow must lie, the share of it that must, and the fewest."""
 
+TURNED_CORNERS, TURNED_LEAST, TURNED_SHARE = 1000, 30, 0.25
+"""Corners that are described, the fewest pairs that must agree, and the share of them."""
+
 
 @dataclass(slots=True)
 class _Live:
@@ -290,7 +293,7 @@ def _seen_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32],
         seen = _flow_homography(previous, gray, uv, start)
         if seen is not None:
             return seen
-    return None
+    return _turned_homography(previous, gray)
 
 
 def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
@@ -303,6 +306,26 @@ def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start:
         return None
     homography, inlier = cv2.findHomography(uv[ok], found[ok], cv2.RANSAC, SEEN_PX)
     if homography is None or inlier.sum() < max(SEEN_LEAST, SEEN_SHARE * ok.sum()):
+        return None
+    return np.asarray(homography, np.float64)
+
+
+def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
+    """The homography that corners described whatever their direction (ORB) agree on, None without agreement.
+
+    For a turn of the flight whose headings nobody recorded.
+    """
+    orb = cv2.ORB.create(nfeatures=TURNED_CORNERS)
+    (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
+    if ours is None or theirs is None:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
+    if len(pairs) < TURNED_LEAST:
+        return None
+    a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
+    b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
+    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, SEEN_PX)
+    if homography is None or inlier.sum() < max(TURNED_LEAST, TURNED_SHARE * len(pairs)):
         return None
     return np.asarray(homography, np.float64)
 
