@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.swarm import klt
 from orthoswarm.swarm.rig import Tracks
+from orthoswarm.swarm.seen import apply_homography, global_shift, is_inside, seen_homography
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -26,11 +27,6 @@ HELD = 48
 ANCHOR_PX = 1.5
 MISSED = 0.6
 """Where fewer tracks are followed, the recorded angles are not what the pictures show (3 degrees are 17 pixels)."""
-SEEN_PX, SEEN_SHARE, SEEN_LEAST = 3.0, 0.4, 12
-"""How near to a homography flow must lie, the share of it that must, and the fewest."""
-
-TURNED_CORNERS, TURNED_LEAST, TURNED_SHARE = 1000, 30, 0.25
-"""Corners that are described, the fewest pairs that must agree, and the share of them."""
 
 
 @dataclass(slots=True)
@@ -109,16 +105,16 @@ class Tracker:
 
     def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
         before, live = len(self._live.ident), self._live
-        guess = _apply(predicted, live.uv)
+        guess = apply_homography(predicted, live.uv)
         good, found = self._flow(gray, half, predicted, guess)
-        inside = _inside(guess, gray.shape, 0.0)
+        inside = is_inside(guess, gray.shape, 0.0)
         if good.sum() < max(6, 0.3 * inside.sum()):
-            shift = _global_shift(self._gray, gray, predicted)
+            shift = global_shift(self._gray, gray, predicted)
             if shift is not None:
                 moved = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ predicted
                 good, found, predicted = self._better(gray, half, moved, (good, found, predicted))
         if good.sum() < MISSED * inside.sum():
-            seen = _seen_homography(self._gray, gray, live.uv, predicted)
+            seen = seen_homography(self._gray, gray, live.uv, predicted)
             if seen is not None:
                 good, found, predicted = self._better(gray, half, seen, (good, found, predicted))
                 self._chain[-1] = predicted @ self._chain[-2]
@@ -133,7 +129,7 @@ class Tracker:
         self, gray: Gray, half: Gray, other: Array, now: tuple[NDArray[np.bool_], NDArray[np.float32], Array]
     ) -> tuple[NDArray[np.bool_], NDArray[np.float32], Array]:
         """Flow as it is now or, where that keeps more tracks, from another prediction; with its prediction."""
-        good, found = self._flow(gray, half, other, _apply(other, self._live.uv))
+        good, found = self._flow(gray, half, other, apply_homography(other, self._live.uv))
         return (good, found, other) if good.sum() > now[0].sum() else now
 
     def _to_first_sight(self, live: _Live, gray: Gray) -> None:
@@ -227,11 +223,6 @@ def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int,
         score[:, -right:] = 0
 
 
-def _apply(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    p = uv.astype(float) @ homography[:, :2].T + homography[:, 2]
-    return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
-
-
 def _backward(homography: Array, uv: NDArray[np.float32]) -> Array:
     """Derivatives (K, 2, 2) of the inverse homography at pixels (K, 2) of the later picture."""
     return _derivative(np.asarray(np.linalg.inv(homography), np.float64), uv)
@@ -246,16 +237,11 @@ def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
     return np.asarray(out / p[:, 2:, None])
 
 
-def _inside(uv: NDArray[np.float32], shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
-    h, w = shape[:2]
-    return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)
-
-
 def _gate(
     guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
     """Keep flows that agree with the others: 5 px from the median residual, which is 12 px from the guess at most."""
-    good = ok & _inside(found, shape, 3.0)
+    good = ok & is_inside(found, shape, 3.0)
     if good.sum() < 3:
         return np.zeros_like(good)
     residual = found - guess
@@ -263,71 +249,6 @@ def _gate(
     if np.hypot(*centre) > 12.0:
         return np.zeros_like(good)
     return np.asarray(good & (np.hypot(*(residual - centre).T) < 5.0))
-
-
-def _global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[float, float] | None:
-    """What the prediction lacks, from phase correlation of the quarter-size pictures; None where unclear."""
-    if previous is None:
-        return None
-    warped = cv2.warpPerspective(previous, predicted, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
-    small = [
-        cv2.resize(g, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32) for g in (warped, gray)
-    ]
-    window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
-    (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    return (4.0 * dx, 4.0 * dy) if response > 0.05 else None
-
-
-def _seen_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
-    """The homography that flow over several octaves shows, whatever was recorded; None where it shows none.
-
-    For angles that are wrong by degrees, or that nobody recorded of a camera that sways. Begun from the prediction
-    and, where that leads nowhere (a heading that is wrong by more than ten degrees), from no motion at all.
-    """
-    if previous is None or len(uv) < SEEN_LEAST:
-        return None
-    for start in (predicted, np.eye(3)):
-        shift = _global_shift(previous, gray, start)
-        if shift is not None:
-            start = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ start
-        seen = _flow_homography(previous, gray, uv, start)
-        if seen is not None:
-            return seen
-    return _turned_homography(previous, gray)
-
-
-def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
-    """The homography from one picture to the next that most flow from a start agrees on, None without agreement."""
-    guess = _apply(start, uv)
-    warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=(21, 21), maxLevel=4)
-    ok = _inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & _inside(found, gray.shape, 0.0)
-    if ok.sum() < SEEN_LEAST:
-        return None
-    homography, inlier = cv2.findHomography(uv[ok], found[ok], cv2.RANSAC, SEEN_PX)
-    if homography is None or inlier.sum() < max(SEEN_LEAST, SEEN_SHARE * ok.sum()):
-        return None
-    return np.asarray(homography, np.float64)
-
-
-def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
-    """The homography that corners described whatever their direction (ORB) agree on, None without agreement.
-
-    For a turn of the flight whose headings nobody recorded.
-    """
-    orb = cv2.ORB.create(nfeatures=TURNED_CORNERS)
-    (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
-    if ours is None or theirs is None:
-        return None
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
-    if len(pairs) < TURNED_LEAST:
-        return None
-    a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
-    b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
-    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, SEEN_PX)
-    if homography is None or inlier.sum() < max(TURNED_LEAST, TURNED_SHARE * len(pairs)):
-        return None
-    return np.asarray(homography, np.float64)
 
 
 def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
