@@ -1,18 +1,14 @@
 """The first pass of a batch: one vehicle's photos that do not hold together do not cost the others theirs."""
 
-import csv
-
 import numpy as np
 import pytest
 
-from orthoswarm.basemap import Basemap
 from orthoswarm.errors import AdjustmentError
-from orthoswarm.geo import LocalGrid, area_epsg
-from orthoswarm.swarm import first
+from orthoswarm.swarm import first, passes
 from orthoswarm.swarm.refine import refine_all
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
-from telemetry import load
+from tests.scenes import scene_of
 from tests.test_swarm_refine import errors
 
 BROKEN = "uav01"
@@ -22,12 +18,7 @@ BROKEN = "uav01"
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("twin") / "tiny"
     make_twin(spec("tiny", seed=6), folder)
-    frames = load([folder / "photos"]).frames
-    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
-    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
-    with (folder / "truth" / "frames.csv").open() as file:
-        truth = {row["image"]: row for row in csv.DictReader(file)}
-    return vehicles, grid, Basemap.open(folder / "basemap.tif", grid.epsg), truth
+    return scene_of(folder)
 
 
 @pytest.fixture
@@ -35,7 +26,7 @@ def opened(monkeypatch):
     """No vehicle can be followed, and matched photos that the test names do not hold together; what was asked for."""
     asked, breaks = [], []
 
-    def singular(frames, **_):
+    def singular(*_):
         raise AdjustmentError("the adjustment is singular")
 
     def sparse(units, *rest):
@@ -46,7 +37,7 @@ def opened(monkeypatch):
         return open_together(units, *rest)
 
     open_together = first.open_sparse_flights
-    monkeypatch.setattr(first, "followed", singular)
+    monkeypatch.setattr(passes, "relative", singular)
     monkeypatch.setattr(first, "open_sparse_flights", sparse)
     return asked, breaks
 

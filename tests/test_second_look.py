@@ -1,18 +1,15 @@
 """Flights that edges do not find on the map: learned matching asks for them in one process, then they are settled."""
 
-import csv
 import pickle
 
 import numpy as np
 import pytest
 
-from orthoswarm.basemap import Basemap
-from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.swarm import passes
 from orthoswarm.swarm.refine import SwarmRefiner, local_origin, refine_all
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
-from telemetry import load
+from tests.scenes import scene_of
 from tests.test_swarm_refine import errors
 
 LOST = "uav01"
@@ -22,12 +19,7 @@ LOST = "uav01"
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("twin") / "tiny"
     make_twin(spec("tiny", seed=5), folder)
-    frames = load([folder / "photos"]).frames
-    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
-    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
-    with (folder / "truth" / "frames.csv").open() as file:
-        truth = {row["image"]: row for row in csv.DictReader(file)}
-    return vehicles, grid, Basemap.open(folder / "basemap.tif", grid.epsg), truth
+    return scene_of(folder)
 
 
 @pytest.fixture

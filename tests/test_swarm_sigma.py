@@ -31,7 +31,8 @@ def test_wrong_ties_make_no_doubt_of_the_others():
 
 
 def test_few_ties_that_were_followed_are_not_believed_to_be_exact():
-    assert map_doubt(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(TIE_SHARE * 0.35, rel=0.05)
+    doubt = np.hypot(MAP_FLOOR_PX * 0.5, TIE_SHARE * 0.35)
+    assert map_doubt(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(doubt, rel=0.02)
     assert map_doubt(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(MAP_FLOOR_PX * 2.0)
 
 

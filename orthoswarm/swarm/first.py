@@ -1,6 +1,6 @@
 """The first pass of a batch: each vehicle by itself, or matched together with others, then onto the map."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -12,12 +12,12 @@ from orthoswarm.geo import LocalGrid
 from orthoswarm.placement import MapWindow
 from orthoswarm.swarm.flight import Flight
 from orthoswarm.swarm.group import Run
+from orthoswarm.swarm.matching import Progress
 from orthoswarm.swarm.passes import Options, followed, look_again, matched, placed_again, read_frame
 from orthoswarm.swarm.sparse_joint import open_sparse_flights
 from orthoswarm.swarm.state import Stopwatch, VehicleState
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 
 
 def first_passes(
@@ -40,7 +40,7 @@ def first_passes(
         The states of all units that could be adjusted, in order; unit -> why not, of the others.
     """
     # The network for the second look is loaded by one process only, afterwards.
-    task = partial(_followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options)
+    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
@@ -59,16 +59,6 @@ def first_passes(
             state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
             states[k] = state
     return _second_looks([state for state in states if state is not None], basemap, origin, run, progress), lost
-
-
-def _followed(
-    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
-) -> VehicleState | None:
-    """`passes.followed` without learned matching; None also where the adjustment of what was followed breaks down."""
-    try:
-        return followed(frames, epsg=epsg, origin=origin, basemap=basemap, options=options, learned=False)
-    except AdjustmentError:
-        return None
 
 
 def _sparse_flights(

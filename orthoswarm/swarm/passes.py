@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.camera import fov_rad
 from orthoswarm.dem import HeightModel
+from orthoswarm.errors import AdjustmentError
 from orthoswarm.frame import Frame
 from orthoswarm.geo import LocalGrid
 from orthoswarm.picture import read_gray
@@ -105,7 +106,7 @@ def followed(
     options: Options,
     learned: bool = True,
 ) -> VehicleState | None:
-    """Refine one vehicle by itself; None where its pictures cannot be followed from one to the next.
+    """Refine one vehicle by itself; None where its pictures cannot be followed, or what was followed does not hold.
 
     learned: where edges do not find it on the map, ask learned matching at once (else see `look_again`).
     """
@@ -116,12 +117,15 @@ def followed(
     watch.lap("tracks")
     if flight is None:
         return None
-    surface = relative(flight, options.ground(origin))
-    if not NARROWEST_RAD < fov_rad(float(flight.rig().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
-        return None  # the recorded height that is behind such a lens cannot be right
-    if len(frames) < FEW and strong_lens(flight):
-        return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
-    return from_flight(flight, surface, origin, basemap, watch, learned)
+    try:
+        surface = relative(flight, options.ground(origin))
+        if not NARROWEST_RAD < fov_rad(float(flight.rig().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
+            return None  # the recorded height that is behind such a lens cannot be right
+        if len(frames) < FEW and strong_lens(flight):
+            return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
+        return from_flight(flight, surface, origin, basemap, watch, learned)
+    except AdjustmentError:
+        return None
 
 
 def matched(

@@ -23,10 +23,8 @@ def seen_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], 
     if previous is None or len(uv) < SEEN_LEAST:
         return None
     for start in (predicted, np.eye(3)):
-        shift = global_shift(previous, gray, start)
-        if shift is not None:
-            start = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ start
-        seen = _flow_homography(previous, gray, uv, start)
+        aligned = shifted_prediction(previous, gray, start)
+        seen = _flow_homography(previous, gray, uv, start if aligned is None else aligned)
         if seen is not None:
             return seen
     return _turned_homography(previous, gray)
@@ -40,10 +38,7 @@ def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start:
     ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
     if ok.sum() < SEEN_LEAST:
         return None
-    homography, inlier = cv2.findHomography(uv[ok], found[ok], cv2.RANSAC, SEEN_PX)
-    if homography is None or inlier.sum() < max(SEEN_LEAST, SEEN_SHARE * ok.sum()):
-        return None
-    return np.asarray(homography, np.float64)
+    return _agreed(uv[ok], found[ok], max(SEEN_LEAST, SEEN_SHARE * ok.sum()))
 
 
 def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
@@ -60,14 +55,19 @@ def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
         return None
     a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
     b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
+    return _agreed(a, b, max(TURNED_LEAST, TURNED_SHARE * len(pairs)))
+
+
+def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Array | None:
+    """The homography that so many pairs of pixels (K, 2) agree on, None where fewer do."""
     homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, SEEN_PX)
-    if homography is None or inlier.sum() < max(TURNED_LEAST, TURNED_SHARE * len(pairs)):
+    if homography is None or inlier.sum() < fewest:
         return None
     return np.asarray(homography, np.float64)
 
 
-def global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[float, float] | None:
-    """What the prediction lacks, from phase correlation of the quarter-size pictures; None where unclear."""
+def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
+    """The prediction with the shift that it lacks, by phase correlation of quarter pictures; None where unclear."""
     if previous is None:
         return None
     warped = cv2.warpPerspective(previous, predicted, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
@@ -76,7 +76,9 @@ def global_shift(previous: Gray | None, gray: Gray, predicted: Array) -> tuple[f
     ]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    return (4.0 * dx, 4.0 * dy) if response > 0.05 else None
+    if response <= 0.05:
+        return None
+    return np.array([[1.0, 0, 4.0 * dx], [0, 1.0, 4.0 * dy], [0, 0, 1.0]]) @ predicted
 
 
 def apply_homography(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.swarm import klt
 from orthoswarm.swarm.rig import Tracks
-from orthoswarm.swarm.seen import apply_homography, global_shift, is_inside, seen_homography
+from orthoswarm.swarm.seen import apply_homography, is_inside, seen_homography, shifted_prediction
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -109,10 +109,9 @@ class Tracker:
         good, found = self._flow(gray, half, predicted, guess)
         inside = is_inside(guess, gray.shape, 0.0)
         if good.sum() < max(6, 0.3 * inside.sum()):
-            shift = global_shift(self._gray, gray, predicted)
-            if shift is not None:
-                moved = np.array([[1.0, 0, shift[0]], [0, 1.0, shift[1]], [0, 0, 1.0]]) @ predicted
-                good, found, predicted = self._better(gray, half, moved, (good, found, predicted))
+            shifted = shifted_prediction(self._gray, gray, predicted)
+            if shifted is not None:
+                good, found, predicted = self._better(gray, half, shifted, (good, found, predicted))
         if good.sum() < MISSED * inside.sum():
             seen = seen_homography(self._gray, gray, live.uv, predicted)
             if seen is not None:
