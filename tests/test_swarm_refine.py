@@ -303,7 +303,8 @@ def test_vehicles_that_were_refined_one_after_the_other_are_solved_together(scen
         assert {p.stage for p in solution.placed} == {"fine"} and solution.warnings == at_once[vehicle].warnings
         np.testing.assert_array_equal(before[vehicle], [p.camera.position for p in at_once[vehicle].placed])
     was, now = (np.concatenate([errors(s, truth, grid) for s in all_.values()]) for all_ in (at_once, together))
-    assert np.median(now) < 1.1 * np.median(was) and now.max() < 1.0
+    # Over ten such cities the root mean square of 6 cm became 1 to 20 % larger, the greatest error 0.19 m.
+    assert np.sqrt(np.mean(now**2)) < 1.3 * np.sqrt(np.mean(was**2)) and now.max() < 0.5
 
 
 def test_a_vehicle_over_a_hole_of_the_map_is_carried_once_its_neighbour_is_there(scene):

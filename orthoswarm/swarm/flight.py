@@ -35,6 +35,8 @@ UNBROKEN = 0.3
 """Share of tracks that survive into each picture of an unbroken chain. Photos without a height mostly have no angles
 either, and what lies behind a break is then held by positions alone."""
 HEIGHT_SIGMA_M = (0.1, 2.0)
+HEIGHT_BEGIN_M, LEAP_M = 0.5, 5.0
+"""Sigma of a recorded height to begin with, and how far one must leave those around it not to be taken as it is."""
 ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
 """Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
 
@@ -123,7 +125,7 @@ def weigh_records(flight: Flight) -> None:
     turn = np.clip(_jitter(attitude), *ATTITUDE_SIGMA_RAD)
     sigma = p.position_sigma.copy()
     if flight.calibration.trusted_height:
-        sigma[:, 2] = z
+        sigma[:, 2] = np.where(sigma[:, 2] > HEIGHT_BEGIN_M, sigma[:, 2], z)
     off = adj.position_residuals()[:, :2] / np.maximum(sigma[:, :2], 1e-9)
     sigma[:, :2] *= max(1.0, 1.4826 * float(np.median(np.abs(off))))
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
@@ -177,12 +179,11 @@ def _begin(records: Records, pictures: Pictures, calibration: Calibration, track
     n = len(records.position)
     width, height = pictures.size
     position = records.position.copy()
-    position[:, 2] = _height_prior(records, calibration)
+    position[:, 2], z_sigma = _height_prior(records, calibration)
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     rig = Rig(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
     horizontal = np.where(np.isfinite(records.position_sigma), np.maximum(records.position_sigma, 0.02), 1.5)
-    z_sigma = 0.5
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
     model = GroupModel(
@@ -192,7 +193,7 @@ def _begin(records: Records, pictures: Pictures, calibration: Calibration, track
     )
     priors = Priors(
         position,
-        np.column_stack([horizontal, horizontal, np.full(n, z_sigma)]),
+        np.column_stack([horizontal, horizontal, z_sigma]),
         rotation,
         np.column_stack([tilt, tilt, yaw]),
         records.velocity(),
@@ -213,13 +214,19 @@ def first_points(rig: Rig, tracks: Tracks) -> Array:
     return np.column_stack([*xy, np.zeros(tracks.count)])
 
 
-def _height_prior(records: Records, calibration: Calibration) -> Array:
-    """Heights over the ground as recorded, without spikes; one height where the record cannot be trusted."""
+def _height_prior(records: Records, calibration: Calibration) -> tuple[Array, Array]:
+    """Heights over the ground as recorded and their sigmas; one height where the record cannot be trusted.
+
+    A height that leaves those around it may be a spike, or the climb after the takeoff: the height of the others is
+    as good a guess, as doubtful as they differ, and the pictures tell which it is.
+    """
     z = records.position[:, 2]
     if not calibration.trusted_height:
-        return np.full(len(z), calibration.height_m)
+        return np.full(len(z), calibration.height_m), np.full(len(z), HEIGHT_BEGIN_M)
     smooth = np.array([np.median(z[max(0, i - 3) : i + 4]) for i in range(len(z))])
-    return np.where(np.abs(z - smooth) > 5.0, smooth, z)
+    off = np.abs(z - smooth)
+    leaps = off > LEAP_M
+    return np.where(leaps, smooth, z), np.where(leaps, off, HEIGHT_BEGIN_M)
 
 
 def fov_deg(flight: Flight) -> float:
