@@ -8,8 +8,8 @@ import pytest
 
 from orthoswarm.swarm.calibrate import Calibration
 from orthoswarm.swarm.flight import HEIGHT_BEGIN_M, _height_prior
-from orthoswarm.swarm.refine import SwarmRefiner, local_origin
 from orthoswarm.swarm.records import read_records
+from orthoswarm.swarm.refine import SwarmRefiner, local_origin
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
 from tests.scenes import scene_of
