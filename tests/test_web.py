@@ -32,7 +32,8 @@ def page(browser, tmp_path):
     with serving(tmp_path / "w") as served:
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(LIMIT_MS)
-        page.foreign, page.errors = [], []
+        page.foreign, page.errors, page.tiles = [], [], []
+        page.on("request", lambda r: page.tiles.append(r.url.split("/tiles/")[1]) if "/tiles/" in r.url else None)
         page.on(
             "request",
             lambda r: None if r.url.startswith((served.url, "blob:", "data:")) else page.foreign.append(r.url),
@@ -66,6 +67,8 @@ def test_the_map_appears_as_pictures_come(page):
         page.wait_for_timeout(500)
     assert colours(page) > before + 0.004
     shown = colours(page)
+    levels = {int(tile.split("/")[1]) for tile in page.tiles}
+    assert levels and min(levels) > 10  # the tiles of the whole world, which are empty, are not asked for first
     page.locator("[data-layer=realtime] input[type=checkbox]").uncheck()
     for _ in range(60):
         if colours(page) < shown - 0.004:

@@ -82,6 +82,7 @@ function drawLayers(rows) {
     view.fit(bounds);
     fitted = shown;
   }
+  for (const row of rows) if (row.name in TITLES && !row.empty) view.showRaster(row.name);
 }
 
 // -- vehicles --------------------------------------------------------------------------------------------------------
@@ -297,5 +298,5 @@ $("overlays-on").onchange = (event) => view.setOverlays(event.target.checked);
 $("swipe-on").onchange = (event) => view.setSwipe(event.target.checked);
 $("token").value = token();
 $("token").onchange = (event) => { setToken(event.target.value); refresh(); };
-view.ready.then(() => { listen(heard, (on) => $("link").classList.toggle("on", on)); drawArea(); });
+view.ready.then(() => { refresh(); listen(heard, (on) => $("link").classList.toggle("on", on)); drawArea(); });
 window.orthoswarm = view;

@@ -16,13 +16,11 @@ export const colourOf = (vehicle) => {
 const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 const empty = { type: "FeatureCollection", features: [] };
 const raster = (name) => ({ type: "raster", tiles: [`${location.origin}/tiles/${name}/{z}/{x}/{y}.webp`], tileSize: 256, maxzoom: 22 });
+const rasterLayer = (name) => ({ id: name, type: "raster", source: name, paint: { "raster-fade-duration": 0, "raster-resampling": "linear" } });
 const style = (names) => ({
   version: 8,
   sources: Object.fromEntries(names.map((name) => [name, raster(name)])),
-  layers: [
-    { id: "ground", type: "background", paint: { "background-color": "#dfe4e9" } },
-    ...names.map((name) => ({ id: name, type: "raster", source: name, paint: { "raster-fade-duration": 0, "raster-resampling": "linear" } })),
-  ],
+  layers: [{ id: "ground", type: "background", paint: { "background-color": "#dfe4e9" } }, ...names.map(rasterLayer)],
 });
 
 const options = (container, names) => ({
@@ -30,7 +28,7 @@ const options = (container, names) => ({
   transformRequest: requestTile, canvasContextAttributes: { preserveDrawingBuffer: true },
 });
 
-export const map = new maplibregl.Map(options("map", RASTERS));
+export const map = new maplibregl.Map(options("map", []));
 map.addControl(new maplibregl.NavigationControl({ showCompass: false }), "top-left");
 map.addControl(new maplibregl.ScaleControl({ maxWidth: 140 }), "bottom-left");
 map.touchZoomRotate.disableRotation();
@@ -61,6 +59,17 @@ export const show = (id, features) => map.getSource(id)?.setData({ type: "Featur
 
 // -- raster layers ---------------------------------------------------------------------------------------------------
 
+// A layer comes onto the map once it holds something and the map looks at it: else hundreds of empty tiles of the
+// whole world are asked for first.
+export function showRaster(name) {
+  if (map.getSource(name)) return;
+  map.addSource(name, raster(name));
+  const above = [...RASTERS.slice(RASTERS.indexOf(name) + 1), OVERLAYS[0][0]].find((id) => map.getLayer(id));
+  map.addLayer(rasterLayer(name), above);
+  if (shares.has(name)) setOpacity(name, shares.get(name));
+}
+
+const shares = new Map();
 const versions = new Map();
 const stale = new Set();
 
@@ -82,6 +91,8 @@ setInterval(() => {
 }, 1000);
 
 export const setOpacity = (name, share) => {
+  shares.set(name, share);
+  if (!map.getLayer(name)) return;
   map.setPaintProperty(name, "raster-opacity", share);
   map.setLayoutProperty(name, "visibility", share > 0 ? "visible" : "none");
 };
@@ -153,7 +164,7 @@ export function setSwipe(on) {
   for (const id of ["before", "divider", "swipe"]) document.getElementById(id).hidden = !on;
   if (!on) return;
   if (!before) {
-    before = new maplibregl.Map({ ...options("before", ["basemap"]), interactive: false });
+    before = new maplibregl.Map({ ...options("before", ["basemap"]), center: map.getCenter(), zoom: map.getZoom(), interactive: false });
     map.on("move", () => before.jumpTo({ center: map.getCenter(), zoom: map.getZoom(), bearing: map.getBearing() }));
     document.getElementById("swipe").addEventListener("input", clip);
     new ResizeObserver(clip).observe(document.getElementById("swipe"));
