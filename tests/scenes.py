@@ -4,7 +4,16 @@ import csv
 
 from orthoswarm.basemap import Basemap
 from orthoswarm.geo import LocalGrid, area_epsg
+from orthoswarm.twin.make import make_twin
+from orthoswarm.twin.presets import spec
 from telemetry import load
+
+
+def tiny_twin(factory, seed, **changes):
+    """The folder of a freshly made tiny twin."""
+    folder = factory.mktemp("twin") / "tiny"
+    make_twin(spec("tiny", seed=seed, **changes), folder)
+    return folder
 
 
 def scene_of(folder):

@@ -10,9 +10,7 @@ from orthoswarm.swarm.calibrate import Calibration
 from orthoswarm.swarm.flight import HEIGHT_BEGIN_M, _height_prior
 from orthoswarm.swarm.records import read_records
 from orthoswarm.swarm.refine import SwarmRefiner, local_origin
-from orthoswarm.twin.make import make_twin
-from orthoswarm.twin.presets import spec
-from tests.scenes import scene_of
+from tests.scenes import scene_of, tiny_twin
 from tests.test_swarm_refine import errors
 
 SHARES = (0.28, 0.46, 0.74)
@@ -21,9 +19,7 @@ SHARES = (0.28, 0.46, 0.74)
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=4), folder)
-    return scene_of(folder)
+    return scene_of(tiny_twin(tmp_path_factory, 4))
 
 
 def climbing(frame, folder):

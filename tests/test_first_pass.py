@@ -6,9 +6,7 @@ import pytest
 from orthoswarm.errors import AdjustmentError
 from orthoswarm.swarm import first, passes
 from orthoswarm.swarm.refine import refine_all
-from orthoswarm.twin.make import make_twin
-from orthoswarm.twin.presets import spec
-from tests.scenes import scene_of
+from tests.scenes import scene_of, tiny_twin
 from tests.test_swarm_refine import errors
 
 BROKEN = "uav01"
@@ -16,9 +14,7 @@ BROKEN = "uav01"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=6), folder)
-    return scene_of(folder)
+    return scene_of(tiny_twin(tmp_path_factory, 6))
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Refinement over a ground with relief whose height model is given: right, in part, of another place."""
 
-import csv
 import pickle
 from dataclasses import replace
 
@@ -8,36 +7,25 @@ import numpy as np
 import pytest
 import rasterio
 
-from orthoswarm.basemap import Basemap
 from orthoswarm.dem import HeightModel
 from orthoswarm.extent import placed_bounds
-from orthoswarm.geo import LocalGrid, area_epsg
 from orthoswarm.placement import Terrain
 from orthoswarm.recorded import recorded_cameras
 from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all
-from orthoswarm.twin.make import make_twin
-from orthoswarm.twin.presets import spec
-from telemetry import load
+from tests.scenes import scene_of, tiny_twin
 from tests.test_swarm_refine import errors
 
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=3, relief_m=8.0), folder)
-    return folder
+    return tiny_twin(tmp_path_factory, 3, relief_m=8.0)
 
 
 @pytest.fixture(scope="module")
 def scene(twin):
-    frames = load([twin / "photos"]).frames
-    grid = LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
-    vehicles = {v: [f for f in frames if f.vehicle == v] for v in sorted({f.vehicle for f in frames})}
-    with (twin / "truth" / "frames.csv").open() as file:
-        truth = {row["image"]: row for row in csv.DictReader(file)}
     with rasterio.open(twin / "truth" / "dtm.tif") as dataset:
         heights, transform = dataset.read(1), dataset.transform
-    return vehicles, grid, Basemap.open(twin / "basemap.tif", grid.epsg), truth, (heights, transform)
+    return *scene_of(twin), (heights, transform)
 
 
 def options(folder, scene, heights):

@@ -7,9 +7,7 @@ import pytest
 
 from orthoswarm.swarm import passes
 from orthoswarm.swarm.refine import SwarmRefiner, local_origin, refine_all
-from orthoswarm.twin.make import make_twin
-from orthoswarm.twin.presets import spec
-from tests.scenes import scene_of
+from tests.scenes import scene_of, tiny_twin
 from tests.test_swarm_refine import errors
 
 LOST = "uav01"
@@ -17,9 +15,7 @@ LOST = "uav01"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=5), folder)
-    return scene_of(folder)
+    return scene_of(tiny_twin(tmp_path_factory, 5))
 
 
 @pytest.fixture

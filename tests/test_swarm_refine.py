@@ -12,18 +12,14 @@ from orthoswarm.basemap import Basemap
 from orthoswarm.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.geo import GroundGrid, LocalGrid, area_epsg
 from orthoswarm.swarm.refine import Options, SwarmRefiner, local_origin, refine_all, solo
-from orthoswarm.twin.make import make_twin
-from orthoswarm.twin.presets import spec
 from orthoswarm.vehicles import legs_as_vehicles
 from telemetry import load
-from tests.scenes import scene_of
+from tests.scenes import scene_of, tiny_twin
 
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=1), folder)
-    return folder
+    return tiny_twin(tmp_path_factory, 1)
 
 
 @pytest.fixture(scope="module")

@@ -35,10 +35,10 @@ UNBROKEN = 0.3
 """Share of tracks that survive into each picture of an unbroken chain. Photos without a height mostly have no angles
 either, and what lies behind a break is then held by positions alone."""
 HEIGHT_SIGMA_M = (0.1, 2.0)
-HEIGHT_BEGIN_M, LEAP_M = 0.5, 5.0
-"""Sigma of a recorded height to begin with, and how far one must leave those around it not to be taken as it is."""
 ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
 """Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
+HEIGHT_BEGIN_M, LEAP_M = 0.5, 5.0
+"""Sigma of a recorded height to begin with, and how far one must leave those around it not to be taken as it is."""
 
 
 @dataclass(slots=True)
@@ -115,7 +115,7 @@ def open_flight(
 def weigh_records(flight: Flight) -> None:
     """Give heights and attitudes the sigmas that they show: pictures tell well how one differs from the next.
 
-    Positions that scatter more than theirs say get larger ones, too.
+    Positions that scatter more than theirs say get larger ones, too. Heights that were doubtful to begin with stay so.
     """
     adj = flight.adjustment
     p = adj.priors
