@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 import telemetry
-from gcs_plugin.commands.evaluate import read_truth
-from orthoswarm.camera import Camera
-from orthoswarm.geo import LocalGrid
-from orthoswarm.matchers.registration import apply
-from orthoswarm.paper.lines import find_legs, fit_line
-from orthoswarm.recorded import area_grid
-from orthoswarm.swarm.records import read_records
-from orthoswarm.swarm.refine import local_origin
+from gcs_plugin.cli.verbs.evaluate import read_truth
+from orthoswarm.matchers.patch_registration import apply
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.recorded_pose import area_grid
+from orthoswarm.paper.leg_lines import find_legs, fit_line
+from orthoswarm.refine.bundle.flight_records import read_records
+from orthoswarm.refine.strategy.swarm_refiner import local_origin
 
 MIDDLE = 0.35
 """Share of a picture's width and height about its middle that the map is made of."""

@@ -27,8 +27,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from orthoswarm.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.geo import LocalGrid
+from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.geo import LocalGrid
 
 EAST, NORTH, EPSG = 327000.0, 3383000.0, 32648
 HEIGHT_M, GROUND_PX_M, MAP_PX_M = 100.0, 0.25, 0.5

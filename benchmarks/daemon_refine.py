@@ -20,7 +20,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from orthoswarm.frame import Frame
+from orthoswarm.model.frame import Frame
 
 RATE_HZ = 4.0
 

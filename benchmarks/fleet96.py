@@ -24,8 +24,8 @@ sys.path.insert(0, str(ROOT))
 
 
 def simulate(count: int, port: int, link: str, seconds: float) -> None:
-    from gcs_plugin.mavlink import Autopilot
-    from gcs_plugin.sim.swarm import SimSwarm, make_swarm
+    from gcs_plugin.links.mavlink import Autopilot
+    from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 
     address = f"udpout:127.0.0.1:{port}" if link == "udp" else f"tcpin:127.0.0.1:{port}"
     vehicles = make_swarm(count, autopilots=(Autopilot.ARDUPILOT, Autopilot.PX4))
@@ -35,8 +35,8 @@ def simulate(count: int, port: int, link: str, seconds: float) -> None:
 
 
 def measure(count: int, seconds: float, link: str) -> dict[str, Any]:
-    from gcs_plugin.fleet import Fleet
-    from gcs_plugin.links import TcpLink, UdpLink
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.links.transports import TcpLink, UdpLink
 
     warm_up_s = 15.0
     if link == "udp":

@@ -5,10 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from orthoswarm.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.frame import Fix, Frame
-from orthoswarm.geo import GroundGrid
-from orthoswarm.placement import PlacedFrame
+from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame
 
 EAST, NORTH = 327000.0, 3383000.0
 HEIGHT_M, SPACING_M, LEG_SPACING_M = 150.0, 8.75, 95.0

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from flight import area, fly
 
-from orthoswarm.mosaic.canvas import Canvas
+from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.mosaic.realtime import RealtimeMosaic, mosaic
-from orthoswarm.picture import read_rgba
+from orthoswarm.raster.picture_file import read_rgba
 
 
 def one_by_one(folder, grid, frames):

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from flight import area, fly
 
-from orthoswarm.mosaic.canvas import Canvas
-from orthoswarm.mosaic.gains import estimate_gains
-from orthoswarm.mosaic.render import render, serial
-from orthoswarm.picture import read_rgb
-from orthoswarm.placement import Terrain
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.renderer import render, serial
+from orthoswarm.raster.picture_file import read_rgb
 
 
 def cpu():

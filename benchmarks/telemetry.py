@@ -38,10 +38,10 @@ def bench_video(count: int) -> None:
     import av
     from av.codec.context import Flags
 
-    from telemetry import bitstream, sei
-    from telemetry.extract import extract
-    from telemetry.sample import Sample
-    from telemetry.seiwriter import add_sei
+    from telemetry.formats import bitstream, sei
+    from telemetry.samples.sample import Sample
+    from telemetry.video.extraction import extract
+    from telemetry.write.sei_writer import add_sei
 
     with tempfile.TemporaryDirectory() as folder:
         plain, marked = Path(folder, "plain.mp4"), Path(folder, "marked.mp4")
@@ -83,7 +83,7 @@ def bench_photos(folder: Path | None) -> None:
 
 def bench_klv() -> None:
     """ST 0601 packets."""
-    from telemetry import klv
+    from telemetry.formats import klv
 
     body = b"\x0d\x04\x20\x00\x00\x00\x0e\x04\x05\x00\x00\x00\x0f\x02\x20\x00\x05\x02\x40\x00" + bytes.fromhex("0102")
     whole = klv.ST0601_KEY + bytes([len(body) + 2]) + body

@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from orthoswarm.frame import Frame
+from orthoswarm.model.frame import Frame
 
 ENCODERS = {"H.264": "libx264", "H.265": "libx265"}
 
@@ -24,9 +24,9 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
     """One vehicle's pictures as a video with B-frames, poses as SEI."""
     import av
 
-    from orthoswarm.picture import read_rgb
-    from telemetry.sample import Sample
-    from telemetry.seiwriter import add_sei
+    from orthoswarm.raster.picture_file import read_rgb
+    from telemetry.samples.sample import Sample
+    from telemetry.write.sei_writer import add_sei
 
     plain = target.with_suffix(".plain.mp4")
     options = {"crf": str(crf), "preset": "medium", "bf": "3"} | (
@@ -74,7 +74,7 @@ def measure(inputs: Path, twin: Path, out: Path) -> dict[str, float]:
 
 def main() -> None:
     """Print a row for each kind."""
-    from telemetry.ingest import load
+    from telemetry.ingest.ingest import load
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("twin", type=Path)

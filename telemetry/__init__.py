@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from telemetry.ingest import LoadOptions, load
+    from telemetry.ingest.ingest import LoadOptions, load
 
 __all__ = ["LoadOptions", "load"]
 
@@ -11,7 +11,7 @@ __all__ = ["LoadOptions", "load"]
 def __getattr__(name: str) -> Any:
     """Import the readers on first use, so that the package itself costs nothing."""
     if name in __all__:
-        from telemetry import ingest
+        from telemetry.ingest import ingest
 
         return getattr(ingest, name)
     raise AttributeError(f"module 'telemetry' has no attribute '{name}'")

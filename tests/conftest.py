@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from orthoswarm.workers import single_threaded
+from orthoswarm.compute.workers import single_threaded
 
 single_threaded()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
 

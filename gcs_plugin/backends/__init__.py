@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gcs_plugin.backends.base import Backend
+from gcs_plugin.backends.backend import Backend
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
-from orthoswarm.errors import InputError
+from orthoswarm.model.errors import InputError
 
 NAMES = ("pymavlink", "mavsdk")
 

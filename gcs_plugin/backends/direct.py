@@ -5,17 +5,17 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.backends.base import ENDED, Backend, Report, Verb, late_start
-from gcs_plugin.fleet import Fleet
-from gcs_plugin.fleetevents import FleetEvent
-from gcs_plugin.links import Link
-from gcs_plugin.mavlink import Autopilot
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Verb, late_start
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.message_rates import default_rates
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.streams import default_rates
-from orthoswarm.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError
 
 _QUIET_S = 2.2  # two heartbeats: whoever has not been heard by then is not there
 

@@ -14,19 +14,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gcs_plugin.backends.base import ENDED, Backend, Report, Verb, late_start
-from gcs_plugin.fleetevents import FleetEvent, mission_event
-from gcs_plugin.links import parse_address
-from gcs_plugin.mavlink import Autopilot, Message
-from gcs_plugin.mission.compare import difference
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Verb, late_start
+from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
+from gcs_plugin.fleet.message_rates import Rates, Streams
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Autopilot, Message
+from gcs_plugin.links.transports import parse_address
+from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.control import unflyable
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import Mission, MissionItem
-from gcs_plugin.mission.modes import modes_of
-from gcs_plugin.streams import Rates, Streams
-from gcs_plugin.vehicle import Vehicle
-from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _HEARD: Final = (
     "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.bench.paste import paste
-from gcs_plugin.bench.runs import check_set, cost, described, keep, kept, label, machine, mosaic, share, text
+from gcs_plugin.bench.benchmark_runs import check_set, cost, described, keep, kept, label, machine, mosaic, share, text
+from gcs_plugin.bench.pasting import paste
 
 METHODS = ("nothing", "paper", "swarm", "truth")
 NAMES = {"nothing": "do nothing", "paper": "paper", "swarm": "swarm", "truth": "true poses"}
@@ -38,8 +38,8 @@ def run_accuracy(
 
 def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map: bool) -> dict[str, Any]:
     """One set mapped by one method and compared with the truth; a failure is a row with its message."""
-    from gcs_plugin.commands.evaluate import evaluate_poses
-    from orthoswarm.errors import OrthoSwarmError
+    from gcs_plugin.cli.verbs.evaluate import evaluate_poses
+    from orthoswarm.model.errors import OrthoSwarmError
 
     out = out.with_name(f"map-{folder.absolute().name}-{method}")
     row: dict[str, Any] = described(folder) | {"method": method}
@@ -63,7 +63,7 @@ def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map:
 
 def judged(product: Path, folder: Path) -> dict[str, Any]:
     """The figures of `orthoswarm evaluate` for a map of a set."""
-    from gcs_plugin.commands.evaluate import evaluate_ortho
+    from gcs_plugin.cli.verbs.evaluate import evaluate_ortho
 
     truth = folder / "truth"
     mask = truth / "ground_mask.tif"
@@ -80,9 +80,9 @@ def true_orthoimage(folder: Path, out: Path, photos: Path | None = None) -> dict
     from time import perf_counter, process_time
 
     import telemetry
-    from gcs_plugin.commands.evaluate import read_truth
-    from orthoswarm.errors import InputError
-    from orthoswarm.placement import PlacedFrame
+    from gcs_plugin.cli.verbs.evaluate import read_truth
+    from orthoswarm.model.errors import InputError
+    from orthoswarm.model.placement import PlacedFrame
 
     wall, cpu = perf_counter(), process_time()
     true = read_truth(folder / "truth" / "frames.csv")
@@ -98,7 +98,7 @@ def _true_ground(folder: Path) -> Any:
     import numpy as np
     import rasterio
 
-    from orthoswarm.placement import Terrain
+    from orthoswarm.model.placement import Terrain
 
     with rasterio.open(folder / "truth" / "dtm.tif") as dtm:
         step = max(1, round(4.0 / dtm.transform.a))

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthoswarm.errors import InputError
+from orthoswarm.model.errors import InputError
 
 _PROC = Path("/proc")
 _EVERY_S = 0.25

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gcs_plugin.bench.accuracy import judged, true_orthoimage
-from gcs_plugin.bench.meter import run_measured
-from gcs_plugin.bench.runs import (
+from gcs_plugin.bench.benchmark_runs import (
     check_set,
     described,
     keep,
@@ -29,7 +28,8 @@ from gcs_plugin.bench.runs import (
     share,
     text,
 )
-from orthoswarm.errors import InputError, OrthoSwarmError
+from gcs_plugin.bench.meter import run_measured
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 SUCCESS = 0.9
 """A map succeeded when this share of the ground that the photos show lies within a metre of its true place."""
@@ -111,7 +111,7 @@ def _script(name: str) -> Callable[[Job, Path], list[str]]:
 
 
 def _stitched(job: Job) -> tuple[Path, int | None]:
-    from gcs_plugin.bench.align import lay_on_reference
+    from gcs_plugin.bench.alignment import lay_on_reference
 
     out = job.out / "laid.tif"  # the best that anyone could do with it afterwards
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
@@ -122,10 +122,10 @@ def _pasted(job: Job) -> tuple[Path, int | None]:
     import numpy as np
 
     import telemetry
-    from gcs_plugin.bench.align import placed_models
-    from gcs_plugin.bench.paste import paste
-    from orthoswarm.geo import LocalGrid, area_epsg
-    from orthoswarm.placement import PlacedFrame, Terrain
+    from gcs_plugin.bench.alignment import placed_models
+    from gcs_plugin.bench.pasting import paste
+    from orthoswarm.model.geo import LocalGrid, area_epsg
+    from orthoswarm.model.placement import PlacedFrame, Terrain
 
     frames = {f.image: f for f in telemetry.load([job.photos]).frames}
     fixes = {name: f.fix for name, f in frames.items() if f.fix.height_m is not None}
@@ -280,7 +280,7 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
 
 def _shape(product: Path, job: Job) -> dict[str, Any] | None:
     """The figures of a map without its place: laid on the truth by one homography. None where it fits nowhere."""
-    from gcs_plugin.bench.align import lay_on_reference
+    from gcs_plugin.bench.alignment import lay_on_reference
 
     laid = job.out / "shape.tif"
     try:
@@ -377,7 +377,7 @@ def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]
 
 def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
     """Draw the maps of all programs side by side, one row for each set."""
-    from gcs_plugin.bench.sheet import contact_sheet, verdict
+    from gcs_plugin.bench.contact_sheet import contact_sheet, verdict
 
     by_set: dict[str, list[tuple[str, Path | None]]] = {}
     for row in result["rows"]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.bench.runs import cost, keep, kept, linked, machine, mosaic, pictures
-from orthoswarm.errors import InputError
+from gcs_plugin.bench.benchmark_runs import cost, keep, kept, linked, machine, mosaic, pictures
+from orthoswarm.model.errors import InputError
 
 FLAT = 0.2
 """Cost per picture counts as flat while it stays within this share of that of the smallest block."""

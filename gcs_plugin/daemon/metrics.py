@@ -3,8 +3,8 @@
 import time
 from typing import Final
 
-from gcs_plugin.daemon.core import Daemon
-from gcs_plugin.daemon.usage import resident_mb
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.jobs.process_usage import resident_mb
 from orthoswarm import __version__
 
 _QUANTILES: Final = (0.5, 0.9, 0.99, 1)

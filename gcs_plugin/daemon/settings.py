@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from orthoswarm.errors import InputError
+from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"
 PORT: Final = 8650

@@ -13,9 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gcs_plugin.daemon.flock import Flock
-from gcs_plugin.daemon.plans import Plans
-from orthoswarm.errors import InputError, OrthoSwarmError
+from gcs_plugin.daemon.vehicles import Flock
+from gcs_plugin.daemon.web_plans import Plans
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _AT_ONCE: Final = 16
 _log = logging.getLogger(__name__)

@@ -7,13 +7,13 @@ packets of the ground go to the vehicle that they name, or to all.
 import threading
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.hub import Hub, Side
-from gcs_plugin.links import Link, Peer
+from gcs_plugin.fleet.link_hub import Hub, Side
+from gcs_plugin.links.transports import Link, Peer
 from gcs_plugin.mission.exchange import Address
 
 if TYPE_CHECKING:
-    from gcs_plugin.fleet import Fleet
-    from gcs_plugin.packets import Packet
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.links.packets import Packet
 
 _WAIT_S: Final = 0.5
 

@@ -6,7 +6,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
-from gcs_plugin.demo.stage import Setting
+from gcs_plugin.demo.setting import Setting
 
 _MOST_WAITING: Final = 4
 _SLOW: Final = 0.15
@@ -35,13 +35,13 @@ def simulate(setting: Setting, pipe: Connection) -> None:
     Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # not inherited everywhere
-    from orthoswarm.workers import single_threaded
+    from orthoswarm.compute.workers import single_threaded
 
     single_threaded()
-    from gcs_plugin.demo.camera import Studio, TwinCamera, VideoServer
-    from gcs_plugin.demo.stage import build_stage
-    from gcs_plugin.sim.motion import Airframe
-    from gcs_plugin.sim.swarm import SimSwarm, make_swarm
+    from gcs_plugin.demo.setting import build_stage
+    from gcs_plugin.demo.simulated_camera import Studio, TwinCamera, VideoServer
+    from gcs_plugin.sim.multirotor import Airframe
+    from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 
     stage, site = build_stage(setting)
     systems = range(1, setting.vehicles + 1)

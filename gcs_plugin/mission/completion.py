@@ -18,7 +18,7 @@ import enum
 from collections.abc import Mapping
 from typing import Any, Final
 
-from gcs_plugin.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
 from gcs_plugin.mission.items import Ending, Mission, ending_of, final_nav
 
 

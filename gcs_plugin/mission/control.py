@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.flight_modes import Modes, mode_params
 from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
-from gcs_plugin.mission.modes import Modes, mode_params
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)

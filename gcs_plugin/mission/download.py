@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.mavlink import Message, dialect
+from gcs_plugin.links.mavlink import Message, dialect
 from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip
 from gcs_plugin.mission.items import MissionItem
 from gcs_plugin.mission.refusal import ACCEPTED, DENIED

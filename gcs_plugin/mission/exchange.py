@@ -9,7 +9,7 @@ import abc
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, dialect
+from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, dialect
 
 NEVER: Final = float("inf")
 MISSION: Final = int(dialect.MAV_MISSION_TYPE_MISSION)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gcs_plugin.mavlink import Autopilot, Message, command_name, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, command_name, dialect
 
 FRAME_GLOBAL = int(dialect.MAV_FRAME_GLOBAL)
 FRAME_MISSION = int(dialect.MAV_FRAME_MISSION)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from gcs_plugin.mavlink import dialect
+from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.mission.items import Mission
 
 ACCEPTED: Final = int(dialect.MAV_MISSION_ACCEPTED)

@@ -16,21 +16,12 @@ import enum
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.compare import difference
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.mission.refusal import (
-    ACCEPTED,
-    CANCELLED,
-    DENIED,
-    ERROR,
-    INVALID_SEQUENCE,
-    NO_SPACE,
-    Refusal,
-    explain,
-)
+from gcs_plugin.mission.refusal import ACCEPTED, CANCELLED, DENIED, ERROR, INVALID_SEQUENCE, NO_SPACE, Refusal, explain
 
 # Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): silence of a few of these means more than loss.
 _COUNT_AGAIN_S: Final = 1.0

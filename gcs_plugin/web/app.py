@@ -14,15 +14,15 @@ from starlette.formparsers import MultiPartException
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
-from gcs_plugin.daemon.core import Daemon
-from gcs_plugin.daemon.flock import Flock
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, parse_pose, parse_time
+from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.metrics import prometheus
-from gcs_plugin.daemon.pose import PostedPose, parse_pose, parse_time
 from gcs_plugin.daemon.takeoffs import names_of
-from gcs_plugin.daemon.tiles import TileAddress
+from gcs_plugin.daemon.vehicles import Flock
 from gcs_plugin.web.guard import Guard, TooLarge, bounded
 from orthoswarm import __version__
-from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Result = TypeVar("Result")
 Linked = TypeVar("Linked")

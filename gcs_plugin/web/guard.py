@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from orthoswarm.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _OPEN: Final = frozenset({"/healthz", "/", "/favicon.ico"})

@@ -21,8 +21,8 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
-from orthoswarm.export.partial import written_whole
-from orthoswarm.geo import GroundGrid
+from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
 TILE_PX = 512

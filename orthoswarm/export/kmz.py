@@ -12,9 +12,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.errors import InputError
 from orthoswarm.export.mbtiles import encode_tile
-from orthoswarm.export.partial import written_whole
+from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]
 _SINGLE_PX = 2048

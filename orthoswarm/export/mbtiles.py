@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.errors import InputError
-from orthoswarm.export.partial import written_whole
+from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]
 Format = Literal["png", "webp", "jpg"]
@@ -196,7 +196,7 @@ class _Writer:
                         self._put(level.zoom, left + c, top + r, np.ascontiguousarray(tile))
 
     def _coarser(self, level: Range) -> None:
-        from orthoswarm.mosaic.overview import reduce_rgba
+        from orthoswarm.canvas.overviews import reduce_rgba
 
         for y in range(level.top, level.bottom + 1):
             for x in range(level.left, level.right + 1):

@@ -5,9 +5,9 @@ rectified patch and a larger window of the map around the place where the patch 
 Learned ones need weights from packages (`orthoswarm weights`); SIFT and CFOG need none.
 """
 
-from orthoswarm.matchers.base import MapMatcher, Matches, PictureMatcher
-from orthoswarm.matchers.opinion import second_opinion
+from orthoswarm.matchers.matcher import MapMatcher, Matches, PictureMatcher
 from orthoswarm.matchers.registry import available, map_matcher, picture_matcher
+from orthoswarm.matchers.second_opinion import second_opinion
 
 __all__ = [
     "MapMatcher",

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.matchers.base import Array, Floats, Mask, Matches
-from orthoswarm.parabola import vertex
+from orthoswarm.matchers.matcher import Array, Floats, Mask, Matches
+from orthoswarm.raster.subpixel_peak import vertex
 
 DIRECTIONS = 6
 TILE_PX = 64

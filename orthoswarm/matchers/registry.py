@@ -11,8 +11,8 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any
 
-from orthoswarm.errors import InputError
-from orthoswarm.matchers.base import MapMatcher, PictureMatcher, UnavailableError
+from orthoswarm.matchers.matcher import MapMatcher, PictureMatcher, UnavailableError
+from orthoswarm.model.errors import InputError
 
 GROUP = "orthoswarm.matchers"
 PICTURE_ORDER = ("xfeat", "sift")
@@ -22,19 +22,19 @@ MAP_ORDER = ("xfeat-window", "cfog")
 
 
 def _learned(kind: Any) -> PictureMatcher:
-    from orthoswarm.matchers.learned import Learned
+    from orthoswarm.matchers.sparse_learned import Learned
 
     return Learned.make(kind)
 
 
 def _sift() -> PictureMatcher:
-    from orthoswarm.matchers.classic import Sift
+    from orthoswarm.matchers.sift import Sift
 
     return Sift()
 
 
 def _window() -> MapMatcher:
-    from orthoswarm.matchers.window import XFeatWindow
+    from orthoswarm.matchers.dense_window import XFeatWindow
 
     return XFeatWindow.make()
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from orthoswarm.matchers.base import Floats, Mask, Matches, UnavailableError
-from orthoswarm.matchers.learned import device, read_state
+from orthoswarm.matchers.matcher import Floats, Mask, Matches, UnavailableError
+from orthoswarm.matchers.sparse_learned import device, read_state
 
 _COUNT = 4000
 _LEAST_CERTAINTY = 0.3

@@ -1,1 +1,1 @@
-"""The orthoimage: an out-of-core tiled canvas, the real-time module (paper III.B) and the final renderer."""
+"""From placed frames to the orthoimage: footprints, the real-time module (paper III.B), seam labels, the renderer."""

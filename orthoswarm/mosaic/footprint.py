@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthoswarm.camera import Camera, Lens
-from orthoswarm.mosaic.lenses import INNER, OUTER, lens_row
+from orthoswarm.model.camera import Camera, Lens
+from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
 

@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.camera import Camera
-from orthoswarm.errors import InputError
-from orthoswarm.mosaic.canvas import Canvas
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.downsampling import pack, reduction
 from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
-from orthoswarm.mosaic.fuse import RUN, aim, fuse, touches
-from orthoswarm.mosaic.lenses import INNER, OUTER, lens_row
-from orthoswarm.mosaic.passes import Read
-from orthoswarm.mosaic.reduce import pack, reduction
-from orthoswarm.mosaic.render import Progress, RenderStats, Run, render, serial
-from orthoswarm.mosaic.tiles import Key
-from orthoswarm.picture import read_rgb
-from orthoswarm.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
+from orthoswarm.mosaic.realtime_kernel import RUN, aim, fuse, touches
+from orthoswarm.mosaic.render_passes import Read
+from orthoswarm.mosaic.renderer import Progress, RenderStats, Run, render, serial
+from orthoswarm.raster.picture_file import read_rgb
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -3,6 +3,6 @@
 `Plan` and its parts are the types that other packages use; `orthoswarm.planning.planner` makes them.
 """
 
-from orthoswarm.planning.types import End, Gap, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.model.plan import End, Gap, Plan, Sortie, VehiclePlan, Waypoint
 
 __all__ = ["End", "Gap", "Plan", "Sortie", "VehiclePlan", "Waypoint"]

@@ -6,20 +6,20 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.errors import InputError
-from orthoswarm.geo import LocalGrid, area_epsg
-from orthoswarm.planning import coverage
-from orthoswarm.planning.area import Area
-from orthoswarm.planning.candidates import METHODS, Method, candidates
-from orthoswarm.planning.crew import Crew, Options, Work
-from orthoswarm.planning.flights import Flight
-from orthoswarm.planning.footprint import Footprint
-from orthoswarm.planning.motion import Motion
-from orthoswarm.planning.routes import Router, make_obstacles
-from orthoswarm.planning.schedule import Separation, Slot
-from orthoswarm.planning.shapes import Ring
-from orthoswarm.planning.sweep import Field, stretches
-from orthoswarm.planning.types import Gap, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.plan import Gap, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.planning.area.area import Area
+from orthoswarm.planning.area.shape_files import Ring
+from orthoswarm.planning.lines import planned_coverage
+from orthoswarm.planning.lines.candidates import METHODS, Method, candidates
+from orthoswarm.planning.lines.detours import Router, make_obstacles
+from orthoswarm.planning.lines.line_spacing import Footprint
+from orthoswarm.planning.lines.sweep_lines import Field, stretches
+from orthoswarm.planning.sorties.assignment import Crew, Options, Work
+from orthoswarm.planning.sorties.deconfliction import Separation, Slot
+from orthoswarm.planning.sorties.flight_path import Flight
+from orthoswarm.planning.sorties.flight_time import Motion
 
 __all__ = ["METHODS", "Method", "Options", "plan_area", "plan_lines"]
 
@@ -66,11 +66,11 @@ def plan_area(
     slots = crew.schedule(best)
     progress("coverage")
     flown = np.concatenate([_legs_of(s.flight) for row in slots for s in row])
-    left = coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
-    gaps = tuple(_gap(p, area.grid) for p in coverage.pieces(left))
+    left = planned_coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
+    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
     warnings = _warnings(slots, best, foot, options)
-    if seen < coverage.COMPLETE:
+    if seen < planned_coverage.COMPLETE:
         warnings.append(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
@@ -179,7 +179,7 @@ def _legs_of(flight: Flight) -> Array:
     return np.stack([flight.points[flight.camera == 1, :2], flight.points[flight.camera == -1, :2]], axis=1)
 
 
-def _gap(piece: coverage.Geometry, grid: LocalGrid) -> Gap:
+def _gap(piece: planned_coverage.Geometry, grid: LocalGrid) -> Gap:
     point = shapely.point_on_surface(piece)
     lat, lon = grid.to_geographic([point.x, point.y])
     return Gap(round(float(lat), 7), round(float(lon), 7), round(float(piece.area), 1))

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
-from orthoswarm.basemap import Basemap
-from orthoswarm.frame import Rejection
-from orthoswarm.geo import GroundGrid
+from orthoswarm.export.product_files import write_text
+from orthoswarm.model.frame import Rejection
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.mosaic.footprint import footprint
-from orthoswarm.placement import PlacedFrame
-from orthoswarm.products import write_text
+from orthoswarm.raster.basemap import Basemap
 from orthoswarm.report import charts
-from orthoswarm.report.displacement import Moved, moved
-from orthoswarm.report.pictures import (
+from orthoswarm.report.displacement_map import Moved, moved
+from orthoswarm.report.report_pictures import (
     MapView,
     Picture,
     data_uri,

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.kernels import kernel
-from orthoswarm.twin import scene as kinds
-from orthoswarm.twin.grain import hash01, lattice, noise_field
-from orthoswarm.twin.render import HAZE_CELL_M
-from orthoswarm.twin.scene import TEXEL_M, Scene
+from orthoswarm.compute.jit import kernel
+from orthoswarm.twin.camera.ray_marching import HAZE_CELL_M
+from orthoswarm.twin.city import scene as kinds
+from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
+from orthoswarm.twin.city.scene import TEXEL_M, Scene
 
 Floats = NDArray[np.float32]
 

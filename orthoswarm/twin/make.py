@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.camera import Camera, rotation_from_angles
-from orthoswarm.errors import InputError
-from orthoswarm.geo import LocalGrid
-from orthoswarm.twin.flight import Flight, fly
-from orthoswarm.twin.presets import TwinSpec
-from orthoswarm.twin.products import (
+from orthoswarm.model.camera import Camera, rotation_from_angles
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.twin.camera.photo_tags_writer import PhotoTags, with_tags
+from orthoswarm.twin.camera.ray_marching import Stage, lens_rays, render
+from orthoswarm.twin.camera.sensor import Sensor
+from orthoswarm.twin.dataset_files import (
     after_disaster,
     photo_name,
     write_basemap,
@@ -23,11 +24,10 @@ from orthoswarm.twin.products import (
     write_truth,
     write_whole,
 )
-from orthoswarm.twin.record import Record, record
-from orthoswarm.twin.render import Stage, lens_rays, render
-from orthoswarm.twin.sensor import Sensor
+from orthoswarm.twin.presets import TwinSpec
+from orthoswarm.twin.recorded_noise import Record, record
 from orthoswarm.twin.site import Site, disaster_zones
-from orthoswarm.twin.tags import PhotoTags, with_tags
+from orthoswarm.twin.true_flight import Flight, fly
 
 Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0

@@ -3,9 +3,9 @@
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from orthoswarm.errors import InputError
-from orthoswarm.twin.flight import FlightPlan, Motion
-from orthoswarm.twin.record import Noise
+from orthoswarm.model.errors import InputError
+from orthoswarm.twin.recorded_noise import Noise
+from orthoswarm.twin.true_flight import FlightPlan, Motion
 
 NOISES: dict[str, Noise] = {
     "none": Noise(position_m=0.0, drift_per_photo_m=0.0),

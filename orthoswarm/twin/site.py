@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthoswarm.errors import InputError
-from orthoswarm.geo import LocalGrid, utm_epsg
-from orthoswarm.twin.builder import Slot
-from orthoswarm.twin.city import build_city
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid, utm_epsg
+from orthoswarm.twin.city.builder import Slot
+from orthoswarm.twin.city.city import build_city
+from orthoswarm.twin.city.scene import Scene, scene_grid
+from orthoswarm.twin.city.sunlight import Sun
 from orthoswarm.twin.disaster import SIZES_M, Zone
-from orthoswarm.twin.light import Sun
 from orthoswarm.twin.presets import TwinSpec
-from orthoswarm.twin.scene import Scene, scene_grid
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Site:
     def of(cls, spec: TwinSpec) -> "Site":
         """The site of a set."""
         if spec.ground is not None:
-            from orthoswarm.twin.photo_ground import ground_place
+            from orthoswarm.twin.city.photo_ground import ground_place
 
             epsg, center, _ = ground_place(spec.ground)
             return cls(LocalGrid(epsg), center, spec.plan.heading_rad)
@@ -40,7 +40,7 @@ class Site:
         c, s = abs(np.cos(spec.plan.heading_rad)), abs(np.sin(spec.plan.heading_rad))
         half = (float(across * c + along * s), float(across * s + along * c))
         if spec.ground is not None:
-            from orthoswarm.twin.photo_ground import load_ground
+            from orthoswarm.twin.city.photo_ground import load_ground
 
             return load_ground(spec.ground, self.center, half), []
         return build_city(scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m)
@@ -112,7 +112,7 @@ def with_heading(spec: TwinSpec) -> TwinSpec:
     rng = np.random.default_rng([spec.seed, 97])
     quarter = float(rng.choice([0.0, np.pi / 2]))
     if spec.ground is not None:  # the long side of the area along the long side of the place
-        from orthoswarm.twin.photo_ground import ground_place
+        from orthoswarm.twin.city.photo_ground import ground_place
 
         size = ground_place(spec.ground)[2]
         across, along = spec.plan.extent_m

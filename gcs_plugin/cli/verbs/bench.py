@@ -1,0 +1,142 @@
+"""`orthoswarm bench`: accuracy and cost on sets with truth; how cost grows; other programs on the same photos.
+
+Every map is made by the `mosaic` verb in a process of its own, as a user would make it, so that times and memory are
+whole and comparable. What is measured already is kept: an interrupted benchmark goes on, and more sets can be added.
+"""
+
+import argparse
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "A SET is a folder of `orthoswarm twin make`: photos, basemap.tif, truth. Results lie in DIR, one file for\n"
+        "each run; a run whose file is there is not repeated. Maps are removed unless --keep is given.\n\n"
+        "example:\n  orthoswarm twin make debris --out sets/debris\n"
+        "  orthoswarm bench accuracy sets/debris --out bench\n"
+        "  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench\n"
+        "  orthoswarm bench peers sets/debris --every 3 --out bench"
+    )
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="accuracy|scaling|peers")
+    accuracy = kinds.add_parser(
+        "accuracy",
+        help="do nothing, the paper, swarm, true poses: error, cost, memory",
+        epilog="example:\n  orthoswarm bench accuracy sets/debris --methods swarm,truth --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    accuracy.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
+    methods = "nothing,paper,swarm,truth"
+    accuracy.add_argument("--methods", default=methods, metavar="LIST", help=f"some of {methods} (default all)")
+    scaling = kinds.add_parser(
+        "scaling",
+        help="time against vehicles (Fig. 7) and pictures a vehicle (Fig. 8)",
+        epilog="example:\n  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    scaling.add_argument("sets", nargs=1, type=Path, metavar="SET", help="a folder of `twin make`")
+    scaling.add_argument(
+        "--vehicles", default="1,2,3,4,8,16,32,64,96", help="numbers of vehicles (default %(default)s)"
+    )
+    scaling.add_argument("--images", default="42,85,170,339", help="pictures a vehicle (default %(default)s)")
+    scaling.add_argument("--refine", default="swarm", help="which refiner (default %(default)s)")
+    peers = kinds.add_parser(
+        "peers",
+        help="other programs on the same photos (Table I)",
+        description="Runs other programs in environments of their own, made with pip on first use, and judges their "
+        "maps by the true map. Linux only.",
+        epilog="example:\n  orthoswarm bench peers sets/debris --every 3 --out bench",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    peers.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
+    programs = "swarm,paper,pyorthomosaic,stitcher,pycolmap"
+    peers.add_argument("--programs", default=programs, metavar="LIST", help=f"some of {programs} (default all)")
+    peers.add_argument(
+        "--every", type=int, default=1, metavar="N", help="use every N-th photo of a vehicle (default 1)"
+    )
+    peers.add_argument(
+        "--limit-s", type=float, default=900.0, metavar="S", help="CPU seconds for a program and set (default 900)"
+    )
+    peers.add_argument(
+        "--environments", type=Path, metavar="DIR", help="where they are (default environments in --out)"
+    )
+    for sub in (scaling, peers):
+        sub.add_argument("--figures", type=Path, metavar="DIR", help="folder for pictures (default: that of --out)")
+    for sub in (accuracy, scaling, peers):
+        sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for results")
+        sub.add_argument("--keep", action="store_true", help="keep the maps")
+        sub.add_argument("--json", action="store_true", help="one JSON document on stdout")
+        what = "threads of each program (default 1)" if sub is peers else "processes at once (default: one a core)"
+        sub.add_argument("--workers", type=int, metavar="N", help=what)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure."""
+    from orthoswarm.compute.workers import single_threaded
+
+    single_threaded()
+    from gcs_plugin.bench.benchmark_runs import check_set, keep
+
+    for folder in args.sets:
+        check_set(folder)
+    args.out.mkdir(parents=True, exist_ok=True)
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a program that is measured ends, too
+    try:
+        result, table = {"accuracy": _accuracy, "scaling": _scaling, "peers": _peers}[args.kind](args)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    thin = f"-every{args.every}" if args.kind == "peers" and args.every > 1 else ""
+    keep(args.out / f"{args.kind}{thin}.json", result)
+    (args.out / f"{args.kind}{thin}.md").write_text(table, encoding="utf-8")
+    print(json.dumps(result) if args.json else table)
+    return 0 if any("error" not in row for row in result["rows"]) else 1
+
+
+def _accuracy(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from gcs_plugin.bench.accuracy import METHODS, accuracy_table, run_accuracy
+    from orthoswarm.model.errors import InputError
+
+    methods = _list(args.methods)
+    if not methods or set(methods) - set(METHODS):
+        raise InputError(f"--methods takes some of {', '.join(METHODS)}; give them with commas between")
+    result = run_accuracy(args.sets, methods, args.out, args.workers, args.keep)
+    return result, accuracy_table(result)
+
+
+def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from gcs_plugin.bench.benchmark_runs import numbers
+    from gcs_plugin.bench.scaling import plot_scaling, run_scaling, scaling_table
+
+    counts, images = numbers(args.vehicles, "--vehicles"), numbers(args.images, "--images")
+    result = run_scaling(args.sets[0], counts, images, args.refine, args.out, args.workers, args.keep)
+    plot_scaling(result, args.figures or args.out)
+    return result, scaling_table(result)
+
+
+def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from gcs_plugin.bench.peers import Settings, peers_sheet, peers_table, run_peers
+    from orthoswarm.model.errors import InputError
+
+    if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
+        raise InputError("--every, --limit-s and --workers take numbers above 0")
+    settings = Settings(
+        tuple(_list(args.programs)),
+        args.out.absolute(),
+        args.environments or args.out.absolute() / "environments",
+        args.limit_s,
+        args.every,
+        args.workers or 1,
+        args.keep,
+    )
+    result = run_peers(args.sets, settings)
+    thin = f"-every{args.every}" if args.every > 1 else ""
+    peers_sheet(result, settings, (args.figures or args.out) / f"peers{thin}.jpg")
+    return result, peers_table(result)
+
+
+def _list(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]

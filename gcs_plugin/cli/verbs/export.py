@@ -1,0 +1,152 @@
+"""`orthoswarm export`: a finished map in the formats of other programs."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+FORMATS = ("mbtiles", "kmz", "gpkg", "odm", "cog")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "mbtiles  web map tiles for tablets and offline maps\n"
+        "kmz      Google Earth, ATAK and other globes\n"
+        "gpkg     footprints of the pictures as polygons\n"
+        "odm      pictures and refined positions for OpenDroneMap\n"
+        "cog      the orthoimage in another coordinate system or as a small JPEG\n\n"
+        "example:\n  orthoswarm export map --to mbtiles kmz"
+    )
+    add = parser.add_argument
+    add("map", type=Path, metavar="OUT", help="output folder of `orthoswarm mosaic`")
+    add("--to", nargs="+", choices=FORMATS, required=True, metavar="FORMAT", help=", ".join(FORMATS))
+    add("--layer", choices=("realtime", "coarse", "orthoimage"), help="which picture (default: the best there is)")
+    add("--dest", type=Path, metavar="DIR", help="where to write (default: OUT/export)")
+    add("--tile-format", choices=("png", "webp", "jpg"), default="png", help="of MBTiles (default png)")
+    add("--quality", type=int, default=85, metavar="Q", help="of JPEG and WebP, 1 to 100 (default 85)")
+    add("--epsg", type=int, metavar="CODE", help="coordinate system of the COG (default: as it is)")
+    add("--jpeg", action="store_true", help="COG as a JPEG, a tenth of the size, with small losses")
+    add("--images", type=Path, metavar="DIR", help="folder of the pictures, if they were moved since")
+    add("--json", action="store_true", help="one JSON document on stdout")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the files."""
+    from orthoswarm.compute.workers import single_threaded
+
+    single_threaded()
+    import json
+
+    from gcs_plugin.cli.progress import ProgressBars
+    from orthoswarm.model.errors import InputError
+
+    if not 1 <= args.quality <= 100:
+        raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")
+    if not args.map.is_dir():
+        raise InputError(f"{args.map} is no folder; name the output folder of `orthoswarm mosaic`")
+    dest = args.dest or args.map / "export"
+    made: dict[str, str] = {}
+    notes: list[str] = []
+    with ProgressBars() as bars:
+        for kind in args.to:
+            made[kind] = str(_WRITERS[kind](args, dest, partial(bars, f"writing {kind}"), notes))
+    if args.json:
+        print(json.dumps({"files": made, "notes": notes}, indent=1, ensure_ascii=False))
+    else:
+        print(*made.values(), sep="\n")
+        for note in notes:
+            print(f"note: {note}")
+    return 0
+
+
+Tell = Callable[[int, int], None]
+
+
+def _layer(args: argparse.Namespace) -> Path:
+    """The picture to export."""
+    from orthoswarm.model.errors import InputError
+
+    names = [args.layer] if args.layer else ["orthoimage", "coarse", "realtime"]
+    for name in names:
+        path = Path(args.map / f"{name}.tif")
+        if path.exists():
+            return path
+    raise InputError(f"{args.map} holds no {' or '.join(names)}.tif; make the map with `orthoswarm mosaic` first")
+
+
+def _mbtiles(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    from orthoswarm.export.mbtiles import write_mbtiles
+
+    layer = _layer(args)
+    path = dest / f"{layer.stem}.mbtiles"
+    write_mbtiles(layer, path, name=layer.stem, tile_format=args.tile_format, quality=args.quality, progress=tell)
+    return path
+
+
+def _kmz(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    from orthoswarm.export.kmz import write_kmz
+
+    layer = _layer(args)
+    path = dest / f"{layer.stem}.kmz"
+    write_kmz(layer, path, name=layer.stem, progress=tell)
+    return path
+
+
+def _gpkg(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    import shutil
+
+    from orthoswarm.model.atomic_file import written_whole
+    from orthoswarm.model.errors import InputError
+
+    source = args.map / "footprints.gpkg"
+    if not source.exists():
+        raise InputError(f"{args.map} holds no footprints.gpkg; make the map with `orthoswarm mosaic` first")
+    path = dest / "footprints.gpkg"
+    with written_whole(path) as part:
+        shutil.copyfile(source, part)
+    tell(1, 1)
+    return path
+
+
+def _odm(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    import json
+
+    from orthoswarm.export.odm_folder import write_odm
+    from orthoswarm.export.product_files import read_frames
+    from orthoswarm.model.errors import InputError
+
+    lines = args.map / "frames.jsonl"
+    if not lines.exists():
+        raise InputError(f"{args.map} holds no frames.jsonl; make the map with `orthoswarm mosaic` first")
+    report = json.loads((args.map / "report.json").read_text(encoding="utf-8"))
+    root = args.images or (Path(report["root"]) if report.get("root") else None)
+
+    def find(row: Mapping[str, Any]) -> Path | None:
+        path = root / row["image"] if root else None
+        return path if path is not None and path.is_file() else None
+
+    gone = write_odm(list(read_frames(lines)), find, dest / "odm", progress=tell)
+    if gone:
+        notes.append(f"{len(gone)} pictures are not where they were and were left out, the first is {gone[0]}")
+    return dest / "odm"
+
+
+def _cog(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    from orthoswarm.export.cog_conversion import convert_cog
+
+    layer = _layer(args)
+    path = dest / f"{layer.stem}.tif"
+    convert_cog(layer, path, epsg=args.epsg, jpeg_quality=args.quality if args.jpeg else None)
+    tell(1, 1)
+    return path
+
+
+_WRITERS: dict[str, Callable[[argparse.Namespace, Path, Tell, list[str]], Path]] = {
+    "mbtiles": _mbtiles,
+    "kmz": _kmz,
+    "gpkg": _gpkg,
+    "odm": _odm,
+    "cog": _cog,
+}

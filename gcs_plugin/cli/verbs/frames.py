@@ -1,0 +1,124 @@
+"""`orthoswarm frames`: the pictures of a video as JPEG files that carry their poses."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from orthoswarm.model.frame import Frame
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "Each vehicle gets a folder of JPEG files with position, time and attitude in EXIF and XMP, as OpenDroneMap,\n"
+        "QGIS and this program read them. Photos are copied with what a geo.txt or CSV beside them adds.\n\n"
+        "example:\n  orthoswarm frames flight.mp4 --out pictures --every-m 5"
+    )
+    add = parser.add_argument
+    add("inputs", nargs="+", type=Path, metavar="INPUT", help="videos, or folders with videos or photos")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
+    add("--every-m", type=float, metavar="M", help="one picture every M metres (default: 4 %% of the height)")
+    add("--every-s", type=float, metavar="S", help="one picture every S seconds")
+    add("--json", action="store_true", help="print what was written as one JSON document on stdout")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Take the pictures."""
+    import json
+    import sys
+    import tempfile
+    from contextlib import suppress
+
+    from gcs_plugin.cli.progress import ProgressBars
+    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+    single_threaded()
+    from telemetry.ingest.ingest import LoadOptions, load, require_frames
+
+    for name, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
+        if value is not None and not value > 0:
+            raise InputError(f"{name} must be larger than zero; leave it out for the default")
+    if args.out.is_file():
+        raise InputError(f"{args.out} is a file; choose a folder for --out")
+    new = not args.out.exists()
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=args.out, prefix=".taking-") as cache, ProgressBars() as progress:
+            options = LoadOptions(args.every_m, args.every_s, Path(cache), exclude=(args.out,))
+            found = load(args.inputs, progress=progress, options=options)
+            require_frames(found)
+            taken: set[Path] = set()
+            written = [write(frame, args.out, taken) for frame in found.frames]
+            progress("writing pictures", len(written), len(written))
+    except OSError as error:
+        raise OrthoSwarmError(
+            f"{args.out} cannot be written ({error.strerror}); free space or choose another"
+        ) from None
+    except InputError:
+        if new:
+            with suppress(OSError):
+                args.out.rmdir()
+        raise
+    if args.json:
+        document = {
+            "written": [
+                {"file": str(path), "image": frame.image, "vehicle": frame.vehicle, "time_s": frame.time_s}
+                for path, frame in zip(written, found.frames, strict=True)
+            ],
+            "rejected": [{"image": r.image, "reason": r.reason} for r in found.rejected],
+            "warnings": found.warnings,
+        }
+        json.dump(document, sys.stdout, indent=1, ensure_ascii=False)
+        print()
+    else:
+        for warning in found.warnings:
+            print(f"! {warning}", file=sys.stderr)
+        for rejection in found.rejected:
+            print(f"x {rejection.image}: {rejection.reason}", file=sys.stderr)
+        vehicles = len({frame.vehicle for frame in found.frames})
+        print(f"{len(written)} pictures of {vehicles} vehicle(s) in {args.out}")
+    return 0
+
+
+def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
+    """Write one frame's picture with its pose; returns the file, which is none of those taken, and is one then.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import os
+
+    from orthoswarm.raster.picture_file import read_rgb
+    from telemetry.video.extraction import encode_jpeg
+    from telemetry.write.tag_writer import with_pose
+
+    folder = out.joinpath(*(_safe(part) for part in frame.vehicle.split("/")))
+    folder.mkdir(parents=True, exist_ok=True)
+    stem, _, number = frame.image.rsplit("/", 1)[-1].partition("#")
+    name = _safe(Path(stem).stem + (f"_{number}" if number else ""))
+    target = folder / f"{name}.jpg"
+    again = 1
+    while _key(target) in taken:  # two files of that name, in folders of one vehicle or with other suffixes
+        again += 1
+        target = folder / f"{name}-{again}.jpg"
+    taken.add(_key(target))
+    data = frame.path.read_bytes()
+    if data[:2] != b"\xff\xd8":
+        data = encode_jpeg(read_rgb(frame.path))
+    temporary = folder / f".{target.name}.part"
+    temporary.write_bytes(with_pose(data, frame))
+    os.replace(temporary, target)
+    return target
+
+
+def _key(path: Path) -> Path:
+    """The same for names that are one file's on systems that do not tell capitals from small letters."""
+    return path.with_name(path.name.casefold())
+
+
+def _safe(name: str) -> str:
+    """A name that is one file's on every system."""
+    kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(" .")
+    return kept or "_"

@@ -1,0 +1,192 @@
+"""`orthoswarm inspect`: what there is, and what is suspicious."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthoswarm.model.angles import wrap_deg
+
+if TYPE_CHECKING:
+    from telemetry.ingest.ingest import Survey
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "Reads photos, videos (SEI, KLV, djmd, subtitles), geo.txt, CSV of poses and flight logs; changes nothing."
+        "\n\nexample:\n  orthoswarm inspect photos flight.mp4 --picture tracks.png"
+    )
+    add = parser.add_argument
+    add("inputs", nargs="+", type=Path, metavar="INPUT", help="folders, photos, videos, logs")
+    add("--json", action="store_true", help="print one JSON document on stdout")
+    add("--picture", type=Path, metavar="PNG", help="write a picture of the tracks")
+    add("--no-pictures", action="store_true", help="look at tags only, do not match pictures to confirm the yaw")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look at the inputs and tell."""
+    import json
+    import sys
+
+    from gcs_plugin.cli.progress import ProgressBars
+    from orthoswarm.compute.workers import single_threaded
+
+    single_threaded()
+    from telemetry.ingest.ingest import LoadOptions, survey
+    from telemetry.ingest.summary import summarise
+
+    with ProgressBars() as progress:
+        found = survey(args.inputs, progress=progress, options=LoadOptions(decode=False))
+        document = summarise(found, pictures=not args.no_pictures)
+    if args.picture is not None:
+        draw_tracks(found, args.picture)
+        document["picture"] = str(args.picture)
+    if args.json:
+        json.dump(document, sys.stdout, indent=1, ensure_ascii=False)
+        print()
+    else:
+        _tell(document)
+    return 0 if document["sources"] or document["rejected"] else 1
+
+
+def _tell(document: dict[str, Any]) -> None:
+    """The document as tables on stdout."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from telemetry.ingest.summary import one_line
+
+    console = Console()
+    for source in document["sources"]:
+        console.print(f"\n[bold]{escape(one_line(source))}[/bold]")
+        if source["vehicles"]:
+            table = Table("vehicle", "pictures", "legs", "length", "start", "end", "height", "pitch", box=None)
+            for v in source["vehicles"]:
+                table.add_row(
+                    escape(v["id"]), str(v["frames"]), str(v["legs"]), f"{v['length_m']:.0f} m",
+                    v["start"] or "?", v["end"] or "?", _range(v.get("height_m"), "m"), _range(v.get("pitch_deg"), "°"),
+                )  # fmt: skip
+            console.print(table)
+            for v in source["vehicles"]:
+                if v.get("fields"):
+                    console.print(
+                        f"  {escape(v['id'])}: " + "; ".join(f"{k} from {escape(s)}" for k, s in v["fields"].items()),
+                        style="dim",
+                    )
+        for finding in source["findings"]:
+            mark = "[yellow]![/yellow]" if finding["severity"] == "warning" else "[dim]i[/dim]"
+            console.print(f"  {mark} [bold]{finding['code']}[/bold] {escape(finding['message'])}")
+    if document["rejected"]:
+        console.print(f"\n[bold]{len(document['rejected'])} cannot be used[/bold]")
+        for rejection in document["rejected"][:20]:
+            console.print(f"  [red]x[/red] {escape(rejection['image'])}: {escape(rejection['reason'])}")
+        if len(document["rejected"]) > 20:
+            console.print(f"  and {len(document['rejected']) - 20} more (--json lists all)")
+    for finding in document["findings"]:
+        console.print(f"[yellow]![/yellow] {escape(finding['message'])}")
+
+
+def _range(pair: list[float] | None, unit: str) -> str:
+    if pair is None:
+        return "?"
+    low, high = pair
+    return f"{low:.0f}{unit}" if high - low < 0.5 else f"{low:.0f} to {high:.0f}{unit}"
+
+
+Row = tuple[float, float, float | None]
+"""Latitude, longitude in degrees, yaw in radians."""
+
+
+def draw_tracks(found: "Survey", path: Path) -> None:
+    """A picture of all vehicles' tracks, with an arrow for the yaw of some pictures; a panel for each area.
+
+    Raises:
+        InputError: there is no position.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from orthoswarm.model.errors import InputError
+
+    areas = _areas(_tracks(found))
+    if not areas:
+        raise InputError("there is no position to draw; leave --picture out")
+    columns = min(3, len(areas))
+    rows = -(-len(areas) // columns)
+    figure, panels = plt.subplots(
+        rows, columns, figsize=(9 if columns == 1 else 6 * columns, 9 if columns == 1 else 6 * rows),
+        layout="constrained", squeeze=False,
+    )  # fmt: skip
+    for axes, area in zip(panels.flat, areas):
+        _draw_area(axes, area)
+    for axes in panels.flat[len(areas) :]:
+        axes.axis("off")
+    figure.suptitle("tracks, with the pictures' yaw as arrows")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.part.png")
+    figure.savefig(temporary, dpi=110)
+    plt.close(figure)
+    temporary.replace(path)
+
+
+def _tracks(found: "Survey") -> dict[str, list[Row]]:
+    """Positions and yaw of each vehicle."""
+    import math
+
+    rows: dict[str, list[Row]] = {}
+    for source in found.sources:
+        for frame in source.frames:
+            rows.setdefault(frame.vehicle, []).append((frame.fix.lat_deg, frame.fix.lon_deg, frame.fix.yaw_rad))
+        for vehicle, samples in source.tracks.items():
+            placed = [
+                (s.lat_deg, s.lon_deg, None if s.yaw_deg is None else math.radians(s.yaw_deg))
+                for s in samples
+                if s.lat_deg is not None and s.lon_deg is not None
+            ]
+            if placed:
+                rows.setdefault(vehicle, []).extend(placed)
+    return rows
+
+
+def _areas(tracks: dict[str, list[Row]], apart_deg: float = 0.2) -> list[dict[str, list[Row]]]:
+    """Vehicles grouped by where they start."""
+    areas: list[dict[str, list[Row]]] = []
+    for vehicle, rows in tracks.items():
+        for area in areas:
+            lat, lon, _ = next(iter(area.values()))[0]
+            if abs(rows[0][0] - lat) < apart_deg and abs(wrap_deg(rows[0][1] - lon)) < apart_deg:
+                area[vehicle] = rows
+                break
+        else:
+            areas.append({vehicle: rows})
+    return areas
+
+
+def _draw_area(axes: Any, tracks: dict[str, list[Row]]) -> None:
+    import numpy as np
+
+    from telemetry.samples.course import local_metres
+
+    every = [row for rows in tracks.values() for row in rows]
+    ground = local_metres([r[0] for r in every], [r[1] for r in every])
+    extent = max(float(np.ptp(ground, axis=0).max()), 10.0)
+    at = 0
+    for vehicle, rows in tracks.items():
+        own = ground[at : at + len(rows)]
+        at += len(rows)
+        (line,) = axes.plot(own[:, 0], own[:, 1], ".-", lw=0.8, ms=3, label=f"{vehicle} ({len(rows)})")
+        some = range(0, len(rows), max(1, len(rows) // 60))
+        arrows = [(own[i], yaw) for i in some if (yaw := rows[i][2]) is not None]
+        if arrows:
+            tails = np.array([tail for tail, _ in arrows])
+            heads = 0.02 * extent * np.array([[np.sin(yaw), np.cos(yaw)] for _, yaw in arrows])
+            axes.quiver(*tails.T, *heads.T, angles="xy", scale_units="xy", scale=1, width=0.002, color=line.get_color())
+    axes.set_aspect("equal", "datalim")
+    axes.set_xlabel("east, m")
+    axes.set_ylabel("north, m")
+    if len(tracks) <= 24:
+        axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,135 @@
+"""`orthoswarm mosaic`: a georeferenced orthoimage from drone photos."""
+
+import argparse
+import gc
+from importlib.util import find_spec
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "A folder of photos is read with its sub-folders; each sub-folder with photos is one vehicle.\n\n"
+        "example:\n  orthoswarm mosaic photos --basemap before.tif --out map"
+    )
+    add = parser.add_argument
+    add("inputs", nargs="+", type=Path, metavar="INPUT", help="folders of photos, photos, videos")
+    add("--basemap", type=Path, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
+    add("--out", type=Path, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
+    refiners = _refiners()
+    add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
+    add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
+    add(
+        "--fov-min", type=float, metavar="DEG", help="field of view assumed in real time (default: photo tags, else 70)"
+    )
+    add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
+    add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
+    add(
+        "--every-m", type=float, metavar="M", help="of a video one picture every M metres (default: 4 %% of the height)"
+    )
+    add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
+    add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
+    add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
+    add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
+    add(
+        "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
+    )
+    add("--json", action="store_true", help="print the report as one JSON document on stdout")
+
+
+def _refiners() -> list[str]:
+    """The refiners that are installed."""
+    return ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the map."""
+    from orthoswarm.compute.workers import Workers, single_threaded, workers
+
+    single_threaded()
+    # What is made of tens of thousands of photos stays to the end: looking through it again and again costs a tenth.
+    gc.set_threshold(100_000, 50, 50)
+    import json
+    import sys
+
+    import telemetry
+    from gcs_plugin.cli.progress import ProgressBars
+    from orthoswarm.batch import pipeline
+    from orthoswarm.batch.workspace import VIDEO, missing, unmake
+    from orthoswarm.model.errors import InputError
+    from orthoswarm.model.frame import Ingest
+
+    _check(args)
+    options = pipeline.Options(
+        basemap=args.basemap,
+        refine=args.refine,
+        until=args.until,
+        fov_min_deg=args.fov_min,
+        gsd_m=args.gsd,
+        dem=args.dem,
+        split_legs=args.split == "legs",
+        gains=not args.no_gains,
+    )
+
+    def load(progress: pipeline.Progress) -> Ingest:
+        reading = telemetry.LoadOptions(
+            args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,),
+            run=None if args.cluster or pool is None else pool.map,
+        )  # fmt: skip
+        return telemetry.load(args.inputs, progress=progress, options=reading)
+
+    if args.out.is_file():
+        raise InputError(f"{args.out} is a file; choose a folder for --out")
+    pool: Workers | None = None
+    folders = missing(args.out)
+    try:
+        if args.cluster:
+            from orthoswarm.compute.dask_cluster import Cluster
+
+            args.out.mkdir(parents=True, exist_ok=True)  # the workers must see it
+            pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
+        else:
+            pool = workers(args.workers)
+        with ProgressBars() as progress:
+            report = pipeline.run(load, args.out, options, pool, progress)
+    finally:
+        if pool is not None:
+            pool.close()
+        unmake(folders)
+    if args.json:
+        json.dump(report, sys.stdout, indent=1, ensure_ascii=False)
+        print()
+    else:
+        _tell(report, args.out)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse values that make no sense."""
+    from orthoswarm.model.errors import InputError
+
+    if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
+        raise InputError(f"--gsd {args.gsd:g} is no ground pixel; give metres, for example 0.1")
+    if args.fov_min is not None and not 5.0 <= args.fov_min <= 150.0:
+        raise InputError(f"--fov-min {args.fov_min:g} is no field of view; give degrees, for example 70")
+    for flag, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
+        if value is not None and not value > 0.0:
+            raise InputError(f"{flag} must be larger than zero; leave it out for the default")
+    if args.workers is not None and args.workers < 1:
+        raise InputError(f"--workers {args.workers} is too few; give 1 or more")
+    for flag, path in (("--basemap", args.basemap), ("--dem", args.dem)):
+        if path is not None and not path.exists():
+            raise InputError(f"{flag} {path} does not exist; check the path")
+
+
+def _tell(report: dict[str, object], out: Path) -> None:
+    """A few lines for people."""
+    import sys
+
+    frames = report["frames"]
+    assert isinstance(frames, dict)
+    print(f"{frames['used']} of {frames['input']} pictures mapped in {report['wall_s']:.0f} s: {out}")
+    warnings = report["warnings"]
+    assert isinstance(warnings, list)
+    for warning in warnings:
+        print(f"note: {warning}", file=sys.stderr)

@@ -1,0 +1,139 @@
+"""`orthoswarm serve`: the daemon with its web map."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gcs_plugin.daemon.settings import Settings
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = (
+        "Starts without links, basemap or configuration; what a workspace holds is gone on with.\n"
+        "LINK is udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.\n\n"
+        "example:\n  orthoswarm serve --link udpin:0.0.0.0:14550 --basemap before.tif --workspace flood"
+    )
+    add = parser.add_argument
+    add("--link", action="append", default=[], metavar="URL", help="MAVLink link; give it again for more")
+    add("--basemap", type=Path, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
+    add("--workspace", type=Path, default=Path("workspace"), metavar="DIR", help="what is kept (default: workspace)")
+    add("--port", type=int, metavar="P", help="of HTTP (default 8650; 0 takes any free one)")
+    add("--bind", metavar="ADDRESS", help="address of HTTP (default 127.0.0.1; any other needs the token)")
+    add("--token-file", type=Path, metavar="FILE", help="where the token is, or goes (default: in the workspace)")
+    add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm (default 70)")
+    add("--gsd", type=float, metavar="M", help="ground pixel of the map (default: that of the first pictures)")
+    add("--workers", type=int, metavar="N", help="processes that refine (default: one less than cores)")
+    add("--source", action="append", default=[], metavar="ID=WHERE", help="pictures of a vehicle: stream or folder")
+    add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    from orthoswarm.compute.workers import single_threaded
+
+    single_threaded()
+    import sys
+
+    from gcs_plugin.daemon.settings import FILE, TEMPLATE
+    from orthoswarm.model.atomic_file import disk_error
+    from orthoswarm.model.errors import InputError
+
+    if args.workspace.exists() and not args.workspace.is_dir():
+        raise InputError(f"{args.workspace} is a file; choose a folder for --workspace")
+    try:
+        args.workspace.mkdir(parents=True, exist_ok=True)
+        if args.init:
+            path = args.workspace / FILE
+            if path.exists():
+                raise InputError(f"{path} is there already; edit it")
+            path.write_text(TEMPLATE, encoding="utf-8")
+            print(path)
+            print(f"edit it, then: orthoswarm serve --workspace {args.workspace}", file=sys.stderr)
+            return 0
+    except OSError as error:
+        raise disk_error(error, args.workspace) from None
+    return serve(settings_of(args))
+
+
+def settings_of(args: argparse.Namespace) -> "Settings":
+    """The workspace's file, with the flags over it."""
+    from dataclasses import replace
+
+    from gcs_plugin.daemon.settings import VehicleSettings, read_settings
+    from orthoswarm.compute.workers import cores
+    from orthoswarm.model.errors import InputError
+
+    settings = read_settings(args.workspace)
+    flags = {
+        "bind": args.bind, "port": args.port, "basemap": args.basemap, "fov_min_deg": args.fov_min,
+        "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
+    }  # fmt: skip
+    if args.workers is None and settings.workers == 1:
+        flags["workers"] = max(1, cores() - 1)
+    settings = replace(settings, **{key: value for key, value in flags.items() if value is not None})
+    vehicles = {vehicle.id: vehicle for vehicle in settings.vehicles}
+    for text in args.source:
+        name, _, where = text.partition("=")
+        if not name or not where:
+            raise InputError(f"--source {text} is no ID=WHERE; for example v1=udp://0.0.0.0:5600")
+        vehicles[name] = replace(vehicles.get(name, VehicleSettings(name)), pictures=where)
+    return replace(settings, vehicles=tuple(vehicles.values())).check()
+
+
+def serve(settings: "Settings") -> int:
+    """Run daemon and web server until SIGINT or SIGTERM."""
+    import logging
+    import os
+    import socket
+    import sys
+    import threading
+
+    import uvicorn
+
+    from gcs_plugin.daemon.daemon import Daemon
+    from gcs_plugin.daemon.intake.picture_sources import STREAM_THREAD
+    from gcs_plugin.web.app import make_app
+    from gcs_plugin.web.guard import take_token
+    from orthoswarm.model.errors import InputError
+
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
+    family = socket.AF_INET6 if ":" in settings.bind else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.bind, settings.port))
+    except OSError as error:
+        listener.close()
+        where = f"{settings.bind}:{settings.port}"
+        raise InputError(f"{where} cannot be served ({error.strerror}); choose another --port") from None
+    port = listener.getsockname()[1]
+    with Daemon(settings) as daemon, listener:
+        token, new = take_token(settings.token_file or settings.workspace / "token")
+        config = uvicorn.Config(
+            make_app(daemon, token, settings.bind), log_level="warning", access_log=False, server_header=False,
+            timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=2048,
+        )  # fmt: skip
+        shown = f"[{settings.bind}]" if ":" in settings.bind else settings.bind
+        address = f"http://{shown}:{port}/"
+        listener.listen(config.backlog)  # whoever reads the address may come at once, and waits until it is served
+        print(f"map: {address}{'#token=' + token if new else ''}", flush=True)
+        if new:
+            print(f"token: {token}", flush=True)
+        else:
+            print(f"token: in {settings.token_file or settings.workspace / 'token'}", flush=True)
+        server = uvicorn.Server(config)
+
+        def end(*_: object) -> None:
+            """End at a signal, at once at the second, and do not raise it again: the daemon has to be closed, too."""
+            server.force_exit, server.should_exit = bool(server.should_exit), True
+
+        server.handle_exit = end
+        server.run(sockets=[listener])
+    if any(thread.name.startswith(STREAM_THREAD) for thread in threading.enumerate()):
+        logging.shutdown()  # a dead stream keeps its reader inside a library; everything else is closed
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+    return 0

@@ -1,1 +1,0 @@
-"""One module for each verb of the `orthoswarm` command; see gcs_plugin.cli."""

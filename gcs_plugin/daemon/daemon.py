@@ -1,0 +1,401 @@
+"""The daemon without its web server: owns the workspace, takes pictures and telemetry in, has maps made of them."""
+
+import json
+import logging
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from gcs_plugin.daemon import views
+from gcs_plugin.daemon.intake.picture_sources import Source
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of
+from gcs_plugin.daemon.jobs.job_queue import Job, Jobs
+from gcs_plugin.daemon.jobs.joint_refinement import Together
+from gcs_plugin.daemon.jobs.leg_placement import Coarse
+from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.sortie_refinement import Refinement
+from gcs_plugin.daemon.jobs.worker_pool import LAST, Crew
+from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
+from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
+from gcs_plugin.daemon.layers.realtime_layer import Drawer, frame_of_row
+from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_frames, packed, unpacked
+from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
+from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
+from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.daemon.vehicles import Flock, completion_rows, note_completion
+from gcs_plugin.daemon.web_plans import Plans
+from orthoswarm.compute.workers import peak_rss_mb
+from orthoswarm.model.errors import InputError
+from orthoswarm.raster.basemap import Basemap
+from telemetry.samples.sample import Sample
+
+_FEW: Final = 10
+_SOURCES_S: Final = 1.0
+_REPLACED: Final = "dropped: the vehicle's refinement takes its place"
+_log = logging.getLogger(__name__)
+
+
+class Daemon:
+    """All of the daemon but HTTP.
+
+    Attributes:
+        settings: what it was told. journal, store, layers, tiles, events, drawer, jobs: its parts.
+        started: when, UTC epoch seconds.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        """Take over a workspace and go on where the last daemon stopped.
+
+        Raises:
+            InputError: another daemon runs in the workspace, or the basemap is of no use.
+            OrthoSwarmError: the workspace cannot be written.
+        """
+        self.settings, self.started = settings, time.time()
+        self.events = Events()
+        self._lock = take_over(settings.workspace)
+        try:
+            self._open()
+        except BaseException:
+            self._lock.close()
+            raise
+
+    def _open(self) -> None:
+        settings, folder = self.settings, self.settings.workspace
+        self.journal = Journal(folder / "journal.db")
+        self.store = PictureStore(folder / "pictures")
+        self.layers = {name: Layer(name) for name in NAMES}
+        self.tiles = TileServer(self.layers)
+        canvases = folder / "layers"
+        canvases.mkdir(exist_ok=True)
+        trusted = distrust_after_power_cut(self.journal)
+        self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
+        fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
+        self.drawer = Drawer(
+            self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
+            fov_rad=fov, on_area=self._area_changed,
+        )  # fmt: skip
+        self.crew, self.background = Crew(settings.workers), Crew(1, LAST)
+        press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
+        self.coarse = Coarse(self.journal, self.store, press, self.background, settings.basemap, self._published)
+        self.refinement = Refinement(
+            self.journal, self.store, press, self.crew, self.drawer, settings.basemap, self._published,
+            self._make_way, lambda: self.jobs.stopping,
+        )  # fmt: skip
+        self.together = Together(self.journal, press, self.background, settings.basemap, self._published)
+        handlers = {
+            "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
+            "redraw": lambda job, tell: press.draw_again(self.background, tell), "export": self._export,
+        }  # fmt: skip
+        self.jobs = Jobs(
+            self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
+        )
+        self.jobs.on_end(self._after_job)
+        if press.lost:
+            self.jobs.add("redraw")
+        self.legwatch = LegWatch(self._leg_over, self._refine_late)
+        self.posted: Counter[str] = Counter()
+        self.plans = Plans(folder / "plans")
+        self.flock: Flock | None = None
+        self.takeoffs: Takeoffs | None = None
+        if settings.links:
+            self.flock = Flock(settings, self.journal, self.events, self.jobs)
+            self.takeoffs = Takeoffs(self.flock, self.plans, self._say)
+        self.sources = [
+            Source(
+                v.id,
+                v.pictures,
+                self.add_picture,
+                self._pose_at,
+                self._say,
+                folder / "videos",
+                self._link_log,
+                self._card_read,
+            )
+            for v in settings.vehicles
+            if v.pictures
+        ]
+
+    def start(self) -> None:
+        """Begin to draw and to work."""
+        if self.drawer.area is not None:
+            self._area_changed(self.drawer.area)
+        self.drawer.start()
+        self.jobs.start()
+        threading.Thread(target=self.crew.warm_up, daemon=True).start()
+        self._watch_what_came_before()
+        self.legwatch.start()
+        if self.flock is not None:
+            self.flock.start()
+        for source in self.sources:
+            source.start()
+
+    def close(self) -> None:
+        """Stop; what is under way goes on at the next start."""
+        self.jobs.give_up()
+        self._close_sources()
+        self.legwatch.close()
+        if self.takeoffs is not None:
+            self.takeoffs.close()
+        if self.flock is not None:
+            self.flock.close()
+        self.crew.close()
+        self.background.close()
+        self.jobs.close()
+        self.drawer.close()
+        for layer in self.layers.values():
+            layer.close()
+        self.journal.remember("clean", True)
+        self.journal.close()
+        self._lock.close()
+
+    def _close_sources(self) -> None:
+        """Stop all at once; one that waits for a silent or dead stream is left to its time-out, and takes nothing."""
+        for source in self.sources:
+            source.stop()
+        end = time.monotonic() + _SOURCES_S
+        stuck = [source.vehicle for source in self.sources if not source.close(max(0.0, end - time.monotonic()))]
+        if stuck:
+            _log.info("the streams of %s are silent; they are left alone", ", ".join(stuck))
+
+    def __enter__(self) -> "Daemon":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- pictures -------------------------------------------------------------------------------------------------
+
+    def add_picture(self, pose: PostedPose, data: bytes) -> tuple[int, bool]:
+        """Take a picture in; when this returns it is safe on the disk.
+
+        Returns:
+            The frame's number, and False if it was there already (the first one stays).
+
+        Raises:
+            InputError: the file is no picture.
+            OrthoSwarmError: the disk is full or gone; nothing was kept.
+        """
+        came = time.time()
+        key = frame_key(pose.vehicle, pose.image)
+        known = self.journal.one("SELECT seq FROM frames WHERE key = ?", (key,))
+        if known is not None:
+            return int(known["seq"]), False
+        width, height, suffix = picture_size(data)
+        require_space(self.settings.workspace, len(data))
+        time_s = came if pose.time_s is None else pose.time_s
+        path = self.store.put(key, suffix, data)
+        change = add_frame(key, pose.vehicle, pose.image, time_s, path, (width, height), pose.values)
+        seq, new = self.journal.write(change)
+        if new:
+            frame = frame_of(
+                pose.values, image=pose.image, path=self.store.path(path), vehicle=pose.vehicle, time_s=time_s,
+                size=(width, height),
+            )  # fmt: skip
+            sortie = self.sortie(pose.vehicle)
+            self.posted[pose.vehicle] += 1
+            self.drawer.add(seq, frame, came, sortie)
+            self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+            if self.posted[pose.vehicle] == _FEW:
+                self.crew.warm_kernels()
+                self.background.warm_up()
+        return seq, new
+
+    def sortie(self, vehicle: str) -> int:
+        """The vehicle's present sortie."""
+        row = self.journal.one("SELECT sortie FROM vehicles WHERE id = ?", (packed(vehicle),))
+        return 1 if row is None else int(row["sortie"])
+
+    def frames(
+        self, vehicle: str | None = None, since: float | None = None, limit: int | None = None
+    ) -> list[dict[str, Any]]:
+        """Frames in the order in which they came, as JSON values; see the HTTP API."""
+        return views.frame_rows(self.journal, vehicle, since, limit)
+
+    def vehicles(self) -> list[dict[str, Any]]:
+        """All vehicles that were heard or sent pictures, as JSON values."""
+        linked = {} if self.flock is None else {row["id"]: row for row in self.flock.rows()}
+        for vehicle, takeoff in ({} if self.takeoffs is None else self.takeoffs.rows()).items():
+            linked.setdefault(vehicle, {"id": vehicle})["takeoff"] = takeoff
+        return views.vehicle_rows(self.journal, self.settings.vehicles, self.sources, linked)
+
+    def legs(self) -> dict[str, Any]:
+        """The legs as GeoJSON lines with state, confidence, sigma and stage (coarse: in flight)."""
+        return views.leg_features(self.journal)
+
+    def completions(self) -> list[dict[str, Any]]:
+        """When vehicles completed, and what followed."""
+        return completion_rows(self.journal)
+
+    def _pose_at(self, vehicle: str, time_s: float) -> Sample | None:
+        return None if self.flock is None else self.flock.pose_at(vehicle, time_s)
+
+    def _link_log(self, vehicle: str, out: Path) -> bool:
+        """Write what a vehicle has said on the links, in this run or before, into a log of its own."""
+        from gcs_plugin.daemon.intake.vehicle_log import write_link_log
+        from gcs_plugin.daemon.settings import system_of
+
+        systems = {v.id: v.system for v in self.settings.vehicles}
+        system = systems.get(vehicle) or system_of(vehicle)
+        return system is not None and write_link_log(self.settings.workspace / "telemetry.tlog", system, out) > 0
+
+    def _say(self, text: str) -> None:
+        _log.info("%s", text)
+        self.events.publish("note", text=text)
+
+    # -- layers ---------------------------------------------------------------------------------------------------
+
+    def layer_rows(self) -> list[dict[str, Any]]:
+        """The layers as JSON values, the basemap first."""
+        return views.layer_rows(self.layers, self.tiles.basemap)
+
+    def _area_changed(self, area: Area) -> None:
+        """Read the basemap on the area's grid."""
+        basemap = self.tiles.basemap
+        if self.settings.basemap is not None and (basemap is None or basemap.epsg != area.epsg):
+            self.tiles.basemap = Basemap.open(self.settings.basemap, area.epsg)
+
+    def _published(self, layer: str, job: Job) -> None:
+        version = self.layers[layer].version
+        self.events.publish("layer", layer=layer, version=version, vehicle=job.vehicle, sortie=job.sortie)
+
+    # -- refinement -----------------------------------------------------------------------------------------------
+
+    def refine(self, vehicle: str | None = None) -> list[Job]:
+        """Queue the refinement of a vehicle's last sortie, or of all sorties that have pictures.
+
+        Raises:
+            InputError: the vehicle has sent no picture.
+        """
+        rows = self.journal.rows("SELECT vehicle, sortie FROM frames GROUP BY vehicle, sortie ORDER BY MIN(seq)")
+        wanted = [(unpacked(row["vehicle"]), int(row["sortie"])) for row in rows]
+        if vehicle is not None:
+            wanted = [pair for pair in wanted if pair[0] == vehicle][-1:]
+            if not wanted:
+                raise InputError(f"vehicle {vehicle} has sent no picture; see /api/vehicles")
+        return [self.jobs.add("refine", name, sortie) for name, sortie in wanted]
+
+    def _card_read(self, vehicle: str) -> None:
+        """A card was read after landing: a sortie that was complete before is refined with what its camera kept."""
+        self._refine_late(vehicle, self.sortie(vehicle))
+
+    def _refine_late(self, vehicle: str, sortie: int) -> None:
+        """Pictures that came after their vehicle was refined (over a slow link) are laid beside the others."""
+        waits = self.journal.one(
+            "SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = ? AND sortie = ? AND state = 'queued'",
+            (packed(vehicle), sortie),
+        )
+        if waits is None and late_frames(self.journal, vehicle, sortie):
+            self.jobs.add("refine", vehicle, sortie, trigger="late")
+
+    def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
+        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""
+        complete = self.journal.one(
+            "SELECT 1 FROM completions WHERE vehicle = ? AND sortie = ?", (packed(vehicle), sortie)
+        )
+        if self.settings.coarse and complete is None:
+            self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
+
+    def _watch_what_came_before(self) -> None:
+        """Pictures of which nothing was made before the last end of the daemon."""
+        for row in self.journal.rows("SELECT DISTINCT vehicle, sortie FROM completions"):
+            self._refine_late(unpacked(row["vehicle"]), int(row["sortie"]))
+        rows = self.journal.rows(
+            "SELECT vehicle, sortie, time, arrived, pose FROM frames WHERE stage = 'realtime' AND reason IS NULL"
+            " AND NOT EXISTS (SELECT 1 FROM completions c WHERE c.vehicle = frames.vehicle"
+            " AND c.sortie = frames.sortie) ORDER BY seq DESC LIMIT 2000"
+        )
+        for row in rows:
+            pose = json.loads(row["pose"])
+            time_s = row["arrived"] if row["time"] is None else row["time"]
+            self.legwatch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
+
+    def _make_way(self, vehicle: str, layer: str | None) -> None:
+        """A refinement begins, or needs a layer: what is done in the background stands aside."""
+        self.together.give_up()
+        if layer is None:
+            self.jobs.drop("coarse", vehicle, _REPLACED)
+        else:
+            self.coarse.give_up(None, layer)
+
+    def _after_job(self, job: Job) -> None:
+        """Note what a completion led to; write the products once nothing is left to refine."""
+        if job.kind == "refine":
+            self._note_refined(job)
+            self.jobs.wake()
+        elif job.kind not in ("together", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
+            return
+        if not self.jobs.open("refine", "together", "coarse", "redraw"):
+            self.jobs.add("export", formats=["cog", "gpkg"])
+
+    def _note_refined(self, job: Job) -> None:
+        if job.state != "done" or job.vehicle is None or "published_s" not in job.detail or "beside" in job.detail:
+            return
+        facts = {
+            "refine_started_s": job.detail["refine_started_s"], "refine_ended_s": job.detail["published_s"],
+            "layer": job.detail["layer"], "version_before": job.detail["version_before"],
+            "version": job.detail["version"], "frames": job.detail["frames"],
+        }  # fmt: skip
+        if self.flock is not None:
+            facts["still_flying_after"] = [r["id"] for r in self.flock.rows() if r["mission"]["phase"] == "active"]
+        self.journal.write(note_completion(job.vehicle, job.sortie, facts))
+        self.events.publish("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
+
+    # -- export ---------------------------------------------------------------------------------------------------
+
+    def export(self, formats: Sequence[str]) -> Job:
+        """Queue an export.
+
+        Raises:
+            InputError: an unknown format.
+        """
+        unknown = [name for name in formats if name not in FORMATS]
+        if unknown or not formats:
+            raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")
+        return self.jobs.add("export", formats=list(dict.fromkeys(formats)))
+
+    def _export(self, job: Job, tell: Callable[[float, str], None]) -> Change:
+        """The handler of `export`."""
+        tell(0.05, "writing")
+        area = self.drawer.area
+        if area is None:
+            raise InputError("there is no map yet; wait for pictures")
+        rows = self.journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
+        canvases = {}
+        for name, layer in self.layers.items():
+            with layer.reading() as canvas:
+                if canvas is not None:
+                    canvases[name] = canvas.path
+        kept = self.settings.workspace / "solutions"
+        solutions = self.journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
+        coarse = self.journal.rows(
+            "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
+            " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
+        )
+        facts = facts_of(
+            [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
+            time.process_time(), (self.crew.usage(), self.background.usage()), peak_rss_mb(),
+        )  # fmt: skip
+        task = ExportTask(
+            self.settings.workspace, tuple(job.detail["formats"]), canvases, area.epsg, area.gsd_m,
+            [frame_of_row(row, self.store) for row in rows],
+            {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
+            [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions], self.settings.basemap,
+            None if self.settings.fov_min_deg is None else math.radians(self.settings.fov_min_deg), facts,
+        )  # fmt: skip
+        job.detail["files"] = self.background.run(write_products, task)
+        return lambda db: None
+
+    # -- health ---------------------------------------------------------------------------------------------------
+
+    def problems(self) -> list[str]:
+        """What is wrong at present, in words."""
+        return [text for text in (self.drawer.problem, self.drawer.overload) if text]

@@ -1,0 +1,1 @@
+"""Pictures and poses into the daemon: posted, from streams, from watched folders, once each."""

@@ -1,0 +1,152 @@
+"""Where a vehicle's pictures come from besides HTTP: a live stream, or a folder into which files arrive (`folder`)."""
+
+import logging
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from gcs_plugin.daemon.intake.pose_relay import pose_values
+from gcs_plugin.daemon.intake.posted_pose import PostedPose
+from gcs_plugin.daemon.intake.watched_folder import Desk, FolderReader
+from orthoswarm.model.errors import OrthoSwarmError
+from telemetry.samples.sample import Sample
+
+_SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
+_SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://", "http://", "https://")
+STREAM_THREAD: Final = "pictures of "
+_log = logging.getLogger(__name__)
+
+PoseAt = Callable[[str, float], Sample | None]
+Take = Callable[[PostedPose, bytes], tuple[int, bool]]
+LinkLog = Callable[[str, Path], bool]
+
+
+def is_stream(where: str) -> bool:
+    """True for an address of a live stream, False for a folder."""
+    return where.lower().startswith(_SCHEMES)
+
+
+class Source:
+    """Pictures of one vehicle, read in a thread of its own.
+
+    Args:
+        vehicle: id.
+        where: stream or folder.
+        take: takes a picture in.
+        pose_at: the vehicle's pose at a moment from its link, for pictures without one of their own.
+        tell: told what happens, in words.
+        cache: folder for pictures of videos, and for what is remembered of folders.
+        settled: told of a vehicle whose folder has come to rest after new pictures.
+        link_log: writes what a vehicle has said on its link into a .tlog; False if it has said nothing.
+    """
+
+    def __init__(
+        self, vehicle: str, where: str, take: Take, pose_at: PoseAt, tell: Callable[[str], None], cache: Path,
+        link_log: LinkLog = lambda vehicle, out: False, settled: Callable[[str], None] = lambda vehicle: None,
+    ) -> None:  # fmt: skip
+        self.vehicle, self.where = vehicle, where
+        self._take, self._pose_at, self._tell = take, pose_at, tell
+        self._stop = threading.Event()
+        self._state, self.taken, self._without_pose = "waiting", 0, 0
+        self._reader: FolderReader | None = None
+        if not is_stream(where):
+            desk = Desk(
+                vehicle,
+                self._keep,
+                partial(pose_at, vehicle),
+                partial(link_log, vehicle),
+                tell,
+                partial(settled, vehicle),
+                cache,
+                self._stop,
+            )
+            self._reader = FolderReader(Path(where), desk)
+        run = self._stream if self._reader is None else self._reader.run
+        self._thread = threading.Thread(target=self._guarded, args=(run,), name=STREAM_THREAD + vehicle, daemon=True)
+
+    @property
+    def state(self) -> str:
+        """What it does, in words."""
+        return self._state if self._reader is None or self._state.startswith("failed") else self._reader.state
+
+    @property
+    def without_pose(self) -> int:
+        """Pictures of a stream that were dropped, or files of a folder that wait, for want of a pose."""
+        return self._without_pose if self._reader is None else len(self._reader.poseless)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Read no more; what waits inside a stream's library notices later."""
+        self._stop.set()
+
+    def close(self, wait_s: float = 5.0) -> bool:
+        """Stop reading; returns whether it has ended within that time."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(wait_s)
+        return not self._thread.is_alive()
+
+    def document(self) -> dict[str, Any]:
+        """Its state as JSON values; addresses are not told, they may hold passwords."""
+        return {
+            "kind": "stream" if is_stream(self.where) else "folder", "state": self.state, "taken": self.taken,
+            "without_pose": self.without_pose,
+        }  # fmt: skip
+
+    def _guarded(self, run: Callable[[], None]) -> None:
+        while not self._stop.is_set():
+            try:
+                self._state = "waiting"
+                run()
+                return
+            except Exception:  # whatever a strange stream does, the vehicle's next picture counts
+                _log.exception("the pictures of %s", self.vehicle)
+                self._state = "failed, tried again"
+                self._stop.wait(2.0)
+
+    # -- a stream -------------------------------------------------------------------------------------------------
+
+    def _stream(self) -> None:
+        from telemetry.live.live_stream import open_stream
+        from telemetry.video.extraction import encode_jpeg
+
+        def state(text: str) -> None:
+            self._state = text.split(":")[0]
+            self._tell(f"the pictures of {self.vehicle}: {self._state}")
+
+        for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
+            if picture.damaged:
+                continue
+            name = f"live-{picture.time_s:.3f}.jpg"
+            self._offer(name, picture.time_s, picture.sample, partial(encode_jpeg, picture.rgb))
+
+    def _offer(self, name: str, time_s: float, sample: Sample | None, data: Callable[[], bytes]) -> None:
+        """Take a picture with the pose that it carries, gaps filled from the vehicle's link."""
+        own = sample if sample is not None else Sample()
+        if not own.has_position or own.yaw_deg is None or own.height_m is None:
+            linked = self._pose_at(self.vehicle, time_s)
+            own = own if linked is None else own.merge(linked)
+        values = pose_values(own)
+        if values is None:
+            self._without_pose += 1
+            return
+        self._keep(PostedPose(self.vehicle, name, time_s, values), data())
+
+    def _keep(self, pose: PostedPose, data: bytes) -> None:
+        """Take a picture in; with the disk full, wait until there is room."""
+        while not self._stop.is_set():
+            try:
+                _, new = self._take(pose, data)
+                self.taken += new
+                return
+            except OrthoSwarmError as error:
+                if "disk" not in str(error) and "journal" not in str(error):
+                    _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
+                    return
+                self._tell(str(error))
+                self._stop.wait(2.0)

@@ -1,0 +1,109 @@
+"""The pose of a posted picture: JSON with degrees on the outside, a Frame inside."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Fix, Frame
+
+MOST_TEXT: Final = 1 << 20
+_OPTIONAL: Final = {
+    "height_m": 1e5, "altitude_m": 1e5, "yaw_deg": 1e5, "pitch_deg": 1e5, "roll_deg": 1e5, "flight_yaw_deg": 1e5,
+    "position_sigma_m": 1e6, "fov_deg": 179.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class PostedPose:
+    """What was posted beside a picture.
+
+    Attributes:
+        vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if it was not said.
+        values: lat_deg, lon_deg and what else is known, in degrees and metres.
+    """
+
+    vehicle: str
+    image: str
+    time_s: float | None
+    values: dict[str, float]
+
+
+def parse_pose(document: Any, image: str | None = None) -> PostedPose:
+    """Check a pose.
+
+    Args:
+        document: the JSON object; `vehicle`, `lat_deg` and `lon_deg` must be there.
+        image: the file's name, for a pose that does not say it.
+
+    Raises:
+        InputError: what is missing or wrong, in a sentence.
+    """
+    if not isinstance(document, Mapping):
+        raise InputError("the pose is no JSON object; send vehicle, image, time, lat_deg, lon_deg, height_m, yaw_deg")
+    vehicle, name = _text(document, "vehicle"), _text(document, "image", image)
+    values = {"lat_deg": _number(document, "lat_deg", 90.0), "lon_deg": _number(document, "lon_deg", 360.0)}
+    for key, largest in _OPTIONAL.items():
+        if document.get(key) is not None:
+            values[key] = _number(document, key, largest)
+    if "fov_deg" in values and values["fov_deg"] < 1.0:
+        raise InputError("fov_deg of the pose is no field of view; leave it out or send degrees")
+    return PostedPose(vehicle, name, parse_time(document.get("time")), values)
+
+
+def parse_time(value: Any) -> float | None:
+    """UTC epoch seconds of an ISO 8601 text (UTC where it names no zone) or a number; None for None.
+
+    Raises:
+        InputError: it is neither.
+    """
+    if value is None:
+        return None
+    try:
+        if isinstance(value, bool):
+            raise ValueError
+        if isinstance(value, int | float):
+            seconds = float(value)
+        else:
+            text = str(value).strip()
+            moment = datetime.fromisoformat(text[:-1] + "+00:00" if text[-1:] in ("Z", "z") else text)
+            seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+        if not -6e10 < seconds < 2.5e11:
+            raise ValueError
+    except (ValueError, OverflowError, TypeError):
+        raise InputError("the time is neither ISO 8601 nor a number of seconds; send as 2026-05-04T10:20:30Z") from None
+    return seconds
+
+
+def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str, time_s: float | None,
+             size: tuple[int, int]) -> Frame:  # fmt: skip
+    """The frame of a stored picture and the pose values that `parse_pose` gave."""
+    v = dict(values)
+
+    def radians(key: str) -> float | None:
+        return None if v.get(key) is None else math.radians(v[key])
+
+    fix = Fix(
+        v["lat_deg"], v["lon_deg"], v.get("height_m"), v.get("altitude_m"), radians("yaw_deg"), radians("pitch_deg"),
+        radians("roll_deg"), radians("flight_yaw_deg"), v.get("position_sigma_m"), bool(v.get("height_is_ground")),
+    )  # fmt: skip
+    return Frame(image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=radians("fov_deg"))
+
+
+def _text(document: Mapping[str, Any], key: str, default: str | None = None) -> str:
+    value = document.get(key, default)
+    if not isinstance(value, str) or not value:
+        raise InputError(f"the pose has no {key}; send it as a text")
+    if len(value) > MOST_TEXT:
+        raise InputError(f"{key} of the pose is longer than a million characters; send a shorter one")
+    return value
+
+
+def _number(document: Mapping[str, Any], key: str, largest: float) -> float:
+    value = document.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
+        raise InputError(f"{key} of the pose is missing or out of range; send a number, at most {largest:g}")
+    return float(value)

@@ -1,0 +1,391 @@
+"""A folder into which a vehicle's photos and videos arrive: over a network, from a card, half-written, all at once.
+
+A file is taken when it is whole (`daemon.whole`) and has not changed between two looks. What was taken is remembered
+in the workspace, so that a card that is put in again, or a restart, costs a look at the names only. Pictures without a
+pose of their own get it from the vehicle's link, or from a log, subtitles or table that arrives beside them.
+"""
+
+import contextlib
+import logging
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from gcs_plugin.daemon.intake.file_complete import is_video_whole, is_whole
+from gcs_plugin.daemon.intake.folder_state import Stamp, Taken, digest_of, video_digest
+from gcs_plugin.daemon.intake.pose_relay import apart_m, pose_values, posted_frame
+from gcs_plugin.daemon.intake.posted_pose import PostedPose
+from orthoswarm.model.errors import OrthoSwarmError
+from telemetry.samples.sample import Sample
+
+if TYPE_CHECKING:
+    from orthoswarm.model.frame import Frame, Ingest, Rejection
+
+_POLL_S: Final = 0.25
+_SCAN_SHARE: Final = 0.1
+_QUIET_S: Final = 1.0
+_SETTLED_S: Final = 3.0
+_BATCH: Final = 32
+_BATCH_BYTES: Final = 64 << 20
+_STALLED_S: Final = 30.0
+_UNCHANGED_S: Final = 2.0
+_REST_S: Final = 5.0
+_AGAIN_S: Final = (20.0, 600.0)
+_NEAR_M: Final = 50.0
+_log = logging.getLogger(__name__)
+
+PoseAt = Callable[[float], Sample | None]
+Keep = Callable[[PostedPose, bytes], None]
+LinkLog = Callable[[Path], bool]
+
+
+@dataclass(slots=True)
+class _File:
+    """A file as it was last seen.
+
+    Attributes:
+        stamp: size and time of change. since: when it was first seen so. done: True once it needs no more work.
+        again_at: when to look into it again, after it was found not whole.
+        told: True once the user knows that it does not get on.
+    """
+
+    stamp: Stamp
+    since: float
+    done: bool = False
+    again_at: float = 0.0
+    told: bool = False
+
+
+@dataclass(slots=True)
+class Desk:
+    """What a folder's reader needs from others.
+
+    Attributes:
+        vehicle: id.
+        keep: takes a picture in; returns when it is safe.
+        pose_at: the vehicle's pose at a moment (UTC) from its link.
+        link_log: writes what the vehicle has said so far to a .tlog; False if it has said nothing.
+        tell: told what happens, in words.
+        settled: told when the folder has come to rest after new pictures were taken from it.
+        cache: folder of the workspace for what is remembered, and for pictures of videos until they are kept.
+        stop: set when it is time to end.
+    """
+
+    vehicle: str
+    keep: Keep
+    pose_at: PoseAt
+    link_log: LinkLog
+    tell: Callable[[str], None]
+    settled: Callable[[], None]
+    cache: Path
+    stop: threading.Event
+
+
+class FolderReader:
+    """Reads one folder.
+
+    Args:
+        folder: watched, with all that lies below it; it may come and go.
+        desk: see Desk.
+
+    Attributes:
+        state: in words. poseless: files that wait for a pose.
+    """
+
+    def __init__(self, folder: Path, desk: Desk) -> None:
+        from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+        from telemetry.ingest.discovery import LOG_SUFFIXES, VIDEO_SUFFIXES
+
+        self.folder, self._desk = folder, desk
+        self.state = "waiting"
+        self.poseless: set[Path] = set()
+        self._pictures, self._videos, self._logs = PICTURE_SUFFIXES, VIDEO_SUFFIXES, LOG_SUFFIXES
+        self._wanted = PICTURE_SUFFIXES | VIDEO_SUFFIXES | LOG_SUFFIXES | {".srt", ".txt", ".csv"}
+        self._files: dict[Path, _File] = {}
+        self._taken = Taken(desk.cache, desk.vehicle, folder)
+        self._tried: object = None
+        self._again_at, self._again_s = 0.0, _AGAIN_S[0]
+        self._fresh_at: float | None = None
+
+    def run(self) -> None:
+        """Watch until told to stop."""
+        wait = _POLL_S
+        while not self._desk.stop.wait(wait):
+            began = time.monotonic()
+            self._look(began)
+            wait = max(_POLL_S, min(5.0, (time.monotonic() - began) / _SCAN_SHARE if not self._busy() else 0.0))
+
+    def _busy(self) -> bool:
+        return any(not file.done and not file.told for file in self._files.values())
+
+    # -- looking --------------------------------------------------------------------------------------------------
+
+    def _look(self, now: float) -> None:
+        """One look at the folder, and what follows from it."""
+        if not self.folder.is_dir():
+            self.state = "the folder is not there"
+            return
+        self.state = "watching"
+        here: list[Path] = []
+        for path, stamp in self._scan(self.folder):
+            here.append(path)
+            known = self._files.get(path)
+            if known is None or known.stamp != stamp:  # new, or still being written
+                done = known is None and self._taken.same(self._name(path), stamp)
+                self._files[path] = _File(stamp, now, done)
+        photos = [p for p in here if p.suffix.lower() in self._pictures and self._settled(p, now, _POLL_S)]
+        for batch in self._batches(photos):
+            if self._desk.stop.is_set():
+                return
+            self._take_photos(batch, now)
+        for path in here:
+            if path.suffix.lower() in self._videos and self._settled(path, now, _QUIET_S):
+                self._take_video(path, now)
+        self._pair(here, now)
+        if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
+            self._fresh_at = None
+            self._desk.settled()
+
+    def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
+        """Files of the wanted kinds with their stamps, by name; what cannot be read now is left for the next look."""
+        try:
+            with os.scandir(folder) as entries:
+                listed = sorted(entries, key=lambda entry: entry.name)
+        except OSError:
+            return
+        for entry in listed:
+            if entry.name.startswith("."):
+                continue
+            try:
+                if entry.is_dir(follow_symlinks=False):
+                    yield from self._scan(Path(entry.path))
+                elif os.path.splitext(entry.name)[1].lower() in self._wanted:
+                    stat = entry.stat()
+                    if stat.st_size > 0:
+                        yield Path(entry.path), (stat.st_size, stat.st_mtime_ns)
+            except OSError:
+                continue
+
+    def _batches(self, photos: Sequence[Path]) -> Iterator[list[Path]]:
+        """Some photos at a time, as many as the memory bears."""
+        batch: list[Path] = []
+        size = 0
+        for path in photos:
+            if batch and (len(batch) >= _BATCH or size + self._files[path].stamp[0] > _BATCH_BYTES):
+                yield batch
+                batch, size = [], 0
+            batch.append(path)
+            size += self._files[path].stamp[0]
+        if batch:
+            yield batch
+
+    def _settled(self, path: Path, now: float, quiet_s: float) -> bool:
+        file = self._files[path]
+        return not file.done and now - file.since >= quiet_s and now >= file.again_at
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self.folder).as_posix()
+
+    def _wait_for(self, path: Path, now: float) -> None:
+        """A file is not whole yet; after a while say so, once."""
+        file = self._files[path]
+        file.again_at = now + _UNCHANGED_S
+        if now - file.since > _STALLED_S and not file.told:
+            file.told = True
+            self._desk.tell(f"{self._name(path)} of {self._desk.vehicle} is not whole; copy it again")
+
+    # -- taking ---------------------------------------------------------------------------------------------------
+
+    def _take_photos(self, paths: Sequence[Path], now: float) -> None:
+        """Take photos in that are whole, those of one look together: only neighbours tell odd angles from good ones."""
+        whole: dict[Path, tuple[bytes, str]] = {}
+        for path in paths:
+            try:
+                data = path.read_bytes()
+            except OSError:  # gone again, or not readable yet
+                self._wait_for(path, now)
+                continue
+            if not is_whole(data, path.suffix):
+                self._wait_for(path, now)
+                continue
+            digest = digest_of(data)
+            if self._taken.holds(self._name(path), digest):  # touched, or on another card
+                self._done(path, digest)
+            else:
+                whole[path] = data, digest
+        if not whole:
+            return
+        asked = [*whole, *self._tables(whole)]
+        found = self._load(asked)
+        if found is None:
+            asked = list(whole)
+            found = self._load(asked)
+        mine = {os.path.normpath(path.absolute()): path for path in whole}
+        for frame in found.frames if found else []:
+            if self._desk.stop.is_set():
+                return
+            photo = mine.get(os.path.normpath(frame.path))
+            if photo is not None:
+                data, digest = whole.pop(photo)
+                self._keep(frame, self._taken.name(self._name(photo), digest), data)
+                self._done(photo, digest)
+        root = os.path.commonpath([path.parent.absolute() for path in asked])  # what names are relative to
+        self._without(
+            {os.path.normpath(os.path.join(root, r.image)): r for r in found.rejected} if found else {}, whole
+        )
+
+    def _without(self, rejected: "dict[str, Rejection]", left: dict[Path, tuple[bytes, str]]) -> None:
+        """Photos that did not become frames: those without a position may still get one."""
+        for path, (data, digest) in left.items():
+            rejection = rejected.get(os.path.normpath(path.absolute()))
+            self._files[path].done = True
+            if rejection is None or "no position" not in rejection.reason:
+                _log.warning("%s: %s", self._name(path), rejection.reason if rejection else "it gives no picture")
+                continue
+            pose = None if rejection.time_s is None else self._desk.pose_at(rejection.time_s)
+            values = None if pose is None else pose_values(pose)
+            if values is None:
+                self.poseless.add(path)
+                continue
+            name = self._taken.name(self._name(path), digest)
+            self._desk.keep(PostedPose(self._desk.vehicle, name, rejection.time_s, values), data)
+            self._done(path, digest)
+
+    def _take_video(self, path: Path, now: float) -> None:
+        """Take the pictures of a video in."""
+        try:
+            if not is_video_whole(path):
+                self._wait_for(path, now)
+                return
+            digest = video_digest(path)
+        except OSError:
+            self._wait_for(path, now)
+            return
+        if self._taken.holds(self._name(path), digest):
+            self._done(path, digest)
+            return
+        beside = [p for p in self._files if p.suffix.lower() == ".srt" and p.with_suffix("") == path.with_suffix("")]
+        found = self._load([path, *beside])
+        if found is None or not path.exists():
+            self._files[path].done = found is None and path.exists()
+            return
+        self._keep_video(path, found, digest)
+
+    def _keep_video(self, path: Path, found: "Ingest", digest: str) -> None:
+        name = self._taken.name(self._name(path), digest)
+        for frame in found.frames:
+            if self._desk.stop.is_set():
+                return
+            self._keep(frame, f"{name}#{frame.image.partition('#')[2]}", frame.path.read_bytes())
+            if frame.path.is_relative_to(self._desk.cache):
+                frame.path.unlink(missing_ok=True)
+        if found.frames:
+            self._done(path, digest)
+            return
+        if any("no position" in rejection.reason for rejection in found.rejected):
+            self.poseless.add(path)
+        for rejection in found.rejected:
+            _log.warning("%s: %s", self._name(path), rejection.reason)
+        self._files[path].done = True
+
+    def _keep(self, frame: "Frame", name: str, data: bytes) -> None:
+        """Take a frame in; height and angles that it lacks come from the link, if that agrees where it was."""
+        posted = posted_frame(frame, self._desk.vehicle, name)
+        if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
+            linked = self._desk.pose_at(posted.time_s)
+            values = None if linked is None else pose_values(linked)
+            if values is not None and apart_m(values, posted.values) < _NEAR_M:
+                for key in ("lat_deg", "lon_deg", "position_sigma_m", "altitude_m"):
+                    values.pop(key, None)
+                posted = PostedPose(posted.vehicle, posted.image, posted.time_s, values | posted.values)
+        self._desk.keep(posted, data)
+
+    def _done(self, path: Path, digest: str) -> None:
+        file = self._files[path]
+        file.done = True
+        self.poseless.discard(path)
+        self._fresh_at = time.monotonic()
+        if not self._desk.stop.is_set():
+            self._taken.add(self._name(path), file.stamp, digest)
+
+    def _load(self, paths: Sequence[Path]) -> "Ingest | None":
+        import telemetry
+
+        try:
+            return telemetry.load(paths, options=telemetry.LoadOptions(cache=self._desk.cache, workers=1))
+        except OrthoSwarmError as error:
+            _log.warning("%s: %s", self._desk.vehicle, error)
+            return None
+
+    def _tables(self, photos: Iterable[Path]) -> list[Path]:
+        """Tables of poses (geo.txt, CSV) beside photos, and above them within the folder."""
+        above = {folder for photo in photos for folder in photo.parents if folder.is_relative_to(self.folder)}
+        return [p for p in self._files if p.suffix.lower() in (".txt", ".csv") and p.parent in above and p.exists()]
+
+    # -- poses from logs ------------------------------------------------------------------------------------------
+
+    def _pair(self, here: Sequence[Path], now: float) -> None:
+        """Give pictures that have no pose the poses of a log beside them or of the vehicle's link, all at once."""
+        waiting = sorted(self.poseless.intersection(here))
+        if not waiting or any(now - self._files[path].since < _SETTLED_S for path in here):
+            return
+        sides = [p for p in here if p.suffix.lower() not in self._pictures | self._videos]
+        state = (tuple(waiting), tuple((p, self._files[p].stamp) for p in sides))
+        if state != self._tried:
+            self._again_s = _AGAIN_S[0]
+        elif now < self._again_at:
+            return
+        self._tried, self._again_at = state, now + self._again_s
+        self._again_s = min(_AGAIN_S[1], 2.0 * self._again_s)
+        self._desk.cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="pairing-", dir=self._desk.cache) as name:
+            desk = Path(name)
+            for path in [*waiting, *sides]:
+                _stand_in(path, desk / path.relative_to(self.folder))
+            self._desk.link_log(desk / "link.tlog")
+            found = self._load([desk])
+            if found is not None:
+                self._take_paired(waiting, found, desk)
+        if self.poseless and state[0] == tuple(waiting):
+            count = len(self.poseless)
+            self._desk.tell(f"{count} files of {self._desk.vehicle} wait for poses; put the flight's log beside them")
+
+    def _take_paired(self, waiting: Sequence[Path], found: "Ingest", desk: Path) -> None:
+        frames: dict[str, list[Frame]] = {}
+        for frame in found.frames:
+            frames.setdefault(frame.image.partition("#")[0], []).append(frame)
+        for path in waiting:
+            mine = frames.get(self._name(path), [])
+            with contextlib.suppress(OSError):  # gone meanwhile: at the next look
+                if mine and "#" in mine[0].image:
+                    self._keep_video(path, replace_frames(found, mine), video_digest(path))
+                elif mine:
+                    data = path.read_bytes()
+                    digest = digest_of(data)
+                    self._keep(mine[0], self._taken.name(self._name(path), digest), data)
+                    self._done(path, digest)
+
+
+def replace_frames(found: "Ingest", frames: "list[Frame]") -> "Ingest":
+    """The same with other frames and nothing rejected."""
+    from orthoswarm.model.frame import Ingest
+
+    return Ingest(frames, [], found.warnings)
+
+
+def _stand_in(path: Path, place: Path) -> None:
+    """Put a file where it can be read together with others, without copying it where that is possible."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.symlink_to(path.absolute())
+    except OSError:
+        try:
+            os.link(path, place)
+        except OSError:
+            shutil.copy2(path, place)

@@ -1,0 +1,1 @@
+"""Jobs of the daemon: a durable queue, worker processes, refinement, and what they publish."""

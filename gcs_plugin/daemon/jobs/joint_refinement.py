@@ -1,0 +1,122 @@
+"""Overlapping neighbours solved together: what was refined first has not yet seen those that completed after it.
+
+A vehicle is refined when it completes, beside the neighbours that are there, which are held; the first one knows of
+nobody. Once a neighbour has been refined, all that overlap it pass once more, and so does it (the second pass of the
+batch, `orthoswarm.refine.strategy`): on a common level, their pictures linked, and what the map did not show is laid
+beside those that it did show. That is work for a quiet moment: it begins when no refinement waits, and gives way to
+any that comes.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell, new_job
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
+from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_tasks import AgainTask, Solved, solve_again
+from gcs_plugin.daemon.layers.layers import Bounds, new_name
+from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
+from orthoswarm.model.errors import OrthoSwarmError
+
+_LEAST_PX: Final = 0.1
+"""What moves less, in pixels of the layer, is not drawn again."""
+
+
+def together_jobs(journal: Journal, job: Job, box: Bounds) -> list[Callable[[Any], Job]]:
+    """The changes that queue what has to be solved again once a job's sortie was refined: its neighbours, then it."""
+    others = others_near(journal, job, box, 0.0)
+    own = [(str(job.vehicle), job.sortie)] if others else []
+    again = [*((unpacked(row["vehicle"]), int(row["sortie"])) for row in others), *own]
+    return [new_job("together", vehicle, sortie, {}) for vehicle, sortie in again]
+
+
+@dataclass(slots=True)
+class Together:
+    """Does the jobs `together`.
+
+    Attributes:
+        journal, press: what there is. crew: where the work runs; it is this one's alone while a job runs.
+        basemap: the map. on_published: called with layer and job when pixels have changed.
+    """
+
+    journal: Journal
+    press: Press
+    crew: Crew
+    basemap: Path | None
+    on_published: Callable[[str, Job], None] = lambda layer, job: None
+    _working: bool = False
+    _aside: bool = False
+
+    def solve(self, job: Job, tell: Tell) -> Change:
+        """The handler of `together`."""
+        target = self.press.kept / f"{new_name('solution')}.pickle"
+        began = time.monotonic()
+        self._working, self._aside = True, False
+        try:
+            if not self._solve(job, tell, target):
+                target.unlink(missing_ok=True)
+        except OrthoSwarmError:
+            target.unlink(missing_ok=True)
+            if self._aside:
+                raise GaveWay from None
+            raise
+        finally:
+            self._working = False
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return lambda db: None
+
+    def give_up(self) -> None:
+        """Stop what is under way; it is done later."""
+        if self._working:
+            self._aside = True
+            self.crew.abandon()
+
+    def _solve(self, job: Job, tell: Tell, target: Path) -> bool:
+        """Solve and publish; False if everything stays as it is."""
+        row = solution_row(self.journal, job)
+        if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
+            return _note(job, "it was not refined on the map")
+        detail = json.loads(row["detail"])
+        others = [self.press.kept / other["path"] for other in others_near(self.journal, job, detail["bounds"], 0.0)]
+        if not others:
+            return _note(job, "it has no neighbours")
+        tell(0.05, f"solving again beside {len(others)} neighbour{'s' * (len(others) > 1)}")
+        area = self.press.area()
+        task = AgainTask(self.press.kept / row["path"], others, target, area.epsg, area.origin, self.basemap)
+        found = self.crew.run(solve_again, task)
+        if found is None:
+            return _note(job, "nothing of it is to be solved again")
+        solved, moved_m = found
+        job.detail |= {
+            "frames": len(solved.stages), "neighbours": len(others), "moved_p95_m": round(moved_m, 3),
+            "solve_cpu_s": round(solved.cpu_s, 3), "warnings": solved.warnings,
+        }  # fmt: skip
+        if moved_m < _LEAST_PX * area.gsd_m:
+            return _note(job, "it lies well beside its neighbours")
+        with self.press.turn("fine"):
+            now = solution_row(self.journal, job)
+            if now is None or now["path"] != row["path"]:
+                return _note(job, "it was refined anew meanwhile")
+            tell(0.7, "drawing")
+            self._print(job, target, solved, detail)
+        self.press.retire(self.press.kept / row["path"])
+        self.on_published("fine", job)
+        return True
+
+    def _print(self, job: Job, target: Path, solved: Solved, before: dict[str, Any]) -> None:
+        def change(rejected: dict[str, str]) -> Change:
+            return refined_change(job, solved, rejected, target.name, before | detail_of(solved, solved.legs))
+
+        job.detail["version_before"], job.detail["version"] = self.press.print(
+            "fine", self.crew, (str(job.vehicle), job.sortie), target, solved.changed, change
+        )
+
+
+def _note(job: Job, text: str) -> bool:
+    job.detail["note"] = text
+    return False

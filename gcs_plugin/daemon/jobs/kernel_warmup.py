@@ -1,0 +1,103 @@
+"""A tiny refinement of made-up pictures, so that a worker has its compiled kernels loaded before they matter.
+
+Loading them takes some seconds in a fresh process, as long as refining a hundred pictures.
+"""
+
+import contextlib
+import tempfile
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.geo import GroundGrid, LocalGrid
+from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.renderer import render
+from orthoswarm.raster.basemap import Basemap
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
+
+_EPSG: Final = 32631
+_EAST, _NORTH = 500_000.0, 5_000_000.0
+_SIDE_M: Final = 420
+_HEIGHT_M: Final = 60.0
+_LENS: Final = Lens(240, 180, focal_px(float(np.radians(70.0)), 240))
+
+
+def refine_something() -> None:
+    """Refine and draw a vehicle beside another of the same path, over a made-up map; the result is thrown away."""
+    ground = made_up_ground()
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(OrthoSwarmError):
+        place = Path(folder)
+        write_map(ground, place / "map.tif")
+        basemap = Basemap.open(place / "map.tif", _EPSG)
+        origin = np.array([_EAST, _NORTH])
+        refiner = SwarmRefiner(_EPSG, origin)
+        first = refiner.refine(made_up_flight(ground, place, "a"), [], basemap)
+        second = refiner.refine(made_up_flight(ground, place, "b"), [first], basemap)
+        terrain = second.terrain
+        if terrain is None:
+            return
+        grid = GroundGrid(_EPSG, _EAST - 200.0, _NORTH + 200.0, 0.5, 800, 800)
+        with Canvas.create(place / "canvas", grid, plane="frame") as canvas:
+            stats = render(second.placed, terrain, canvas)
+            estimate_gains(second.placed, stats.thumbnails, terrain)
+
+
+def made_up_ground() -> NDArray[np.float32]:
+    """Colours of a ground with detail of all sizes, float32 (metres down, metres right, 3)."""
+    import cv2
+
+    rng = np.random.default_rng(7)
+    ground = np.zeros((_SIDE_M, _SIDE_M, 3), np.float32)
+    for cells in (20, 80, 300):
+        part = rng.uniform(0.0, 85.0, (cells, cells, 3)).astype(np.float32)
+        ground += cv2.resize(part, (_SIDE_M, _SIDE_M), interpolation=cv2.INTER_LINEAR)
+    return ground
+
+
+def write_map(ground: NDArray[np.float32], path: Path) -> None:
+    """Write the ground as a georeferenced map."""
+    import rasterio
+    from rasterio.transform import from_origin
+
+    half = 0.5 * _SIDE_M
+    about: dict[str, Any] = {"driver": "GTiff", "width": _SIDE_M, "height": _SIDE_M, "count": 3, "dtype": "uint8"}
+    with rasterio.open(
+        path, "w", crs=f"EPSG:{_EPSG}", transform=from_origin(_EAST - half, _NORTH + half, 1.0, 1.0), **about
+    ) as raster:
+        raster.write(np.moveaxis(ground.astype(np.uint8), -1, 0))
+
+
+def made_up_flight(ground: NDArray[np.float32], folder: Path, vehicle: str) -> list[Frame]:
+    """Two legs of 14 pictures, there and back, photographed into a folder."""
+    grid = LocalGrid(_EPSG)
+    frames = []
+    for number in range(28):
+        back = number >= 14
+        along = -78.0 + 6.0 * (number - 14 if back else number)
+        position = np.array([_EAST - 60.0 + 30.0 * back, _NORTH + (-along if back else along), _HEIGHT_M])
+        yaw = np.pi if back else 0.0
+        camera = Camera(position, rotation_from_angles(yaw, NADIR_PITCH_RAD, 0.0), _LENS)
+        path = folder / f"{vehicle}{number}.jpg"
+        _photograph(ground, camera, path)
+        lat, lon = (float(v) for v in grid.to_geographic(position[:2]))
+        turn = float(grid.convergence_rad(lat, lon))
+        fix = Fix(lat, lon, _HEIGHT_M, None, yaw + turn, NADIR_PITCH_RAD, 0.0, None, None, False)
+        frames.append(Frame(path.name, path, vehicle, 1e9 + number, fix, _LENS.width, _LENS.height))
+    return frames
+
+
+def _photograph(ground: NDArray[np.float32], camera: Camera, path: Path) -> None:
+    import cv2
+
+    half = 0.5 * _SIDE_M
+    to_cells = np.array([[1.0, 0.0, half - 0.5 - _EAST], [0.0, -1.0, half - 0.5 + _NORTH], [0.0, 0.0, 1.0]])
+    matrix = to_cells @ camera.homography(0.0)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    picture = cv2.warpPerspective(ground, matrix, (_LENS.width, _LENS.height), flags=flags)
+    cv2.imwrite(str(path), picture[..., ::-1].astype(np.uint8))

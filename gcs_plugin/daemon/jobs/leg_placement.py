@@ -1,0 +1,208 @@
+"""The coarse layer: legs are placed and drawn as they finish, in flight, at the lowest priority.
+
+A job takes all legs of the vehicle that are over by then, so jobs that come faster than they can be done melt into
+one. What it makes is thrown away without regret: the work stops at once when the vehicle completes (its refinement
+takes its place) or when a refinement needs the layer.
+"""
+
+import json
+import logging
+import sqlite3
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell
+from gcs_plugin.daemon.jobs.placed_sorties import apart_m, detail_of, sortie_frames
+from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, coarse_after, joined, near, place
+from gcs_plugin.daemon.layers.layers import new_name
+from gcs_plugin.daemon.store.journal import Change, Journal, packed
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.export.product_files import finite
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.refine.flight.finished_legs import ended_legs
+
+MOST: Final = 200
+"""Pictures that are placed at once: those of the newest legs; older ones stay as they were placed."""
+_REACH_M: Final = 100.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Coarse:
+    """Does the jobs `coarse`.
+
+    Attributes:
+        journal, store, press: what there is. crew: where the work runs; it is this one's alone while a job runs.
+        basemap: the map, or None. on_published: called with layer and job when pixels have changed.
+    """
+
+    journal: Journal
+    store: PictureStore
+    press: Press
+    crew: Crew
+    basemap: Path | None
+    on_published: Callable[[str, Job], None] = lambda layer, job: None
+    _working: str | None = None
+    _aside: bool = False
+
+    def make(self, job: Job, tell: Tell) -> Change:
+        """The handler of `coarse`."""
+        target = self.press.kept / f"{new_name('coarse')}.pickle"
+        self._working, self._aside = str(job.vehicle), False
+        began = time.monotonic()
+        try:
+            change = self._after(job, tell, target) if "after" in job.detail else self._legs(job, tell, target)
+        except OrthoSwarmError as error:
+            target.unlink(missing_ok=True)
+            if self._aside:
+                raise GaveWay from None
+            if "stopped from outside" in str(error) or "disk" in str(error):
+                raise
+            job.detail["note"] = str(error)  # the map in flight stays as it is; the refinement will see
+            return lambda db: None
+        finally:
+            self._working = None
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return change
+
+    def give_up(self, vehicle: str | None, layer: str | None = None) -> None:
+        """Stop what is under way for a vehicle (None: any), or what holds a layer."""
+        if self._working is None or (vehicle is not None and vehicle != self._working):
+            return
+        if layer is None or layer in self.press.printing:
+            self._aside = True
+            self.crew.abandon()
+
+    # -- in flight ------------------------------------------------------------------------------------------------
+
+    def _legs(self, job: Job, tell: Tell, target: Path) -> Change:
+        vehicle, area = str(job.vehicle), self.press.area()
+        if self._is_refined(job):
+            job.detail["note"] = "it is refined already"
+            return lambda db: None
+        frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
+        frames, count = newest_legs(frames, area.epsg, over=bool(job.detail.get("over")))
+        if not frames:
+            raise OrthoSwarmError("no leg is over yet")
+        tell(0.1, f"{len(frames)} pictures, {count} legs")
+        before = self._row(job)
+        small = {f.image: thumbnails[f.image] for f in frames if f.image in thumbnails}
+        task = SolveTask(
+            frames, area.epsg, area.origin, self.basemap, small, self._others(job, frames), target,
+            None if before is None else self.press.kept / before["path"],
+        )  # fmt: skip
+        solved = self.crew.run(place, task)
+        job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}
+        fresh = {leg["images"][0] for leg in solved.legs if "images" in leg}
+        mine = {frame.image for frame in frames}
+        earlier = [] if before is None else json.loads(before["detail"])["legs"]
+        legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]
+        return self._print(job, tell, target, solved, [*legs, *solved.legs])
+
+    def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
+        """Kept sorties nearby, whose exposure is drawn already."""
+        box = near(frames, self.press.area().epsg)
+        mine = (packed(str(job.vehicle)), job.sortie)
+        shown = self.press.shown("coarse").items()
+        return [path for key, (path, bounds) in shown if key != mine and apart_m(bounds, box) < _REACH_M]
+
+    def _is_refined(self, job: Job) -> bool:
+        """Whether a refinement has taken, or is about to take, the place of what would be made."""
+        key = (packed(str(job.vehicle)), job.sortie)
+        for query in (
+            "SELECT 1 FROM completions WHERE vehicle = ? AND sortie = ?",
+            "SELECT 1 FROM jobs WHERE vehicle = ? AND sortie = ? AND kind = 'refine'"
+            " AND state IN ('queued', 'running')",
+        ):
+            if self.journal.one(query, key) is not None:
+                return True
+        row = self.journal.one("SELECT detail FROM solutions WHERE vehicle = ? AND sortie = ?", key)
+        return row is not None and json.loads(row["detail"])["layer"] == "coarse"
+
+    # -- after a refinement ---------------------------------------------------------------------------------------
+
+    def _after(self, job: Job, tell: Tell, target: Path) -> Change:
+        """The whole sortie on the coarse layer, by what its refinement began from."""
+        row = self.journal.one(
+            "SELECT path, detail FROM solutions WHERE vehicle = ? AND sortie = ?",
+            (packed(str(job.vehicle)), job.sortie),
+        )
+        if row is None or json.loads(row["detail"])["layer"] != "fine":
+            return lambda db: None
+        tell(0.1, "the coarse layer beside the refined one")
+        solved = self.crew.run(coarse_after, (self.press.kept / row["path"], self.press.area().origin, target))
+        return self._print(job, tell, target, solved, json.loads(row["detail"])["legs"])
+
+    # -- both -----------------------------------------------------------------------------------------------------
+
+    def _row(self, job: Job) -> Any:
+        return self.journal.one(
+            "SELECT * FROM coarse WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
+        )
+
+    def _print(self, job: Job, tell: Tell, target: Path, solved: Solved, legs: list[dict[str, Any]]) -> Change:
+        vehicle = packed(str(job.vehicle))
+        old = self._row(job)
+        changed = solved.changed
+        if old is not None and "after" in job.detail:
+            west, south, east, north = json.loads(old["detail"])["bounds"]
+            changed = joined([changed, (west, south, east, north)])
+        detail = json.dumps(detail_of(solved, legs))
+
+        def change(rejected: dict[str, str]) -> Change:
+            placed = [
+                (finite(sigma), vehicle, job.sortie, packed(image))
+                for image, (_, sigma) in solved.stages.items()
+                if image not in rejected
+            ]
+
+            def both(db: sqlite3.Connection) -> None:
+                db.executemany(
+                    "UPDATE frames SET stage = 'coarse', sigma = ? WHERE vehicle = ? AND sortie = ? AND image = ?"
+                    " AND stage IN ('realtime', 'coarse') AND reason IS NULL",
+                    placed,
+                )
+                db.execute(
+                    "INSERT OR REPLACE INTO coarse VALUES (?, ?, ?, ?)", (vehicle, job.sortie, target.name, detail)
+                )
+
+            return both
+
+        with self.press.turn("coarse"):
+            tell(0.7, "drawing")
+            if self._aside or ("after" not in job.detail and self._is_refined(job)):
+                raise OrthoSwarmError("a refinement takes its place")
+            job.detail["version_before"], job.detail["version"] = self.press.print(
+                "coarse", self.crew, (str(job.vehicle), job.sortie), target, changed, change
+            )
+        if old is not None:
+            self.press.retire(self.press.kept / old["path"])
+        self.on_published("coarse", job)
+        return lambda db: None
+
+
+def newest_legs(frames: list[Frame], epsg: int, *, over: bool = False) -> tuple[list[Frame], int]:
+    """The pictures of the newest legs that are over, MOST at most, turns between them included; and how many legs.
+
+    Args:
+        frames: of a sortie so far, in order of time. epsg: the area's grid. over: no more pictures are expected.
+    """
+    position = LocalGrid(epsg).to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
+    times = [f.time_s for f in frames]
+    timed = None if None in times else np.array(times, float)
+    legs = ended_legs(np.asarray(position), timed, over=over)
+    if not legs:
+        return [], 0
+    end = legs[-1][1] + 1
+    chosen = [leg for leg in legs if end - leg[0] <= MOST]
+    first = chosen[0][0] if chosen else end - MOST
+    return frames[first:end], max(1, len(chosen))

@@ -1,0 +1,100 @@
+"""Sorties that were placed, as the journal holds them: their frames, what is kept of them, and who lies beside whom."""
+
+import json
+import sqlite3
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from gcs_plugin.daemon.jobs.job_queue import Job
+from gcs_plugin.daemon.jobs.solution_file import Bytes, thumbnail_of
+from gcs_plugin.daemon.jobs.worker_tasks import Solved
+from gcs_plugin.daemon.layers.layers import Bounds
+from gcs_plugin.daemon.layers.realtime_layer import frame_of_row
+from gcs_plugin.daemon.store.journal import Change, Journal, packed
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.export.product_files import finite
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+
+
+def sortie_frames(
+    journal: Journal, store: PictureStore, vehicle: str, sortie: int | None
+) -> tuple[list[Frame], dict[str, Bytes]]:
+    """A sortie's frames in order of time that were not rejected, and image -> thumbnail of those that were drawn.
+
+    Raises:
+        OrthoSwarmError: there are none.
+    """
+    rows = journal.rows(
+        "SELECT frames.*, thumbnails.rgb FROM frames LEFT JOIN thumbnails USING (seq)"
+        " WHERE vehicle = ? AND sortie = ? AND reason IS NULL ORDER BY time, seq",
+        (packed(vehicle), sortie),
+    )
+    if not rows:
+        raise OrthoSwarmError(f"{vehicle} has no pictures that could be drawn; check its camera and its poses")
+    frames = [frame_of_row(row, store) for row in rows]
+    small = {f.image: thumbnail_of(row["rgb"]) for f, row in zip(frames, rows, strict=True) if row["rgb"] is not None}
+    return frames, small
+
+
+def detail_of(solved: Solved, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """What the journal keeps of a placed sortie, as JSON values."""
+    return {
+        "bounds": solved.bounds,
+        "legs": [leg | {key: finite(leg[key]) for key in ("confidence", "sigma_m")} for leg in legs],
+        "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
+        "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
+    }  # fmt: skip
+
+
+def apart_m(one: Bounds, other: Bounds) -> float:
+    """How far two boxes lie apart along an axis; negative where they overlap."""
+    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
+
+
+def solution_row(journal: Journal, job: Job) -> Any:
+    """What is kept of a job's sortie since it was refined, None if it was not."""
+    return journal.one(
+        "SELECT * FROM solutions WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
+    )
+
+
+def others_near(journal: Journal, job: Job, box: Bounds, reach_m: float) -> list[Any]:
+    """Rows of the refined sorties, but a job's own, whose ground comes nearer to a box than this."""
+    mine = (packed(str(job.vehicle)), job.sortie)
+    return [
+        row
+        for row in journal.rows("SELECT * FROM solutions ORDER BY vehicle, sortie")
+        if (row["vehicle"], row["sortie"]) != mine and apart_m(json.loads(row["detail"])["bounds"], box) < reach_m
+    ]
+
+
+def refined_change(job: Job, solved: Solved, rejected: dict[str, str], name: str, detail: dict[str, Any]) -> Change:
+    """The change by which a refinement stands: its frames' stages, what is kept, and that its job is done.
+
+    Args:
+        job: whose vehicle and sortie it is. solved: with stages and sigmas of what is new.
+        rejected: image -> why it could not be drawn. name: of the kept file. detail: what stands beside it.
+    """
+    vehicle = packed(str(job.vehicle))
+    dropped = {**solved.dropped, **rejected}
+    placed = [
+        (stage, finite(sigma), vehicle, job.sortie, packed(image))
+        for image, (stage, sigma) in solved.stages.items()
+        if image not in dropped
+    ]
+    lost = [(why, vehicle, job.sortie, packed(image)) for image, why in dropped.items()]
+
+    def change(db: sqlite3.Connection) -> None:
+        db.executemany("UPDATE frames SET stage = ?, sigma = ? WHERE vehicle = ? AND sortie = ? AND image = ?", placed)
+        db.executemany(
+            "UPDATE frames SET stage = 'rejected', reason = ? WHERE vehicle = ? AND sortie = ? AND image = ?", lost
+        )
+        db.execute(
+            "INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", (vehicle, job.sortie, name, json.dumps(detail))
+        )
+        # The job's result stands with this, so that it is not done again if the daemon ends right now.
+        db.execute("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", (time.time(), job.id))
+
+    return change

@@ -1,0 +1,183 @@
+"""Printing: the next generation of a refined layer is drawn beside the present one and takes its place at once.
+
+Until the last step nothing of what the map shows changes; the last step is one transaction of the journal, which names
+the layer's new generation and whatever else became true with it.
+"""
+
+import json
+import logging
+import shutil
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
+from gcs_plugin.daemon.layers.layers import Area, Bounds, Layer, new_name
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.errors import OrthoSwarmError
+
+REFINED = ("coarse", "fine")
+_log = logging.getLogger(__name__)
+
+
+class Press:
+    """Draws generations of the layers `coarse` and `fine`, one of each at a time.
+
+    Attributes:
+        folder: of the layers' canvases. kept: folder of kept sorties.
+        lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
+    """
+
+    def __init__(
+        self, journal: Journal, layers: dict[str, Layer], folder: Path, kept: Path, drawer: Drawer, *, trusted: bool
+    ) -> None:
+        """Remove what a killed daemon left half made, and open what it had published.
+
+        Args:
+            trusted: False after a power cut: canvases are not synced, for speed.
+        """
+        self.journal, self.layers, self.folder, self.kept, self._drawer = journal, layers, folder, kept, drawer
+        self._turns = {name: threading.Lock() for name in REFINED}
+        self.printing: set[str] = set()
+        self.kept.mkdir(parents=True, exist_ok=True)
+        begun = journal.fact("lost") or []
+        self.lost = [name for name in REFINED if not self._opened(name, trusted) or name in begun]
+        journal.write(fact_change("lost", self.lost))
+        self.sweep()
+
+    def _opened(self, layer: str, trusted: bool) -> bool:
+        """Open what was published of a layer; False if that cannot be trusted, and is forgotten."""
+        generation = self.journal.fact(layer)
+        if generation is None:
+            return not self.shown(layer)
+        try:
+            if not trusted:
+                raise OrthoSwarmError("it may have lost its last pixels in the power cut")
+            self.layers[layer].replace(Canvas.open(self.folder / generation))
+        except (OrthoSwarmError, OSError) as error:
+            _log.warning("the layer %s is drawn again: %s", layer, error)
+            self.journal.write(fact_change(layer, None))
+            return False
+        return True
+
+    def draw_again(self, crew: Crew, tell: Callable[[float, str], None]) -> Change:
+        """Draw the layers that were lost from the kept sorties, one after the other; gives the change that says so."""
+        todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
+        for n, (layer, (vehicle, sortie)) in enumerate(todo):
+            with self.turn(layer):
+                row = self.shown(layer).get((vehicle, sortie))
+                if row is None:
+                    continue  # refined, or drawn anew, meanwhile
+                tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
+                whose = (unpacked(vehicle), sortie)
+                self.print(layer, crew, whose, row[0], row[1], lambda rejected: lambda db: None)
+        return fact_change("lost", [])
+
+    def sweep(self) -> None:
+        """Remove canvases and pickles that nothing names."""
+        named = {self.journal.fact(name) for name in ("realtime", *REFINED)}
+        for path in self.folder.iterdir():
+            if path.name not in named:
+                shutil.rmtree(path, ignore_errors=True)
+        known = {row["path"] for table in ("solutions", "coarse") for row in self._rows(table)}
+        for path in self.kept.iterdir():
+            if path.name not in known:
+                path.unlink(missing_ok=True)
+
+    def area(self) -> Area:
+        """Where the map lies.
+
+        Raises:
+            OrthoSwarmError: there is no map yet.
+        """
+        if self._drawer.area is None:
+            raise OrthoSwarmError("there is no map yet; wait for pictures")
+        return self._drawer.area
+
+    @contextmanager
+    def turn(self, layer: str) -> Iterator[None]:
+        """Wait for a layer, and have it for oneself."""
+        with self._turns[layer]:
+            self.printing.add(layer)
+            try:
+                yield
+            finally:
+                self.printing.discard(layer)
+
+    def print(
+        self,
+        layer: str,
+        crew: Crew,
+        sortie: tuple[str, int | None],
+        target: Path,
+        changed: Bounds,
+        change: Callable[[dict[str, str]], Change],
+    ) -> tuple[int, int]:
+        """Draw a kept sortie into the next generation of a layer and publish it; the layer's turn must be held.
+
+        Args:
+            layer: coarse or fine. crew: where the work runs. sortie: vehicle and number.
+            target: the kept sortie. changed: ground that it shows otherwise than before.
+            change: gives, for image -> why it could not be drawn, what else becomes true in the journal.
+
+        Returns:
+            The layer's version before and now.
+
+        Raises:
+            OrthoSwarmError: the disk is full, or the work was stopped; nothing has changed.
+        """
+        name = new_name(layer)
+        try:
+            rejected = crew.run(draw, self._task(layer, name, sortie, target, changed))
+            fact, other = fact_change(layer, name), change(rejected)
+
+            def both(db: sqlite3.Connection) -> None:
+                other(db)
+                fact(db)
+
+            before = self.layers[layer].version
+            self.journal.write(both)  # here, so that the next drawing begins from it
+        except BaseException:
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+            raise
+        self.layers[layer].replace(Canvas.open(self.folder / name))
+        return before, self.layers[layer].version
+
+    def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, Bounds]]:
+        """(vehicle, sortie) -> kept file and bounds of all that show on a layer; a refined one hides its coarse one."""
+        refined = {(r["vehicle"], r["sortie"]): r for r in self._rows("solutions")}
+        rows = {key: row for key, row in refined.items() if json.loads(row["detail"])["layer"] == layer}
+        if layer == "coarse":
+            rows = {(r["vehicle"], r["sortie"]): r for r in self._rows("coarse")} | rows
+        return {key: (self.kept / row["path"], _bounds(row)) for key, row in sorted(rows.items())}
+
+    def retire(self, path: Path) -> None:
+        """Remove a kept file later: others may be reading it."""
+        later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
+        later.daemon = True
+        later.start()
+
+    def _task(self, layer: str, name: str, sortie: tuple[str, int | None], target: Path, changed: Bounds) -> DrawTask:
+        mine = (packed(sortie[0]), sortie[1])
+        others = [path for key, (path, box) in self.shown(layer).items() if key != mine and _meet(box, changed)]
+        canvas = self.layers[layer].canvas
+        old = None if canvas is None else canvas.path
+        return DrawTask(old, self.folder / name, self.area().grid, [*others, target], target, changed)
+
+    def _rows(self, table: str) -> list[Any]:
+        return self.journal.rows(f"SELECT * FROM {table} ORDER BY vehicle, sortie")
+
+
+def _bounds(row: Any) -> Bounds:
+    west, south, east, north = json.loads(row["detail"])["bounds"]
+    return west, south, east, north
+
+
+def _meet(one: Bounds, other: Bounds) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

@@ -1,0 +1,164 @@
+"""Refinement of one vehicle's sortie: gather its frames, solve and draw in worker processes, publish at once."""
+
+import json
+import sqlite3
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+from gcs_plugin.daemon.jobs.job_queue import Job, Tell, new_job
+from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
+from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, joined, lay_beside, near, solve
+from gcs_plugin.daemon.layers.layers import Bounds, new_name
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
+from gcs_plugin.daemon.store.picture_store import PictureStore
+
+_REACH_M: Final = 400.0
+_DRAWN_S: Final = 3.0
+_QUIET_S: Final = 0.7
+_MOST_QUIET_S: Final = 3.0
+_LATE_S: Final = 15.0
+_AGAIN: Final = 10
+"""So many pictures that came late have their vehicle refined again; fewer are laid beside its refined ones."""
+
+
+@dataclass(slots=True)
+class Refinement:
+    """Does the jobs `refine`.
+
+    Attributes:
+        journal, store, press: what there is. crew: where the work runs. drawer: of the real-time layer.
+        basemap: the map, or None. on_published: called with layer and job when pixels have changed.
+        make_way: called with vehicle and layer before the work begins, and before the layer is needed.
+    """
+
+    journal: Journal
+    store: PictureStore
+    press: Press
+    crew: Crew
+    drawer: Drawer
+    basemap: Path | None
+    on_published: Callable[[str, Job], None] = lambda layer, job: None
+    make_way: Callable[[str, str | None], None] = lambda vehicle, layer: None
+    stopped: Callable[[], bool] = lambda: False
+
+    def refine(self, job: Job, tell: Tell) -> Change:
+        """The handler of `refine`."""
+        vehicle = str(job.vehicle)
+        began = time.monotonic()
+        tell(0.02, "waiting for the last pictures")
+        self.make_way(vehicle, None)
+        if job.detail.get("trigger") == "complete":
+            self._wait_quiet(job)
+        self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
+        if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
+            return _nothing_came(job)
+        job.detail["refine_started_s"] = time.time()
+        area = self.press.area()
+        frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
+        before = self._beside(job, len(frames))
+        tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
+        target = self.press.kept / f"{new_name('solution')}.pickle"
+        task = SolveTask(
+            frames, area.epsg, area.origin, self.basemap, thumbnails, self._neighbours(job, near(frames, area.epsg)),
+            target, None if before is None else self.press.kept / before["path"],
+        )  # fmt: skip
+        solved = self.crew.run(solve if before is None else lay_beside, task)
+        if before is not None:
+            job.detail["beside"] = len(solved.stages)
+            if not solved.stages and not solved.dropped:
+                target.unlink(missing_ok=True)
+                return _nothing_came(job)
+        job.detail |= {
+            "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
+            "warnings": solved.warnings,
+        }  # fmt: skip
+        self._show(job, tell, target, solved, before)
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return lambda db: None
+
+    def _show(self, job: Job, tell: Tell, target: Path, solved: Solved, before: Any) -> None:
+        """Draw and publish what was solved."""
+        vehicle, layer = str(job.vehicle), "fine" if self.basemap is not None else "coarse"
+        job.detail["layer"] = layer
+        self.make_way(vehicle, layer)
+        with self.press.turn(layer):
+            tell(0.7, "drawing")
+            shown = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
+            changed = solved.changed
+            if before is None and shown is not None:  # it leaves where it was
+                changed = joined([changed, shown[1]])
+            job.detail["version_before"], job.detail["version"] = self.press.print(
+                layer, self.crew, (vehicle, job.sortie), target, changed,
+                lambda rejected: self._publish(job, layer, target, solved, rejected, before),
+            )  # fmt: skip
+        job.detail["published_s"] = time.time()
+        self.on_published(layer, job)
+
+    # -- the parts ------------------------------------------------------------------------------------------------
+
+    def _wait_quiet(self, job: Job) -> None:
+        """Pictures that were on their way when the vehicle completed still belong to its sortie.
+
+        They are thought to be all there when none has come for longer than they came apart before.
+        """
+        end = time.monotonic() + _LATE_S
+        while time.monotonic() < end and not self.stopped():
+            rows = self.journal.rows(
+                "SELECT arrived FROM frames WHERE vehicle = ? AND sortie = ? ORDER BY seq DESC LIMIT 8",
+                (packed(str(job.vehicle)), job.sortie),
+            )
+            came = [float(row["arrived"]) for row in rows]
+            apart = max((a - b for a, b in pairwise(came)), default=0.0)
+            if came and time.time() - came[0] > min(max(_QUIET_S, apart), _MOST_QUIET_S):
+                return
+            time.sleep(0.05)
+
+    def _beside(self, job: Job, count: int) -> Any:
+        """The kept refinement beside which late pictures are laid; None if all are to be refined."""
+        if job.detail.get("trigger") != "late":
+            return None
+        row = solution_row(self.journal, job)
+        refined = None if row is None else json.loads(row["detail"]).get("refined")
+        return row if refined is not None and count - refined < _AGAIN else None
+
+    def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
+        """Solutions of others whose ground comes near."""
+        return [self.press.kept / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
+
+    def _publish(
+        self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str], before: Any
+    ) -> Change:
+        if before is None:
+            count = len(solved.stages) - len(rejected)
+            detail = detail_of(solved, solved.legs) | {"layer": layer, "refined": count}
+        else:
+            detail = json.loads(before["detail"]) | {"bounds": solved.bounds}
+        stands = refined_change(job, solved, rejected, target.name, detail)
+        old = solution_row(self.journal, job)
+        then = []
+        if self.basemap is not None:  # the coarse layer shows all of the sortie, too
+            then.append(new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"}))
+            if before is None:
+                then += together_jobs(self.journal, job, solved.bounds)
+
+        def change(db: sqlite3.Connection) -> None:
+            stands(db)
+            for queue in then:
+                queue(db)
+
+        if old is not None:
+            self.press.retire(self.press.kept / old["path"])
+        return change
+
+
+def _nothing_came(job: Job) -> Change:
+    job.detail["note"] = "nothing came late"
+    return lambda db: None

@@ -1,0 +1,151 @@
+"""Worker processes of the daemon: warm, low in priority, and gone when the daemon is gone, however it went."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Final, TypeVar
+
+from gcs_plugin.daemon.jobs.process_usage import used_by
+from orthoswarm.compute.workers import Usage, single_threaded
+from orthoswarm.model.errors import OrthoSwarmError
+
+Result = TypeVar("Result")
+
+NICE: Final = 5
+LAST: Final = 10
+"""Priority of what may wait while anything else has work."""
+
+
+class Crew:
+    """A few processes that run one function at a time each.
+
+    Args:
+        count: how many processes. nice: how much lower their priority is than the daemon's (not on Windows).
+    """
+
+    def __init__(self, count: int, nice: int = NICE) -> None:
+        self.count, self._nice = max(1, count), nice
+        self._lock = threading.Lock()
+        self._pool: ProcessPoolExecutor | None = None
+        self._closed = self._started = self._warm = False
+        self._ended_cpu_s = 0.0
+
+    def warm_up(self) -> None:
+        """Start the processes, once, and let them import what they will need."""
+        with self._lock:
+            if self._started or self._closed:
+                return
+            self._started = True
+        for _ in range(self.count):
+            self.submit(_import_all, 0)
+
+    def warm_kernels(self) -> None:
+        """Have a process load its compiled kernels, once: the first vehicle that completes need not wait for that."""
+        with self._lock:
+            if self._warm or self._closed:
+                return
+            self._warm = True
+        for _ in range(self.count):
+            self.submit(_warm_kernels, 0)
+
+    def submit(self, function: Callable[[Any], Result], item: Any) -> "Future[Result]":
+        """Run a module-level function of one picklable argument."""
+        with self._lock:
+            if self._closed:
+                raise OrthoSwarmError("the daemon is stopping; start it again")
+            if self._pool is None:
+                single_threaded()
+                context = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(
+                    self.count, mp_context=context, initializer=_prepare, initargs=(self._nice,)
+                )
+            try:
+                return self._pool.submit(function, item)
+            except BrokenProcessPool:
+                self._pool = None
+        return self.submit(function, item)
+
+    def run(self, function: Callable[[Any], Result], item: Any) -> Result:
+        """Run a function and wait for it.
+
+        Raises:
+            OrthoSwarmError: the process was stopped from outside. What the function raises is raised here.
+        """
+        future = self.submit(function, item)
+        pool = self._pool
+        try:
+            return future.result()
+        except (BrokenProcessPool, CancelledError):
+            with self._lock:
+                if self._pool is pool:
+                    self._pool = None
+            raise OrthoSwarmError("a worker process was stopped from outside, mostly for lack of memory") from None
+
+    def usage(self) -> Usage:
+        """CPU time of all its processes so far, and the largest memory of each one that lives, added up."""
+        with self._lock:
+            living = _used(self._pool)
+            return Usage(self._ended_cpu_s + living.cpu_s, living.peak_rss_mb)
+
+    def abandon(self) -> None:
+        """Give up what is under way, at once; the processes start anew with the next work."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+            self._ended_cpu_s += _used(pool).cpu_s
+        if pool is not None:
+            _end(pool)
+
+    def close(self) -> None:
+        """Stop at once; what was under way is given up."""
+        with self._lock:
+            pool, self._pool, self._closed = self._pool, None, True
+        if pool is not None:
+            for process in _end(pool):
+                process.join(5.0)
+
+
+def _used(pool: ProcessPoolExecutor | None) -> Usage:
+    parts = [used_by(pid) for pid in list(getattr(pool, "_processes", None) or {})]
+    return Usage(sum(part.cpu_s for part in parts), sum(part.peak_rss_mb for part in parts))
+
+
+def _end(pool: ProcessPoolExecutor) -> list[Any]:
+    """Terminate a pool's processes; gives them."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    for process in processes:
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)
+    return processes
+
+
+def _prepare(nice: int) -> None:
+    """First thing in a worker: the daemon handles signals, and its end is this process's end, too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(nice)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()  # also wakes up when it was killed
+        os._exit(1)
+
+
+def _import_all(_: int) -> None:
+    import gcs_plugin.daemon.jobs.worker_tasks  # noqa: F401
+    import orthoswarm.refine.strategy.swarm_refiner  # noqa: F401
+
+
+def _warm_kernels(_: int) -> None:
+    from gcs_plugin.daemon.jobs.kernel_warmup import refine_something
+
+    refine_something()

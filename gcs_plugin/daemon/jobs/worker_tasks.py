@@ -1,0 +1,324 @@
+"""What worker processes do for the daemon: place a vehicle's pictures, and draw the next generation of a layer.
+
+Both hand large things over as files: a solution is pickled beside the journal, a generation is a folder of tiles.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcs_plugin.daemon.jobs.solution_file import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
+from gcs_plugin.daemon.layers.layers import Bounds, drawn_bounds, successor, union
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import GroundGrid, LocalGrid
+from orthoswarm.model.placement import Leg, PlacedFrame, Solution
+from orthoswarm.mosaic.oblique import strays, told
+from orthoswarm.mosaic.renderer import render
+from orthoswarm.raster.basemap import Basemap
+
+
+@dataclass(frozen=True, slots=True)
+class SolveTask:
+    """One vehicle's sortie, or as much of it as there is.
+
+    Attributes:
+        frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
+        thumbnails: image -> uint8 (12, 16, 3).
+        neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        before: in flight, what was kept of the sortie's earlier legs; for late pictures, of its refinement.
+    """
+
+    frames: list[Frame]
+    epsg: int
+    origin: tuple[float, float]
+    basemap: Path | None
+    thumbnails: dict[str, Bytes]
+    neighbours: list[Path]
+    target: Path
+    before: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """What became of it.
+
+    Attributes:
+        stages: image -> stage and sigma in metres, of what is new. dropped: image -> why.
+        legs: as JSON values with `line`, their ends in degrees. fov_deg: with its sigma. warnings: in plain words.
+        bounds: of what all its frames see. changed: of the ground that has to be drawn anew.
+        cpu_s: CPU seconds that it took; wall_s.
+    """
+
+    stages: dict[str, tuple[str, float]]
+    dropped: dict[str, str]
+    legs: list[dict[str, Any]]
+    fov_deg: float
+    fov_sigma_deg: float
+    warnings: list[str]
+    bounds: Bounds
+    changed: Bounds
+    cpu_s: float
+    wall_s: float
+
+
+class _Watch:
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def solved(self, solution: Solution, frames: Sequence[Frame], kept: Kept, changed: Bounds) -> Solved:
+        return Solved(
+            {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
+            [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
+            list(solution.warnings), seen(kept.solution.placed, kept.terrain), changed,
+            time.process_time() - self._cpu, time.monotonic() - self._wall,
+        )  # fmt: skip
+
+
+def solve(task: SolveTask) -> Solved:
+    """Refine one vehicle.
+
+    Raises:
+        OrthoSwarmError: nothing can be made of its frames.
+    """
+    from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
+
+    watch = _Watch()
+    others = [load_kept(path) for path in task.neighbours]
+    refiner = SwarmRefiner(task.epsg, np.array(task.origin))
+    solution = without_strays(refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task)))
+    kept = Kept(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
+    kept.write(task.target)
+    return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
+
+
+def lay_beside(task: SolveTask) -> Solved:
+    """Lay pictures that came late beside the others of their sortie, which was refined without them."""
+    from orthoswarm.refine.registration.late_pictures import lay_late
+    from orthoswarm.refine.strategy.vehicle_passes import read_frame
+
+    assert task.before is not None
+    watch = _Watch()
+    before = load_kept(task.before)
+    refined = before.solution
+    known = {p.frame.image for p in refined.placed} | set(refined.dropped)
+    placed, dropped = lay_late([f for f in task.frames if f.image not in known], refined, task.epsg, read_frame)
+    whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
+    thumbnails = before.thumbnails | task.thumbnails
+    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], before.gains)
+    kept = Kept(whole, thumbnails, gains)
+    kept.write(task.target)
+    new = replace(whole, placed=placed, dropped=dropped, legs=[])
+    return watch.solved(new, [], kept, seen(placed, kept.terrain))
+
+
+def without_strays(solution: Solution) -> Solution:
+    """The solution without pictures that look far aside among others that look straight down, which would smear."""
+    out = strays(solution.placed)
+    if not out:
+        return solution
+    return replace(
+        solution,
+        placed=[p for p in solution.placed if p.frame.image not in out],
+        dropped={**solution.dropped, **out},
+        warnings=[*solution.warnings, *told(out)],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AgainTask:
+    """A refined sortie, to be solved once more beside neighbours.
+
+    Attributes:
+        before: the kept sortie. neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        epsg, origin: the area's. basemap: the map.
+    """
+
+    before: Path
+    neighbours: list[Path]
+    target: Path
+    epsg: int
+    origin: tuple[float, float]
+    basemap: Path
+
+
+def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
+    """Solve a refined sortie again; gives how far its pictures moved (metres, 95 %), None if nothing was to be solved.
+
+    Its exposure stays as it is: its neighbours were drawn to agree with it.
+    """
+    from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner, states_of
+
+    watch = _Watch()
+    before = load_kept(task.before)
+    frames = [frame for state in states_of(before.solution) for frame in state.flight.frames]
+    if not frames:
+        return None
+    others = [load_kept(path).solution for path in task.neighbours]
+    basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
+    solution = SwarmRefiner(task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
+    if solution is before.solution:
+        return None
+    kept = replace(before, solution=solution)
+    kept.write(task.target)
+    changed = joined([seen(p.solution.placed, p.terrain) for p in (before, kept)])
+    return watch.solved(solution, frames, kept, changed), _moved_m(before.solution, solution)
+
+
+def _moved_m(before: Solution, now: Solution) -> float:
+    """How far the ground under pictures moved, 95 % of their middles and corners."""
+    was = {p.frame.image: p.camera for p in before.placed}
+    moved = [
+        np.hypot(*(_ground_of(p.camera, now.ground_z_m) - _ground_of(was[p.frame.image], before.ground_z_m)).T)
+        for p in now.placed
+        if p.frame.image in was and not p.weak
+    ]
+    found = np.concatenate(moved) if moved else np.zeros(1)
+    return float(np.nanpercentile(found, 95))
+
+
+def _ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """East and north (5, 2) of a picture's middle and corners on a level plane."""
+    return np.vstack([camera.to_ground(np.array(camera.lens.principal_point), z_m), camera.corners(z_m)])
+
+
+def place(task: SolveTask) -> Solved:
+    """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
+
+    Raises:
+        OrthoSwarmError: the pictures do not hold together (yet).
+    """
+    from orthoswarm.refine.strategy.in_flight import place_in_flight
+
+    watch = _Watch()
+    solution = place_in_flight(task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task))
+    mine = {frame.image for frame in task.frames}
+    before = Kept(replace(solution, placed=[])) if task.before is None else load_kept(task.before)
+    earlier = [p for p in before.solution.placed if p.frame.image not in mine]
+    moved = [p for p in before.solution.placed if p.frame.image in mine]
+    whole = replace(solution, placed=[*earlier, *solution.placed])
+    stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
+    thumbnails = before.thumbnails | task.thumbnails
+    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], stays)
+    kept = Kept(whole, thumbnails, gains)
+    kept.write(task.target)
+    changed = seen([*solution.placed, *moved], kept.terrain)
+    return watch.solved(solution, _in_units(task.frames), kept, changed)
+
+
+def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
+    """The coarse placement that a refined sortie began from, for the coarse layer.
+
+    Args:
+        task: the kept refined sortie, the area's origin, where the coarse one goes.
+
+    Raises:
+        OrthoSwarmError: the refined one does not know any more.
+    """
+    from orthoswarm.refine.strategy.in_flight import coarse_of
+
+    watch = _Watch()
+    source, origin, target = task
+    fine = load_kept(source)
+    solution = coarse_of(fine.solution, np.array(origin))
+    there = {p.frame.image for p in solution.placed}
+    solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # laid beside the others
+    kept = replace(fine, solution=solution)
+    kept.write(target)
+    return watch.solved(replace(solution, legs=[]), [], kept, seen(solution.placed, kept.terrain))
+
+
+def _basemap(task: SolveTask) -> Basemap | None:
+    return None if task.basemap is None else Basemap.open(task.basemap, task.epsg, near(task.frames, task.epsg))
+
+
+def near(frames: Sequence[Frame], epsg: int) -> Bounds:
+    """West, south, east, north of where pictures were taken, by their records."""
+    ground = LocalGrid(epsg).to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
+    (west, south), (east, north) = ground.min(0), ground.max(0)
+    return float(west), float(south), float(east), float(north)
+
+
+def _in_units(frames: Sequence[Frame]) -> list[Frame]:
+    """Frames in the order in which legs number them: unit by unit."""
+    from orthoswarm.refine.flight.solve_units import split_units
+
+    return [frame for unit in split_units({frames[0].vehicle: frames}) for frame in unit]
+
+
+def _leg(leg: Leg, frames: Sequence[Frame]) -> dict[str, Any]:
+    """A leg as JSON values, with its ends by the record and the pictures at them."""
+    values: dict[str, Any] = {
+        "vehicle": leg.vehicle, "first": leg.first, "last": leg.last, "state": leg.state,
+        "confidence": leg.confidence, "sigma_m": leg.sigma_m,
+    }  # fmt: skip
+    if 0 <= leg.first < leg.last < len(frames):
+        ends = [frames[leg.first], frames[leg.last]]
+        values["line"] = [[f.fix.lon_deg, f.fix.lat_deg] for f in ends]
+        values["images"] = [f.image for f in ends]
+    return values
+
+
+@dataclass(frozen=True, slots=True)
+class DrawTask:
+    """The next generation of a refined layer.
+
+    Attributes:
+        old: folder of the present generation, None for the first. new: folder of the next.
+        grid: where the layer lies.
+        solutions: kept sorties, in the order that breaks ties; all that show on the layer near the changed ground.
+        changed: the one whose ground is drawn anew. bounds: that ground.
+    """
+
+    old: Path | None
+    new: Path
+    grid: GroundGrid
+    solutions: list[Path]
+    changed: Path
+    bounds: Bounds
+
+
+def draw(task: DrawTask) -> dict[str, str]:
+    """Draw a sortie, and what overlaps it, into a new generation; gives image -> why it could not be drawn.
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    placed: list[PlacedFrame] = []
+    gains: dict[str, Any] = {}
+    terrain = load_kept(task.changed).terrain
+    for path in task.solutions:
+        kept = load_kept(path)
+        for p in kept.solution.placed:
+            if touches(p, task.bounds):
+                frame = marked(p, len(placed), own=path == task.changed)
+                placed.append(frame)
+                if p.frame.image in kept.gains:
+                    gains[frame.frame.image] = kept.gains[p.frame.image]
+    old = None if task.old is None else Canvas.open(task.old, writable=False)
+    canvas = successor(old, task.new, task.grid, "frame", share=True)
+    try:
+        stats = render(placed, terrain, canvas, gains=gains, bounds=task.bounds)
+        canvas.flush()
+        assert drawn_bounds(canvas) is not None or not stats.pixels.any()
+    finally:
+        canvas.close()
+        if old is not None:
+            old.close()
+    named = ([*key.split(" ", 2), why] for key, why in stats.rejected.items())
+    return {image: why for _, whose, image, why in named if whose == OWN}
+
+
+def load_solution(path: Path) -> Solution:
+    """The solution of a kept sortie."""
+    return load_kept(path).solution
+
+
+def joined(boxes: Sequence[Bounds | None]) -> Bounds:
+    """The box around those boxes that there are."""
+    return union([box for box in boxes if box is not None])

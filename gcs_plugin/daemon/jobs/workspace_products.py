@@ -1,0 +1,260 @@
+"""The workspace's products: the same files as those of a batch run, made in a worker from what the journal holds."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gcs_plugin.daemon.jobs.worker_tasks import load_solution
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.compute.workers import Usage
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Frame, Rejection
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Solution
+from orthoswarm.raster.basemap import Basemap
+
+FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm")
+_FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
+
+
+@dataclass(frozen=True, slots=True)
+class ExportTask:
+    """What to write.
+
+    Attributes:
+        workspace: the daemon's folder. formats: some of FORMATS.
+        canvases: layer -> its canvas's folder, those that there are. epsg, gsd_m: the area's.
+        frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
+        coarse, solutions: kept sorties, those only placed in flight and those refined.
+        basemap: the map, or None. fov_rad: theta-hat.
+    """
+
+    workspace: Path
+    formats: tuple[str, ...]
+    canvases: dict[str, Path]
+    epsg: int
+    gsd_m: float
+    frames: list[Frame]
+    reasons: dict[tuple[str, str], str]
+    coarse: list[Path]
+    solutions: list[Path]
+    basemap: Path | None
+    fov_rad: float | None
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def write_products(task: ExportTask) -> dict[str, str]:
+    """Write COGs, frames.jsonl, footprints, report, and the other formats; gives format -> path in the workspace.
+
+    Raises:
+        InputError: there is no map yet.
+        OrthoSwarmError: the disk is full.
+    """
+    from orthoswarm.export.product_files import write_frames, write_json
+    from orthoswarm.report.page import write_page
+
+    out = task.workspace
+    made, area_ha = _pictures(task)
+    if not made:
+        raise InputError("there is no map yet; wait for pictures")
+    refined = [load_solution(path) for path in task.solutions]
+    solutions = [*(load_solution(path) for path in task.coarse), *refined]
+    placed, rejected = _placements(task, solutions)
+    placed, level = _stated(placed, solutions)
+    write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
+    report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
+    basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
+    write_page(out, report, placed, rejected, basemap)
+    write_json(out / "report.json", report)
+    files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
+    others = [name for name in task.formats if name not in files]
+    if others:
+        files |= _converted(task, out / made[-1], others, placed)
+    return files
+
+
+def _pictures(task: ExportTask) -> tuple[list[str], float]:
+    """A COG for each layer, the best one last, and the ground that the first shows, hectares.
+
+    orthoimage.tif is there as soon as anything was refined.
+    """
+    import shutil
+
+    from orthoswarm.export.cog import write_cog
+    from orthoswarm.model.atomic_file import written_whole
+    from orthoswarm.mosaic.extent import drawn_window
+
+    made: list[str] = []
+    area_ha = 0.0
+    for name, file in _FILES.items():
+        if name not in task.canvases:
+            continue
+        with Canvas.open(task.canvases[name], writable=False) as canvas:
+            if canvas.drawn[1] == 0:
+                continue
+            area_ha = area_ha or _drawn_ha(canvas)
+            write_cog(_WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1)
+        made.append(file)
+    if task.solutions and made[-1:] == ["coarse.tif"]:  # without a map the orthoimage is the coarse product
+        with written_whole(task.workspace / "orthoimage.tif") as part:
+            shutil.copyfile(task.workspace / "coarse.tif", part)
+        made.append("orthoimage.tif")
+    return made, area_ha
+
+
+def _drawn_ha(canvas: Canvas) -> float:
+    """Ground that a canvas shows, hectares."""
+    row0, row1, col0, col1 = canvas.drawn
+    drawn = 0
+    for top in range(row0, row1, canvas.tile_px):
+        drawn += int(np.count_nonzero(canvas.read(top, min(row1, top + canvas.tile_px), col0, col1)[..., 3]))
+    return drawn * canvas.grid.gsd_m**2 / 1e4
+
+
+class _WithOverviews:
+    """A canvas that another process writes: its overviews may be behind, so reduced pixels are made from full ones."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self.grid, self._canvas = canvas.grid, canvas
+
+    def read_reduced(self, factor: int, row0: int, row1: int, col0: int, col1: int) -> Any:
+        """See Canvas.read_reduced."""
+        from orthoswarm.canvas.overviews import reduce_rgba
+
+        if factor == 1:
+            return self._canvas.read(row0, row1, col0, col1)
+        out = np.zeros((row1 - row0, col1 - col0, 4), np.uint8)
+        step = max(1, 512 // factor)  # in strips, for memory
+        for top in range(row0, row1, step):
+            bottom = min(row1, top + step)
+            part = self._canvas.read(top * factor, bottom * factor, col0 * factor, col1 * factor)
+            out[top - row0 : bottom - row0] = reduce_rgba(part, factor)
+        return out
+
+
+def _placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], list[Rejection]]:
+    """Each frame as it was placed last."""
+    from orthoswarm.model.recorded_pose import recorded_cameras
+
+    best: dict[tuple[str, str], PlacedFrame] = {}
+    grid = LocalGrid(task.epsg)
+    ordered = sorted(task.frames, key=lambda f: (f.vehicle, f.time_s or 0.0))
+    recorded = recorded_cameras(ordered, grid, task.fov_rad)
+    for p in [*recorded.placed, *(p for s in solutions for p in s.placed)]:
+        best[p.frame.vehicle, p.frame.image] = p
+    reasons = {(r.vehicle, r.image): r.reason for r in recorded.rejected} | task.reasons
+    placed = [replace(p, frame=_writable(p.frame)) for key, p in best.items() if key not in reasons]
+    known = {(f.vehicle, f.image): _writable(f) for f in task.frames}
+    left_out = ((known[key], why) for key, why in reasons.items() if key in known)
+    return placed, [Rejection(f.image, why, f.vehicle, f.time_s) for f, why in left_out]
+
+
+def _writable(frame: Frame) -> Frame:
+    """A frame whose names can be written in UTF-8 and by C libraries."""
+    image, vehicle = (
+        text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0") for text in (frame.image, frame.vehicle)
+    )
+    return replace(frame, image=image, vehicle=vehicle)
+
+
+def _stated(placed: list[PlacedFrame], solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
+    """The frames and the level of the ground below them as they are written."""
+    from orthoswarm.mosaic.extent import from_takeoff, ground_level
+
+    terrain = next((s.terrain for s in solutions if s.terrain is not None), None)
+    frames, level = from_takeoff(placed, ground_level(placed, terrain))
+    return list(frames), level
+
+
+def _report(
+    task: ExportTask, solutions: list[Solution], placed: list[PlacedFrame], rejected: list[Rejection], level: float
+) -> dict[str, Any]:
+    from orthoswarm.export.product_files import leg_rows, vehicle_rows
+
+    warnings = [w for s in solutions for w in s.warnings]
+    if task.basemap is None:
+        warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
+    for stage in task.facts.get("stages", []):
+        if stage["name"] == "realtime":
+            stage["items"] = len(placed)
+    return {
+        "frames": {"input": len(placed) + len(rejected), "used": len(placed), "rejected": len(rejected)},
+        "vehicles": vehicle_rows(solutions, placed), "legs": leg_rows(solutions), "ground_z_m": level,
+        "refine": "swarm" if solutions else "none", "warnings": list(dict.fromkeys(warnings)), "epsg": task.epsg,
+        "gsd_m": task.gsd_m, "basemap": None if task.basemap is None else task.basemap.name, **task.facts,
+    }  # fmt: skip
+
+
+def _converted(task: ExportTask, picture: Path, formats: list[str], placed: list[PlacedFrame]) -> dict[str, str]:
+    """The other formats, in the workspace's folder `export`."""
+    from orthoswarm.export.kmz import write_kmz
+    from orthoswarm.export.mbtiles import write_mbtiles
+    from orthoswarm.export.odm_folder import write_odm
+    from orthoswarm.export.product_files import read_frames
+
+    dest = task.workspace / "export"
+    files: dict[str, str] = {}
+    for name in formats:
+        path = dest / (f"{picture.stem}.{name}" if name != "odm" else "odm")
+        if name == "mbtiles":
+            write_mbtiles(picture, path, name=picture.stem)
+        elif name == "kmz":
+            write_kmz(picture, path, name=picture.stem)
+        else:
+            paths = {(p.frame.vehicle, p.frame.image): p.frame.path for p in placed}
+            write_odm(list(read_frames(task.workspace / "frames.jsonl")), partial(_find, paths), path)
+        files[name] = path.relative_to(task.workspace).as_posix()
+    return files
+
+
+def _find(paths: dict[tuple[str, str], Path], row: Mapping[str, Any]) -> Path | None:
+    return paths.get((row["vehicle"], row["image"]))
+
+
+def facts_of(
+    jobs: list[dict[str, Any]],
+    completions: list[dict[str, Any]],
+    wall_s: float,
+    cpu_s: float,
+    others: Sequence[Usage],
+    rss_mb: float,
+) -> dict[str, Any]:
+    """What only the daemon knows for the report: stage timings from its jobs, completions, and what it uses.
+
+    Args:
+        jobs: all, as JSON values. completions: the same.
+        wall_s: since its start. cpu_s, rss_mb: of the daemon's own process. others: of its other processes.
+    """
+    stages = [
+        {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},  # counted when the report is written
+        *(
+            {
+                "name": f"{j['detail'].get('layer', 'fine')}: {j['vehicle']}",
+                "wall_s": j["detail"].get("seconds", 0.0),
+                "cpu_s": j["detail"].get("solve_cpu_s", 0.0), "items": j["detail"].get("frames", 0),
+            }
+            for j in jobs
+            if j["kind"] == "refine" and j["state"] == "done"
+        ),
+        *_summed("coarse: in flight", "coarse", jobs),
+        *_summed("fine: neighbours together", "together", jobs),
+    ]  # fmt: skip
+    document = {
+        "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),
+        "peak_rss_mb": rss_mb + sum(other.peak_rss_mb for other in others), "completions": completions,
+    }  # fmt: skip
+    return dict(json.loads(json.dumps(document)))
+
+
+def _summed(name: str, kind: str, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The stage of all jobs of a kind that placed pictures, if there were any."""
+    details = [j["detail"] for j in jobs if j["kind"] == kind and "frames" in j["detail"]]
+    if not details:
+        return []
+    wall, cpu = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))
+    return [{"name": name, "wall_s": wall, "cpu_s": cpu, "items": sum(d["frames"] for d in details)}]

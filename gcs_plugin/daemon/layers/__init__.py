@@ -1,0 +1,1 @@
+"""Map layers of the daemon: canvases and their generations, the real-time layer, web tiles."""

@@ -1,0 +1,112 @@
+"""Frames that wait to be drawn, bounded in number, in the order in which they matter.
+
+A map pixel takes the picture with the nearest nadir point, so a frame wins the fewer pixels the nearer its nadir lies
+to one that is drawn already: its share of the map is its cell of the Voronoi diagram of all nadirs. That distance, in
+steps of a twentieth of a footprint, is a frame's level; the highest level goes first, within a level the oldest. When
+more wait than memory is meant for, those of the lowest level are let go of: they stay in the journal, undrawn.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from orthoswarm.model.frame import Frame
+
+LEVELS: Final = 8
+_STEP_SHARE: Final = 0.06
+_HEIGHT_M: Final = 100.0
+_METRES_A_DEGREE: Final = 111_320.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A frame to be drawn: its number, when it came (UTC epoch seconds), its sortie."""
+
+    seq: int
+    arrived: float
+    sortie: int
+    frame: Frame
+
+
+class Waiting:
+    """The queue; whoever uses it sees to it that one thread does at a time.
+
+    Args:
+        most: how many it holds.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._queues: list[deque[Pending]] = [deque() for _ in range(LEVELS)]
+        self._drawn: set[tuple[int, int]] = set()
+        self._step_m = 0.0
+        self._east_m = _METRES_A_DEGREE
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def put(self, pending: Pending) -> Pending | None:
+        """Add a frame; gives the one that has to leave for it (itself, if it matters least), None if there is room."""
+        level = self._level(pending.frame)
+        left: Pending | None = None
+        if self._count >= self.most:
+            lowest = next(k for k, queue in enumerate(self._queues) if queue)
+            if lowest >= level:
+                return pending
+            left = self._queues[lowest].popleft()
+            self._count -= 1
+        self._queues[level].append(pending)
+        self._count += 1
+        return left
+
+    def take(self) -> Pending | None:
+        """The frame that is to be drawn next; it counts as drawn from now on. None if there is none."""
+        for level in range(LEVELS - 1, -1, -1):
+            queue = self._queues[level]
+            while queue:
+                pending = queue.popleft()
+                now = self._level(pending.frame)
+                if now < level:  # others were drawn nearby meanwhile
+                    self._queues[now].append(pending)
+                    continue
+                self._count -= 1
+                self._drawn.add(self._cell(pending.frame))
+                return pending
+        return None
+
+    def seqs(self) -> set[int]:
+        """The numbers of all that wait."""
+        return {pending.seq for queue in self._queues for pending in queue}
+
+    def forget_drawn(self) -> None:
+        """The map is drawn anew: nothing is on it."""
+        self._drawn.clear()
+
+    def _cell(self, frame: Frame) -> tuple[int, int]:
+        fix = frame.fix
+        if self._step_m == 0.0:  # the first frame sets the scale
+            self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or _HEIGHT_M))
+            self._east_m = _METRES_A_DEGREE * max(0.05, math.cos(math.radians(fix.lat_deg)))
+        return (
+            int(fix.lat_deg * _METRES_A_DEGREE / self._step_m // 1),
+            int(fix.lon_deg * self._east_m / self._step_m // 1),
+        )
+
+    def _level(self, frame: Frame) -> int:
+        """Rings of cells around a frame's nadir without a drawn one, at most LEVELS - 1."""
+        row, col = self._cell(frame)
+        drawn = self._drawn
+        if (row, col) in drawn:
+            return 0
+        for ring in range(1, LEVELS - 1):
+            for k in range(-ring, ring + 1):
+                if (
+                    (row - ring, col + k) in drawn
+                    or (row + ring, col + k) in drawn
+                    or (row + k, col - ring) in drawn
+                    or (row + k, col + ring) in drawn
+                ):
+                    return ring
+        return LEVELS - 1

@@ -1,0 +1,426 @@
+"""The real-time layer: one thread that draws every frame of the journal that is not drawn yet, the most telling first.
+
+The journal is the queue, so nothing waits in memory without bound and nothing is forgotten by a crash. While the thread
+keeps up, frames are drawn as they come. Under overload those that would win the fewest pixels are put off (`waiting`):
+they are on the disk, count for the refinement, and are drawn when there is time; how many they are is told.
+"""
+
+import json
+import logging
+import shutil
+import sqlite3
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.daemon.intake.posted_pose import frame_of
+from gcs_plugin.daemon.layers.draw_queue import Pending, Waiting
+from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Drawn, Journal, fact_change, frames_drawn, packed, unpacked
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import GroundGrid, LocalGrid, utm_epsg
+from orthoswarm.model.recorded_pose import recorded_cameras
+from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.realtime import RealtimeMosaic
+from orthoswarm.mosaic.render_passes import thumbnail
+from orthoswarm.raster.picture_file import read_rgba
+
+_IN_MEMORY: Final = 2000
+_AT_ONCE: Final = 16
+_LATE_S: Final = 1.0
+_LOOK_S: Final = 0.5
+_FEW: Final = 200
+_OTHER_GSD: Final = 3.0
+_FAR_M: Final = 100_000.0
+_SEEN_HEIGHTS: Final = 4.0  # nothing is drawn beyond 3.8 heights (`reach`)
+_COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"
+_log = logging.getLogger(__name__)
+Bytes = NDArray[np.uint8]
+
+
+class Drawer:
+    """Draws the frames of a journal on the real-time layer.
+
+    Attributes:
+        area: where the map lies, None before the first frame.
+        drawn: frames drawn since the start. late: drawn later than a second after they came.
+        put_off: frames that wait longer than a second, because they would show least of all that wait.
+        latencies: seconds from arrival to the map, of the last thousand.
+    """
+
+    def __init__(
+        self,
+        journal: Journal,
+        store: PictureStore,
+        layer: Layer,
+        folder: Path,
+        events: Events,
+        *,
+        gsd_m: float | None = None,
+        fov_rad: float | None = None,
+        on_area: Callable[[Area], None] = lambda _: None,
+    ) -> None:
+        """Take up where the last daemon stopped; `start` begins to draw.
+
+        Args:
+            journal: what there is.
+            store: where the pictures are.
+            layer: to draw on.
+            folder: of all layers' canvases.
+            events: told of frames and layer versions.
+            gsd_m: ground pixel; from the first pictures if None.
+            fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
+            on_area: called in the drawing thread when the area changes.
+        """
+        self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
+        self._gsd_m, self._fov_rad, self._on_area = gsd_m, fov_rad, on_area
+        self._queue = Waiting(_IN_MEMORY)
+        self._waiting: set[int] = set()
+        self._looked = 0.0
+        self._more, self._looking = True, False
+        self._condition = threading.Condition()
+        self._stop = False
+        self._thread: threading.Thread | None = None
+        self._mosaic: RealtimeMosaic | None = None
+        self._grid: LocalGrid | None = None
+        self.area: Area | None = None
+        self.drawn = self.late = self.put_off = 0
+        self.latencies: list[float] = []
+        self.problem = ""
+        document = journal.fact("area")
+        if document is not None:
+            self.area = Area.from_document(document)
+            self._open(journal.fact("realtime"))
+
+    # -- from outside ---------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin to draw, in a thread."""
+        self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop after the present frame."""
+        with self._condition:
+            self._stop = True
+            self._condition.notify_all()
+        if self._thread is not None:
+            self._thread.join()
+
+    def add(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
+        """Hand in a frame that is in the journal."""
+        with self._condition:
+            if seq not in self._waiting:
+                self._put(Pending(seq, arrived, sortie, frame))
+            self._condition.notify_all()
+
+    @property
+    def backlog(self) -> int:
+        """Frames that wait in memory; up to a bound, beyond which the journal knows."""
+        return len(self._queue)
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until nothing is left to draw; returns whether that is so."""
+        end = time.monotonic() + timeout_s
+        with self._condition:
+            while len(self._queue) or self._waiting or self._more or self._looking:
+                left = end - time.monotonic()
+                if left <= 0 or self._stop:
+                    return False
+                self._condition.wait(left)
+        return True
+
+    def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
+        """Wait until a sortie's frames are drawn, whatever else waits; returns whether that is so."""
+        end = time.monotonic() + timeout_s
+        query = "SELECT 1 FROM frames WHERE drawn = 0 AND vehicle = ? AND sortie IS ? LIMIT 1"
+        while self._journal.one(query, (packed(vehicle), sortie)) is not None:
+            if time.monotonic() > end or self._stop:
+                return False
+            time.sleep(0.05)
+        return True
+
+    # -- the thread -----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        _warm_up(self._folder)
+        while True:
+            with self._condition:
+                while not len(self._queue) and not self._more and not self._stop:
+                    self._condition.wait()
+                if self._stop:
+                    return
+            try:
+                self._refill()
+                self._draw_some()
+                self._tell_overload()
+                self.problem = ""
+            except OrthoSwarmError as error:  # the disk is full, or gone: nothing is lost, try again
+                self._complain(str(error))
+            except sqlite3.Error as error:
+                self._complain(f"the journal cannot be read ({error})")
+
+    def _complain(self, problem: str) -> None:
+        if problem != self.problem:
+            self.problem = problem
+            _log.error("drawing waits: %s", problem)
+            self._events.publish("problem", text=problem)
+        with self._condition:
+            self._waiting = self._queue.seqs()
+            self._more, self._looking = True, False
+            self._condition.wait(1.0)
+
+    def _tell_overload(self) -> None:
+        """Say how many frames are put off, when that has changed; the journal knows."""
+        now = time.monotonic()
+        if now - self._looked < _LOOK_S or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
+            return
+        self._looked = now
+        query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?"
+        row = self._journal.one(query, (time.time() - _LATE_S,))
+        before, self.put_off = self.put_off, 0 if row is None else int(row["n"])
+        if bool(before) != bool(self.put_off):
+            _log.warning("%s", self.overload or "all pictures are on the map again")
+        if before != self.put_off:
+            self._events.publish("overload", put_off=self.put_off, text=self.overload)
+
+    @property
+    def overload(self) -> str:
+        """What there is to say about frames that are put off; empty if there are none."""
+        if not self.put_off:
+            return ""
+        return (
+            f"more pictures come than can be drawn at once: {self.put_off} that would show least are put off;"
+            " they are safe on the disk and are drawn when there is time"
+        )
+
+    def _refill(self) -> None:
+        with self._condition:
+            if not self._more or len(self._queue) > _IN_MEMORY // 2:
+                return
+            self._more, self._looking = False, True
+        most = _IN_MEMORY + len(self._waiting) + 1
+        rows = self._journal.rows(f"SELECT {_COLUMNS} FROM frames WHERE drawn = 0 ORDER BY seq LIMIT ?", (most,))
+        with self._condition:
+            self._looking = False
+            self._more = self._more or len(rows) == most
+            for row in rows:
+                if row["seq"] not in self._waiting:
+                    if len(self._queue) >= _IN_MEMORY:
+                        self._more = True
+                        break
+                    self._put(Pending(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
+
+    def _put(self, pending: Pending) -> None:
+        self._waiting.add(pending.seq)
+        left = self._queue.put(pending)
+        if left is not None:  # it is found in the journal when there is room
+            self._waiting.discard(left.seq)
+            self._more = True
+
+    def _draw_some(self) -> None:
+        done: list[Drawn] = []
+        seqs: list[int] = []
+        while len(done) < _AT_ONCE:
+            with self._condition:
+                pending = None if self._stop else self._queue.take()
+            if pending is None:
+                break
+            result = self._draw(pending)
+            done.append(result)
+            seqs.append(pending.seq)
+            self._note(pending, result)
+        if done:
+            self._journal.write(frames_drawn(done))
+            self._events.publish("layer", layer="realtime", version=self._layer.version)
+        with self._condition:
+            self._waiting.difference_update(seqs)
+            self._condition.notify_all()
+
+    def _note(self, pending: Pending, result: Drawn) -> None:
+        took = time.time() - pending.arrived
+        self.drawn += 1
+        self.late += took > _LATE_S
+        self.latencies.append(took)
+        del self.latencies[:-1000]
+
+    # -- one frame ------------------------------------------------------------------------------------------------
+
+    def _draw(self, pending: Pending) -> Drawn:
+        frame = pending.frame
+        try:
+            place = self._place(frame)
+            if isinstance(place, str):
+                return self._told(pending, Drawn(pending.seq, place, None), None)
+            camera, sigma = place
+            picture = read_rgba(frame.path)
+            mosaic = self._mosaic
+            assert mosaic is not None
+            added = mosaic.add(picture, camera)
+        except OrthoSwarmError as error:
+            if "canvas" in str(error):  # the disk is full: later
+                raise
+            reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
+            return self._told(pending, Drawn(pending.seq, reason, None), None)
+        except (ValueError, ArithmeticError) as error:
+            return self._told(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
+        return self._told(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
+
+    def _told(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
+        frame, fix = pending.frame, pending.frame.fix
+        outline = None
+        if camera is not None and self._grid is not None and drawn.reason is None:
+            corners = camera.corners()
+            if np.isfinite(corners).all():
+                outline = [[float(lon), float(lat)] for lat, lon in self._grid.to_geographic(corners)]
+        self._events.publish(
+            "frame", seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
+            stage="rejected" if drawn.reason else "realtime", reason=drawn.reason, sigma_m=drawn.sigma_m,
+            lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, outline=outline,
+        )  # fmt: skip
+        return drawn
+
+    def _place(self, frame: Frame) -> tuple[Camera, float] | str:
+        """The frame's camera and sigma, the layer ready to take it; or why it cannot be drawn."""
+        if self._grid is None:
+            if not -80.0 <= frame.fix.lat_deg <= 84.0:
+                return "it lies beyond the UTM grid, near a pole"
+            epsg = self.area.epsg if self.area else utm_epsg(frame.fix.lat_deg, frame.fix.lon_deg)
+            self._grid = LocalGrid(epsg)
+        place = self._grid.to_grid(frame.fix.lat_deg, frame.fix.lon_deg)
+        if not np.isfinite(place).all() or (self.area is not None and self._away_m(place) > _FAR_M):
+            return "it lies more than 100 km from the others; use a workspace of its own for it"
+        placed = recorded_cameras([frame], self._grid, self._fov_rad).placed
+        if not placed:
+            return "its position is not a number"
+        camera = placed[0].camera
+        if self.area is None:
+            gsd = self._gsd_m or default_gsd([camera])
+            reason = rejection(camera, 0.0, gsd)
+            if reason is not None:
+                self._grid = None
+                return reason
+            self._begin(Area.around(self._grid.epsg, float(place[0]), float(place[1]), gsd))
+        elif self._gsd_m is None and self.drawn < _FEW and self._is_other_scale(camera):
+            self._begin_again(camera, place)
+        return self._with_room(camera) or (camera, placed[0].sigma_m)
+
+    def _away_m(self, place: Any) -> float:
+        assert self.area is not None
+        return float(np.hypot(*(place - np.array(self.area.origin))))
+
+    def _is_other_scale(self, camera: Camera) -> bool:
+        """Whether the map's scale was taken from pictures during the climb."""
+        assert self.area is not None
+        height = float(camera.position[2])
+        solved = self._journal.one("SELECT 1 FROM solutions LIMIT 1") is not None
+        return 10.0 < height < 500.0 and not solved and height / camera.lens.focal_px > _OTHER_GSD * self.area.gsd_m
+
+    def _begin_again(self, camera: Camera, place: Any) -> None:
+        assert self._grid is not None
+        gsd = default_gsd([camera])
+        _log.info("the map's pixel becomes %.3f m; what was drawn is drawn again", gsd)
+        self._begin(Area.around(self._grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
+
+    def _with_room(self, camera: Camera) -> str | None:
+        """Make sure that the layer holds what a camera sees; why not, if that cannot be."""
+        assert self.area is not None
+        east, north, height = (float(v) for v in camera.position)
+        far = _SEEN_HEIGHTS * abs(height)
+        if self.area.holds((east - far, north - far, east + far, north + far)):
+            return None  # the usual case, without a look at the footprint
+        if rejection(camera, 0.0, self.area.gsd_m) is not None:
+            return None  # the mosaic will say so
+        box = footprint_boxes([camera], 0.0, 0.0)[0]
+        bounds = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
+        if not np.isfinite(box).all() or self.area.holds(bounds):
+            return None
+        try:
+            area = self.area.grown(bounds)
+        except OrthoSwarmError as error:
+            return str(error)
+        old = self._layer.canvas
+        name = new_name("realtime")
+        self._adopt(area, successor(old, self._folder / name, area.grid, "orthogonality", share=True))
+        return None
+
+    # -- the layer ------------------------------------------------------------------------------------------------
+
+    def _begin(self, area: Area, *, again: bool = False) -> None:
+        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid)
+        self._adopt(area, canvas, again=again)
+
+    def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
+        """Make a canvas the layer, in the journal first."""
+        facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
+
+        def change(db: sqlite3.Connection) -> None:
+            for fact in facts:
+                fact(db)
+            if again:
+                db.execute("UPDATE frames SET drawn = 0")
+
+        self._journal.write(change)
+        if again:
+            with self._condition:
+                self._queue.forget_drawn()
+                self._more = True
+        self.area = area
+        self._layer.replace(canvas)
+        self._mosaic = RealtimeMosaic(canvas)
+        self._grid = LocalGrid(area.epsg)
+        self._on_area(area)
+
+    def _open(self, name: str | None) -> None:
+        """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
+        assert self.area is not None
+        try:
+            canvas = Canvas.open(self._folder / str(name))
+        except (OrthoSwarmError, OSError):
+            _log.warning("the real-time layer is damaged and is drawn again")
+            self._begin(self.area, again=True)
+            return
+        self._layer.replace(canvas)
+        self._mosaic = RealtimeMosaic(canvas)
+        self._grid = LocalGrid(self.area.epsg)
+        self._on_area(self.area)
+
+
+def _warm_up(folder: Path) -> None:
+    """Load the compiled kernels before the first picture needs them."""
+    path = folder / new_name("warm")
+    try:
+        lens = Lens(32, 24, 30.0)
+        camera = Camera(np.array([16.0, 16.0, 30.0]), rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0), lens)
+        with Canvas.create(path, GroundGrid(32631, 0.0, 64.0, 1.0, 64, 64), tile_px=64) as canvas:
+            RealtimeMosaic(canvas).add(np.full((24, 32, 4), 255, np.uint8), camera)
+    except OrthoSwarmError as error:  # a full disk is told when there is something to draw
+        _log.warning("%s", error)
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _thumbnail(picture: Bytes) -> bytes:
+    """The means of a picture's parts, for gains; see `thumbnail`."""
+    import cv2
+
+    some = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
+    return thumbnail(np.ascontiguousarray(some[..., :3])).tobytes()
+
+
+def frame_of_row(row: sqlite3.Row, store: PictureStore) -> Frame:
+    """The frame of a journal's row."""
+    return frame_of(
+        json.loads(row["pose"]), image=unpacked(row["image"]), path=store.path(row["path"]),
+        vehicle=unpacked(row["vehicle"]), time_s=row["time"], size=(row["width"], row["height"]),
+    )  # fmt: skip

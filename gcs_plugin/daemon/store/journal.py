@@ -1,0 +1,288 @@
+"""The daemon's memory: SQLite with a write-ahead log, written by one thread that commits many changes at once.
+
+What `write` has returned from (or its future resolved) is on the disk: a commit is followed by fsync, and one fsync
+serves all changes that waited meanwhile. Texts from outside (names of vehicles and pictures) are kept as JSON in
+ASCII, so that any characters, NUL and lone surrogates included, come back as they came.
+"""
+
+import contextlib
+import json
+import queue
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from orthoswarm.model.errors import OrthoSwarmError
+
+Result = TypeVar("Result")
+
+_SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS vehicles (
+    id TEXT PRIMARY KEY, sortie INTEGER NOT NULL DEFAULT 1, state TEXT NOT NULL DEFAULT '{}');
+CREATE TABLE IF NOT EXISTS frames (
+    seq INTEGER PRIMARY KEY AUTOINCREMENT, key BLOB NOT NULL UNIQUE, vehicle TEXT NOT NULL, image TEXT NOT NULL,
+    sortie INTEGER NOT NULL, time REAL, arrived REAL NOT NULL, path TEXT NOT NULL,
+    width INTEGER NOT NULL, height INTEGER NOT NULL, pose TEXT NOT NULL,
+    drawn INTEGER NOT NULL DEFAULT 0, stage TEXT NOT NULL DEFAULT 'realtime', sigma REAL, reason TEXT, camera TEXT);
+CREATE INDEX IF NOT EXISTS frames_by_vehicle ON frames (vehicle, sortie);
+CREATE INDEX IF NOT EXISTS frames_to_draw ON frames (drawn) WHERE drawn = 0;
+CREATE TABLE IF NOT EXISTS jobs (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, kind TEXT NOT NULL, vehicle TEXT, sortie INTEGER,
+    state TEXT NOT NULL, progress REAL NOT NULL DEFAULT 0, message TEXT NOT NULL DEFAULT '',
+    created REAL NOT NULL, started REAL, ended REAL, attempts INTEGER NOT NULL DEFAULT 0, detail TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS solutions (
+    vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, path TEXT NOT NULL, detail TEXT NOT NULL,
+    PRIMARY KEY (vehicle, sortie));
+CREATE TABLE IF NOT EXISTS coarse (
+    vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, path TEXT NOT NULL, detail TEXT NOT NULL,
+    PRIMARY KEY (vehicle, sortie));
+CREATE TABLE IF NOT EXISTS thumbnails (seq INTEGER PRIMARY KEY, rgb BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS completions (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
+"""
+_BATCH: Final = 256
+_BUSY_S: Final = 30.0
+
+Change = Callable[[sqlite3.Connection], Any]
+
+
+def packed(text: str) -> str:
+    """Any text as ASCII that SQLite can hold."""
+    return json.dumps(text)
+
+
+def unpacked(text: str) -> str:
+    """The text that `packed` took."""
+    return str(json.loads(text))
+
+
+class Journal:
+    """Everything that must survive a crash, but for pictures and map tiles.
+
+    Attributes:
+        path: the database file; made if absent.
+        commits: how many commits there were.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open or make the journal.
+
+        Raises:
+            OrthoSwarmError: the file cannot be opened or is no journal.
+        """
+        self.path, self.commits = path, 0
+        self._local = threading.local()
+        self._readers: list[sqlite3.Connection] = []
+        self._guard = threading.Lock()
+        self._work: queue.SimpleQueue[tuple[Change, Future[Any]] | None] = queue.SimpleQueue()
+        try:
+            self._writer = self._connect()
+            self._writer.execute("PRAGMA journal_mode=WAL")
+            self._writer.execute("PRAGMA synchronous=FULL")
+            self._writer.executescript(_SCHEMA)
+        except sqlite3.Error as error:
+            raise OrthoSwarmError(f"the journal {path} cannot be opened ({error}); choose another workspace") from None
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what is waiting and let go of the file."""
+        self._work.put(None)
+        self._thread.join()
+        with self._guard:
+            for reader in self._readers:
+                with contextlib.suppress(sqlite3.Error):
+                    reader.close()
+            self._readers.clear()
+        self._writer.close()
+
+    # -- writing --------------------------------------------------------------------------------------------------
+
+    def submit(self, change: Callable[[sqlite3.Connection], Result]) -> "Future[Result]":
+        """Have a change made; the future's result is the change's, once it is safe on the disk.
+
+        A change that raises is undone by itself; others of its batch stay. A full disk fails the whole batch.
+        """
+        future: Future[Any] = Future()
+        self._work.put((change, future))
+        return future
+
+    def write(self, change: Callable[[sqlite3.Connection], Result]) -> Result:
+        """Make a change and wait until it is safe."""
+        return self.submit(change).result()
+
+    def _run(self) -> None:
+        while True:
+            first = self._work.get()
+            if first is None:
+                return
+            batch, last = [first], False
+            while len(batch) < _BATCH:
+                try:
+                    more = self._work.get_nowait()
+                except queue.Empty:
+                    break
+                if more is None:
+                    last = True
+                    break
+                batch.append(more)
+            self._commit(batch)
+            if last:
+                return
+
+    def _commit(self, batch: Sequence[tuple[Change, "Future[Any]"]]) -> None:
+        outcomes: list[tuple[Future[Any], Any, BaseException | None]] = []
+        try:
+            self._writer.execute("BEGIN IMMEDIATE")
+            for change, future in batch:
+                self._writer.execute("SAVEPOINT change")
+                try:
+                    outcomes.append((future, change(self._writer), None))
+                except Exception as error:
+                    self._writer.execute("ROLLBACK TO change")
+                    outcomes.append((future, None, error))
+                self._writer.execute("RELEASE change")
+            self._writer.execute("COMMIT")
+            self.commits += 1
+        except Exception as error:  # the disk is full or gone: nothing of this batch has happened
+            with contextlib.suppress(sqlite3.Error):
+                self._writer.execute("ROLLBACK")
+            reason = OrthoSwarmError(f"the journal cannot be written ({error}); free some disk space")
+            for _, future in batch:
+                future.set_exception(reason)
+            return
+        for future, value, problem in outcomes:
+            if problem is not None:
+                future.set_exception(problem)
+            else:
+                future.set_result(value)
+
+    # -- reading --------------------------------------------------------------------------------------------------
+
+    def rows(self, query: str, values: Sequence[Any] | Mapping[str, Any] = ()) -> list[sqlite3.Row]:
+        """The rows of a query, from any thread."""
+        return list(self._reader().execute(query, values))
+
+    def one(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Row | None:
+        """The first row of a query, None if there is none."""
+        row: sqlite3.Row | None = self._reader().execute(query, values).fetchone()
+        return row
+
+    def _reader(self) -> sqlite3.Connection:
+        reader: sqlite3.Connection | None = getattr(self._local, "reader", None)
+        if reader is None:
+            reader = self._local.reader = self._connect()
+            reader.execute("PRAGMA query_only=ON")
+            with self._guard:
+                self._readers.append(reader)
+        return reader
+
+    def _connect(self) -> sqlite3.Connection:
+        connection = sqlite3.connect(self.path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        connection.row_factory = sqlite3.Row
+        return connection
+
+    # -- small facts ----------------------------------------------------------------------------------------------
+
+    def fact(self, key: str) -> Any:
+        """A remembered JSON value, None if there is none."""
+        row = self.one("SELECT value FROM meta WHERE key = ?", (key,))
+        return None if row is None else json.loads(row["value"])
+
+    def remember(self, key: str, value: Any) -> None:
+        """Remember a JSON value."""
+        self.write(fact_change(key, value))
+
+
+def fact_change(key: str, value: Any) -> Change:
+    """The change that remembers a JSON value, to be made together with others."""
+    text = json.dumps(value)
+
+    def change(db: sqlite3.Connection) -> None:
+        db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
+
+    return change
+
+
+# -- frames -------------------------------------------------------------------------------------------------------
+
+
+def add_frame(
+    key: bytes,
+    vehicle: str,
+    image: str,
+    time_s: float | None,
+    path: str,
+    size: tuple[int, int],
+    pose: Mapping[str, Any],
+) -> Callable[[sqlite3.Connection], tuple[int, bool]]:
+    """The change that enters a frame into the vehicle's present sortie; gives its number and whether it is new."""
+    name, arrived = packed(vehicle), time.time()
+    row = (key, name, packed(image), time_s, arrived, path, size[0], size[1], json.dumps(pose), name)
+
+    def change(db: sqlite3.Connection) -> tuple[int, bool]:
+        db.execute("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (name,))
+        cursor = db.execute(
+            "INSERT OR IGNORE INTO frames (key, vehicle, image, time, arrived, path, width, height, pose, sortie)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, (SELECT sortie FROM vehicles WHERE id = ?))",
+            row,
+        )
+        new = cursor.rowcount == 1
+        number = db.execute("SELECT seq FROM frames WHERE key = ?", (key,)).fetchone()[0]
+        return int(number), new
+
+    return change
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What became of a frame in real time.
+
+    Attributes:
+        seq: its number. reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
+        thumbnail: bytes of uint8 (12, 16, 3), by which gains are evened out; None for a picture that was not read.
+    """
+
+    seq: int
+    reason: str | None
+    sigma_m: float | None
+    thumbnail: bytes | None = None
+
+
+_LATE: Final = """
+SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
+    AND arrived > COALESCE((SELECT MAX(COALESCE(json_extract(detail, '$.refine_started_s'), started)) FROM jobs
+        WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie AND id != :job), 0)
+    AND (EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
+        OR EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie
+            AND detail LIKE '%"trigger": "lost"%'))
+"""
+
+
+def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0) -> int:
+    """How many frames of a sortie its last refinement, other than a job's, has not seen; 0 while it is flown."""
+    row = journal.rows(_LATE, {"vehicle": packed(vehicle), "sortie": sortie, "job": job})[0]
+    return int(row["late"])
+
+
+def frames_drawn(results: Iterable[Drawn]) -> Change:
+    """The change that notes frames as drawn in real time; those that were refined meanwhile stay so."""
+    done = list(results)
+    rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
+    thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
+
+    def change(db: sqlite3.Connection) -> None:
+        db.executemany(
+            "UPDATE frames SET drawn = 1, reason = ?, stage = CASE WHEN stage IN ('coarse', 'fine') THEN stage"
+            " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
+            rows,
+        )
+        db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
+
+    return change

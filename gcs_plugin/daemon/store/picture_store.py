@@ -1,0 +1,105 @@
+"""Pictures on disk: a file each, named by a hash of vehicle and picture, whole and synced before anybody is told."""
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+from pathlib import Path
+from typing import Final
+
+from orthoswarm.model.atomic_file import disk_error
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+_SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
+_FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
+_MOST_PIXELS: Final = 400_000_000
+
+
+def frame_key(vehicle: str, image: str) -> bytes:
+    """The 32 bytes that stand for a picture of a vehicle; equal only for equal names."""
+    text = json.dumps([vehicle, image])  # ASCII whatever the names hold, and no two pairs alike
+    return hashlib.sha256(text.encode()).digest()
+
+
+def picture_size(data: bytes) -> tuple[int, int, str]:
+    """Columns, rows and file suffix of a picture, read from its head.
+
+    Raises:
+        InputError: it is no picture, or a huge one.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
+    try:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
+            (width, height), kind = picture.size, picture.format or ""
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, OverflowError):
+        raise InputError("the file is no picture (JPEG, PNG, WebP, TIFF or BMP); send the camera's file") from None
+    except Image.DecompressionBombError:
+        raise InputError("the picture has more pixels than any camera; send a smaller one") from None
+    if width * height > _MOST_PIXELS or min(width, height) < 1:
+        raise InputError(f"a picture of {width} x {height} pixels is not possible; send a smaller one")
+    return width, height, _SUFFIXES[kind]
+
+
+class PictureStore:
+    """The folder of pictures: `ab/<64 hexadecimal digits>.jpg`.
+
+    Attributes:
+        folder: made if absent.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for number in range(256):
+                (folder / f"{number:02x}").mkdir(exist_ok=True)
+                for part in (folder / f"{number:02x}").glob("*.part"):  # of a daemon that was killed
+                    part.unlink()
+            _sync_folder(folder)
+        except OSError as error:
+            raise disk_error(error, folder) from None
+
+    def path(self, name: str) -> Path:
+        """The file of a name that `put` has given."""
+        return self.folder / name
+
+    def put(self, key: bytes, suffix: str, data: bytes) -> str:
+        """Write a picture; when this returns, neither a crash nor a power cut loses it.
+
+        Returns:
+            Its name within the folder.
+
+        Raises:
+            OrthoSwarmError: the disk is full or gone.
+        """
+        digits = key.hex()
+        name = f"{digits[:2]}/{digits}{suffix}"
+        path = self.folder / name
+        part = path.with_suffix(".part")
+        try:
+            with part.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+            _sync_folder(path.parent)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                part.unlink()
+            reason = disk_error(error, path)
+            raise OrthoSwarmError(str(reason).replace(path.name, "a picture")) from None
+        return name
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a folder's new names last through a power cut, where the system can."""
+    if os.name == "nt":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

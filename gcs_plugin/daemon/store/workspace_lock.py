@@ -1,0 +1,108 @@
+"""The ground the daemon stands on: its workspace's lock, the disk's room, this start of the machine, the basemap."""
+
+import json
+import logging
+import os
+import shutil
+import sqlite3
+import time
+from pathlib import Path
+from typing import Final
+
+from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.batch.workspace import Workspace
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.raster.basemap import Basemap
+
+_LOCK_S: Final = 5.0
+_FREE_MB: Final = 50.0
+_log = logging.getLogger(__name__)
+
+
+def take_over(workspace: Path) -> Workspace:
+    """The workspace's lock; one that a dying daemon still holds is waited for.
+
+    Raises:
+        InputError: another daemon holds it.
+    """
+    end = time.monotonic() + _LOCK_S
+    while True:
+        try:
+            return Workspace(workspace)
+        except InputError:
+            if workspace.is_file() or time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def require_space(workspace: Path, size: int) -> None:
+    """Refuse what would fill the disk, while there is room to say so.
+
+    Raises:
+        OrthoSwarmError: there is too little room.
+    """
+    try:
+        free = shutil.disk_usage(workspace).free
+    except OSError as error:
+        raise OrthoSwarmError(f"the workspace cannot be reached ({error.strerror}); connect its disk") from None
+    if free < _FREE_MB * 1e6 + size:
+        raise OrthoSwarmError(f"the disk is nearly full ({free / 1e6:.0f} MB left); free some space")
+
+
+def distrust_after_power_cut(journal: Journal) -> bool:
+    """After the machine went down without the daemon, draw the real-time layer again: its last pixels may be lost.
+
+    Pictures and journal are synced before they are acknowledged, kept sorties before they are published; canvases are
+    not, for speed.
+
+    Returns:
+        Whether canvases can be trusted.
+    """
+    boot = _boot_id()
+    clean = journal.fact("clean") or journal.fact("boot") in (None, boot)
+
+    def change(db: sqlite3.Connection) -> None:
+        db.execute("INSERT OR REPLACE INTO meta VALUES ('boot', ?)", (json.dumps(boot),))
+        db.execute("INSERT OR REPLACE INTO meta VALUES ('clean', 'false')")
+        if not clean:
+            db.execute("UPDATE frames SET drawn = 0")
+            db.execute("DELETE FROM meta WHERE key = 'realtime'")
+
+    journal.write(change)
+    if not clean:
+        _log.warning("the machine went down without warning; the real-time layer is drawn again")
+    return bool(clean)
+
+
+def _boot_id() -> str:
+    """What tells this start of the machine from the next."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return str(round((time.time() - time.monotonic()) / 60.0)) if os.name == "nt" else ""
+
+
+def open_basemap(path: Path) -> Basemap | None:
+    """The basemap on the grid of its own middle, to be shown before there is an area; None where that is not known.
+
+    Raises:
+        InputError: it cannot be read, or lies nowhere.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.warp import transform_bounds
+
+    from orthoswarm.model.geo import utm_epsg
+
+    if path.is_dir():
+        return None
+    try:
+        with rasterio.open(path) as raster:
+            if raster.crs is None:
+                raise InputError(f"the basemap {path.name} has no coordinate system; give a georeferenced map")
+            west, south, east, north = transform_bounds(raster.crs, 4326, *raster.bounds)
+    except RasterioError as error:
+        raise InputError(f"the basemap {path.name} cannot be read ({error}); check the file") from None
+    basemap = Basemap.open(path, utm_epsg(0.5 * (south + north), 0.5 * (west + east)))
+    basemap.require_readable(basemap.bounds)  # now, and not when the first vehicle completes
+    return basemap

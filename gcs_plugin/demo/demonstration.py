@@ -1,0 +1,263 @@
+"""The demonstration's course: city, plan, flight, map, refinement at each completion, and the accuracy at the end."""
+
+import json
+import multiprocessing
+import multiprocessing.process
+import multiprocessing.resource_tracker
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, Setting, write_world
+from gcs_plugin.demo.simulator import simulate
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+if TYPE_CHECKING:
+    from gcs_plugin.daemon.daemon import Daemon
+
+_MARK: Final = "demo.json"
+_MADE: Final = (
+    "journal.db", "journal.db-wal", "journal.db-shm", "pictures", "layers", "solutions", "plans", "videos", "twin",
+    "token", "telemetry.tlog", "export", "report.json", "report.html", "frames.jsonl", "footprints.gpkg",
+    "realtime.tif", "coarse.tif", "orthoimage.tif", _MARK,
+)  # fmt: skip
+_MOST_S: Final = 900.0
+Tell = Callable[[str, int, int], None]
+
+
+def run_demo(
+    setting: Setting, out: Path, tell: Tell, *, port: int = 0, opened: Callable[[str], None]
+) -> dict[str, Any]:
+    """Run it; gives the content of report.json.
+
+    Args:
+        setting: what to fly.
+        out: workspace of the daemon; a demonstration that is there already is replaced.
+        tell: progress.
+        port: of the web page.
+        opened: called with the page's address.
+
+    Raises:
+        InputError: the folder holds something else.
+        OrthoSwarmError: the demonstration did not come to its end.
+    """
+    _clear(out)
+    began = time.monotonic()
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=simulate, args=(setting, theirs), name="simulator", daemon=True)
+    _start(process)
+    theirs.close()
+    try:
+        tell("city", 0, 1)
+        write_world(setting, out / "twin")
+        tell("city", 1, 1)
+        places = _first_words(ours, process)
+        with _daemon(setting, out, places) as daemon, Served(daemon, port) as served:
+            opened(served.url)
+            _fly(daemon, setting, tell)
+            ours.send("stop")
+            end = ours.recv() if ours.poll(90.0) else {}
+            _finish(daemon, tell)
+    except BaseException:
+        process.terminate()  # while it makes its city it does not listen
+        raise
+    finally:
+        ours.close()
+        process.join(10.0)
+        if process.is_alive():
+            process.terminate()
+            process.join(10.0)
+    if end.get("problem"):
+        raise OrthoSwarmError(f"a simulated camera failed: {end['problem']}")
+    tell("measuring", 0, 1)
+    report = _measure(setting, out, end, time.monotonic() - began)
+    tell("measuring", 1, 1)
+    return report
+
+
+def _start(process: multiprocessing.process.BaseProcess) -> None:
+    """Start a process that a Ctrl-C at the terminal does not reach: this one ends it.
+
+    The signal is held back meanwhile, not ignored: one that comes just now is heard afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # there the simulator itself ignores it, as soon as it runs
+        process.start()
+        return
+    multiprocessing.resource_tracker.ensure_running()  # it would let the signal through while it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _clear(out: Path) -> None:
+    """Make room: an earlier demonstration goes, anything else stays and is refused."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; choose a folder for --out")
+    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
+        raise InputError(f"{out} holds something else; choose an empty folder for --out")
+    out.mkdir(parents=True, exist_ok=True)
+    for name in _MADE:
+        path = out / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    (out / _MARK).write_text("{}\n")
+
+
+def _first_words(pipe: Any, process: Any) -> dict[str, list[str]]:
+    end = time.monotonic() + 180.0
+    while time.monotonic() < end:
+        if pipe.poll(0.2):
+            places: dict[str, list[str]] = pipe.recv()
+            return places
+        if not process.is_alive():
+            break
+    raise OrthoSwarmError("the simulated swarm did not start; run the demonstration again")
+
+
+def _daemon(setting: Setting, out: Path, places: dict[str, list[str]]) -> "Daemon":
+    from gcs_plugin.daemon.daemon import Daemon
+    from gcs_plugin.daemon.settings import Settings, VehicleSettings
+    from orthoswarm.compute.workers import cores
+
+    vehicles = tuple(VehicleSettings(f"v{n}", n, "", url) for n, url in enumerate(places["streams"], start=1))
+    settings = Settings(
+        out, links=tuple(places["links"]), basemap=out / "twin" / "basemap.tif", fov_min_deg=FOV_MIN_DEG,
+        workers=max(1, cores() - 1), vehicles=vehicles,
+    )  # fmt: skip
+    return Daemon(settings)
+
+
+class Served:
+    """The daemon's web server in a thread.
+
+    Attributes:
+        url: the page's address, with the token.
+    """
+
+    def __init__(self, daemon: "Daemon", port: int) -> None:
+        import uvicorn
+
+        from gcs_plugin.web.app import make_app
+        from gcs_plugin.web.guard import take_token
+
+        token, _ = take_token(daemon.settings.workspace / "token")
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+            self._socket.listen()  # a browser may come at once
+        except OSError as error:
+            self._socket.close()
+            raise InputError(f"port {port} cannot be served ({error.strerror}); choose another --port") from None
+        self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}/#token={token}"
+        config = uvicorn.Config(
+            make_app(daemon, token), log_level="warning", access_log=False, server_header=False,
+            timeout_graceful_shutdown=2,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._socket]}, daemon=True)
+
+    def __enter__(self) -> "Served":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join(15.0)
+        self._socket.close()
+
+
+def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
+    """Plan, upload, start one after the other, and wait until all have completed."""
+    flock = daemon.flock
+    assert flock is not None
+    _wait(lambda: sum(row["lat_deg"] is not None for row in flock.rows()) == setting.vehicles, 60.0, "the vehicles")
+    tell("planning", 0, 1)
+    starts = [[row["lat_deg"], row["lon_deg"]] for row in flock.rows()]
+    body = {
+        "area": setting.area(), "vehicles": setting.vehicles, "altitude_m": HEIGHT_M, "fov_min_deg": FOV_MIN_DEG,
+        "speed_m_s": 12.0, "forward_overlap": 0.85, "side_overlap": 0.6, "method": "columns", "starts": starts,
+        "end": "rtl", "separation_m": 4.0,
+    }  # fmt: skip
+    plan = daemon.plans.make(body, daemon.crew)
+    tell("planning", 1, 1)
+    delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
+    began = time.monotonic()
+    for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
+        system = flock.system_of(vehicle)
+        mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, flock.fleet.vehicles[system].autopilot)
+        flock.command(lambda fleet, s=system, m=mission: fleet.upload(s, m))  # type: ignore[misc]
+        # apart as planned, and never at the same moment, so that one completes while others fly
+        due = began + max(delays[vehicle], 6.0 * (number - 1)) / setting.speed
+        time.sleep(max(0.0, due - time.monotonic()))
+        flock.command(lambda fleet, s=system: fleet.start(s))  # type: ignore[misc]
+        tell("starting", number, setting.vehicles)
+    photos = sum(vehicle["photos"] for vehicle in plan["vehicles"])
+
+    def done() -> bool:
+        tell("flying: pictures on the map", min(daemon.drawer.drawn, photos), photos)
+        return len(daemon.completions()) >= setting.vehicles
+
+    _wait(done, _MOST_S, "the missions' completion")
+    tell("flying: pictures on the map", photos, photos)
+
+
+def _finish(daemon: "Daemon", tell: Tell) -> None:
+    """Wait until every completion's refinement is on the map, and the products are written."""
+
+    def refined() -> bool:
+        rows = daemon.completions()
+        tell("refining", sum("version" in row for row in rows), len(rows))
+        failed = [job for job in daemon.jobs.all() if job.state == "failed" and job.kind != "coarse"]
+        if failed:
+            raise OrthoSwarmError(f"the {failed[0].kind} of {failed[0].vehicle} failed: {failed[0].message}")
+        return all("version" in row for row in rows) and not daemon.jobs.open()
+
+    _wait(refined, 300.0, "the refinement")
+    tell("products", 0, 1)
+    job = daemon.export(["cog", "gpkg", "mbtiles", "kmz"])
+    _wait(
+        lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
+    )
+    tell("products", 1, 1)
+
+
+def _wait(done: Callable[[], bool], limit_s: float, what: str) -> None:
+    end = time.monotonic() + limit_s
+    while not done():
+        if time.monotonic() > end:
+            raise OrthoSwarmError(f"{what} did not come within {limit_s:.0f} s; run the demonstration again")
+        time.sleep(0.2)
+
+
+def _measure(setting: Setting, out: Path, end: dict[str, Any], wall_s: float) -> dict[str, Any]:
+    """Compare the orthoimages with the truth, and put the figures into the report."""
+    from gcs_plugin.cli.verbs.evaluate import evaluate_ortho, find_mask
+    from orthoswarm.export.product_files import write_json
+
+    reference = out / "twin" / "truth" / "reference.tif"
+    report: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    figures = {
+        name: evaluate_ortho(out / file, reference, find_mask(reference, None)).figures()
+        for name, file in (("realtime", "realtime.tif"), ("orthoimage", "orthoimage.tif"))
+    }
+    report["accuracy"] = figures["orthoimage"]
+    report["accuracy_realtime"] = figures["realtime"]
+    report["demo"] = {
+        "vehicles": setting.vehicles,
+        "seed": setting.seed,
+        "pictures": end.get("taken"),
+        "wall_s": wall_s,
+    }
+    write_json(out / "report.json", report)
+    return report

@@ -1,0 +1,322 @@
+"""Simulated cameras under REAL vehicles: what the twin looks like from where an autopilot says that it is.
+
+The autopilot (ArduCopter or PX4 in simulation, or a real one on the bench) tells position, attitude and, where it has
+one, its gimbal; the camera renders the twin from there and sends video, or posts photos. Pictures are taken at even
+moments of the VEHICLE's clock, a little late, so that telemetry from before and after is there to interpolate.
+"""
+
+import contextlib
+import io
+import json
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.demo.setting import Setting
+from gcs_plugin.demo.simulated_camera import TwinCamera, VideoSender, VideoServer
+from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.errors import InputError
+from telemetry.live.live_poses import LivePoses
+from telemetry.samples.sample import Sample
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.site import Site
+
+LATE_S: Final = 0.25
+"""How long a moment is past before its picture is taken: two messages at 10 Hz."""
+_BEHIND_S: Final = 10.0
+_IDLE_S: Final = 0.02
+_POST_TIMEOUT_S: Final = 30.0
+
+Pixels = NDArray[np.uint8]
+
+
+class Outlet(Protocol):
+    """Where a vehicle's pictures go.
+
+    Attributes:
+        url: where that is.
+    """
+
+    url: str
+
+    def send(self, image: Pixels, sample: Sample) -> None:
+        """Send a picture, uint8 (rows, columns, 3), with its recorded pose."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class Poster:
+    """Posts photos with their poses to a daemon, as a companion computer does.
+
+    Args:
+        url: the daemon's address. vehicle: id.
+    """
+
+    def __init__(self, url: str, vehicle: str) -> None:
+        self.url, self._vehicle = url.rstrip("/"), vehicle
+        self.failed = 0
+        self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+    def send(self, image: Pixels, sample: Sample) -> None:
+        """Post a picture; one that the daemon cannot take is counted, and the flight goes on."""
+        import simplejpeg
+
+        data = bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 92, "RGB", "420"))
+        time_s = float(sample.time_s or 0.0)
+        pose = {
+            "vehicle": self._vehicle, "image": f"twin-{time_s:.3f}.jpg", "time": iso_time(time_s),
+            "lat_deg": sample.lat_deg, "lon_deg": sample.lon_deg, "height_m": sample.height_m,
+            "yaw_deg": sample.yaw_deg, "pitch_deg": sample.pitch_deg, "roll_deg": sample.roll_deg,
+        }  # fmt: skip
+        kind, body = _multipart(data, json.dumps(pose))
+        request = urllib.request.Request(self.url + "/api/frames", data=body, headers={"Content-Type": kind})
+        try:
+            self._opener.open(request, timeout=_POST_TIMEOUT_S).close()
+        except (OSError, urllib.error.HTTPError):
+            self.failed += 1
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def _multipart(picture: bytes, pose: str) -> tuple[str, bytes]:
+    """Content type and body of a form with `image` and `pose` (RFC 7578)."""
+    mark = "orthoswarm-picture-and-pose"
+    body = io.BytesIO()
+    body.write(f'--{mark}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode())
+    head = 'Content-Disposition: form-data; name="image"; filename="picture.jpg"\r\nContent-Type: image/jpeg'
+    body.write(f"--{mark}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{mark}--\r\n".encode())
+    return f"multipart/form-data; boundary={mark}", body.getvalue()
+
+
+def open_outlet(url: str, system: int) -> Outlet:
+    """Where the pictures of a vehicle go: vehicle 1 to the address as it is, vehicle 2 to the next port, and so on.
+
+    Args:
+        url: tcp://HOST:PORT serves video there, udp://HOST:PORT sends it there, http://HOST:PORT posts photos.
+        system: the vehicle's MAVLink system id.
+
+    Raises:
+        InputError: it is none of these, or the port is taken.
+    """
+    from urllib.parse import urlsplit
+
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if parts.scheme not in ("tcp", "udp", "http") or not host or not port:
+        raise InputError(f"'{url}' is no place for pictures; give tcp://HOST:PORT, udp://HOST:PORT or http://HOST:PORT")
+    if parts.scheme == "http":
+        return Poster(url, f"v{system}")
+    if port + system - 1 > 65535:
+        raise InputError(f"vehicle {system} would need port {port + system - 1}; give a lower one in --stream")
+    if parts.scheme == "udp":
+        return VideoSender(host, port + system - 1)
+    try:
+        return VideoServer(host, port + system - 1, live=True)
+    except OSError as error:
+        raise InputError(f"port {port + system - 1} cannot be served ({error.strerror}); give another one") from None
+
+
+@dataclass(slots=True)
+class Shutter:
+    """Says when a vehicle's next picture is due.
+
+    Attributes:
+        every_s: seconds of the vehicle's clock between pictures.
+        above_m: least height over takeoff.
+        on_trigger: True to take pictures only when the autopilot reports an exposure.
+        skipped: moments that passed while the camera was busy.
+    """
+
+    every_s: float
+    above_m: float
+    on_trigger: bool = False
+    skipped: int = 0
+    _next_s: float | None = None
+    _events: deque[float] = field(default_factory=deque)
+
+    def exposed(self, time_s: float) -> None:
+        """The autopilot has reported an exposure (UTC)."""
+        if self.on_trigger:
+            self._events.append(time_s)
+
+    def due(self, now_s: float, armed: bool, height_m: float | None) -> float | None:
+        """The moment of a picture that is due, None if there is none.
+
+        Args:
+            now_s: the vehicle's UTC of its latest telemetry.
+            armed: whether its motors run.
+            height_m: over takeoff.
+        """
+        ready_s = now_s - LATE_S
+        if self.on_trigger:
+            return self._events.popleft() if self._events and self._events[0] <= ready_s else None
+        if not armed or height_m is None or height_m < self.above_m:
+            self._next_s = None
+            return None
+        if self._next_s is None or self._next_s > now_s + _BEHIND_S:  # it takes off, or its clock was set back
+            self._next_s = ready_s
+        late = ready_s - self._next_s
+        if late < 0.0:
+            return None
+        if late > _BEHIND_S:
+            lost = int(late // self.every_s)
+            self.skipped += lost
+            self._next_s += lost * self.every_s
+        moment = self._next_s
+        self._next_s += self.every_s
+        return moment
+
+
+@dataclass(slots=True)
+class Follower:
+    """The camera under one vehicle.
+
+    Attributes:
+        vehicle: as the fleet knows it. poses: where it was.
+        shutter: when to take pictures. camera: takes them. outlet: takes them away.
+        level: True for a gimbal that holds the camera level, of which the autopilot says nothing.
+        taken: pictures so far.
+    """
+
+    vehicle: "Vehicle"
+    poses: LivePoses
+    shutter: Shutter
+    camera: TwinCamera
+    outlet: Outlet
+    level: bool = False
+    taken: int = 0
+    problem: str = ""
+
+    def feed(self, message: Any, utc: float) -> None:
+        """Take a message of the vehicle (in the fleet's thread)."""
+        event = self.poses.feed(message, utc)
+        if event is not None and event.time_s is not None:
+            self.shutter.exposed(event.time_s)
+
+    def work(self) -> bool:
+        """Take the picture that is due, if one is; False if none was."""
+        latest = self.poses.latest
+        if latest.time_s is None:
+            return False
+        moment = self.shutter.due(latest.time_s, self.vehicle.armed, latest.height_m)
+        if moment is None:
+            return False
+        pose = self.pose(moment)
+        if pose is not None:
+            image, sample = self.camera.shoot(pose, self.taken)
+            self.outlet.send(image, sample)
+            self.taken += 1
+        return True
+
+    def pose(self, moment: float) -> Sample | None:
+        """Where the camera is at a moment; None where telemetry has a gap."""
+        pose = self.poses.at(moment)
+        if self.level and pose.flight_yaw_deg is not None:
+            pose = replace(pose, yaw_deg=pose.flight_yaw_deg, pitch_deg=-90.0, roll_deg=0.0)
+        known = pose.has_position and pose.height_m is not None and pose.yaw_deg is not None
+        # the body's own angles are the mount's business, not the camera's
+        return replace(pose, flight_pitch_deg=None, flight_roll_deg=None, altitude_m=None) if known else None
+
+
+class Crew:
+    """The cameras of all vehicles of a fleet, each opened when its vehicle is heard.
+
+    Args:
+        fleet: whose vehicles; it is polled by a thread of this object.
+        stage: the city. site: where it lies.
+        stream: where pictures go (`open_outlet`).
+        seed: of the cameras' errors.
+        shutter: makes a vehicle's shutter.
+        level: see Follower. rays: see TwinCamera.
+        opened: told of each new camera.
+    """
+
+    def __init__(
+        self, fleet: "Fleet", stage: "Stage", site: "Site", stream: str, *, seed: int, shutter: Callable[[], Shutter],
+        level: bool, rays: int, opened: Callable[[Follower], None],
+    ) -> None:  # fmt: skip
+        self._rays = rays
+        self._fleet, self._stage, self._site, self._stream = fleet, stage, site, stream
+        self._setting, self._shutter, self._level, self._opened = Setting(seed=seed), shutter, level, opened
+        self.followers: dict[int, Follower] = {}
+        fleet.subscribe(self._message)
+
+    def run(self, stop: threading.Event) -> None:
+        """Take pictures until told to stop; the fleet must be polled by another thread."""
+        while not stop.is_set():
+            self._welcome()
+            taken = sum(_guarded(follower) for follower in list(self.followers.values()))
+            if not taken:
+                time.sleep(_IDLE_S)
+
+    def close(self) -> None:
+        """End the streams."""
+        for follower in self.followers.values():
+            with contextlib.suppress(OSError):
+                follower.outlet.close()
+
+    def _welcome(self) -> None:
+        """Open a camera for each vehicle that has come."""
+        for system, vehicle in sorted(self._fleet.vehicles.items()):
+            if system not in self.followers:
+                follower = Follower(
+                    vehicle, LivePoses(f"v{system}"), self._shutter(),
+                    TwinCamera(self._stage, self._site, self._setting, system, self._rays),
+                    open_outlet(self._stream, system), self._level,
+                )  # fmt: skip
+                self.followers[system] = follower
+                self._opened(follower)
+
+    def _message(self, vehicle: "Vehicle", message: Any, utc: float) -> None:
+        follower = self.followers.get(vehicle.system)
+        if follower is not None:
+            follower.feed(message, utc)
+
+
+def _guarded(follower: Follower) -> bool:
+    """Take a picture; what goes wrong with one does not end the others."""
+    try:
+        return follower.work()
+    except (OSError, ValueError, ArithmeticError) as error:
+        follower.problem = f"{type(error).__name__}: {error}"
+        return True
+
+
+def wait_for_place(fleet: "Fleet", vehicles: int, seconds: float) -> tuple[float, float]:
+    """Poll a fleet until so many vehicles know where they are; gives where the one with the lowest id stands.
+
+    Stock ArduCopter says latitude 0, longitude 0 until its receiver and filter have a position, which takes up to half
+    a minute after its start; PX4 says nothing.
+
+    Raises:
+        InputError: they do not come in time.
+    """
+
+    def placed() -> list["Vehicle"]:
+        return [v for v in fleet.vehicles.values() if v.lat_deg and v.lon_deg and v.gps_fix >= 3]
+
+    if not fleet.run_until(lambda: len(placed()) >= vehicles, seconds):
+        heard = len(fleet.vehicles)
+        raise InputError(
+            f"{len(placed())} of {vehicles} vehicles know their position after {seconds:.0f} s ({heard} heard); "
+            "check --link, and that the autopilot has a GPS fix"
+        )
+    first = min(placed(), key=lambda v: v.system)
+    return float(first.lat_deg or 0.0), float(first.lon_deg or 0.0)

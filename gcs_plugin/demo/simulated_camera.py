@@ -1,0 +1,312 @@
+"""Simulated cameras: the twin's view at a vehicle's true pose, streamed as H.264 in MPEG-TS over TCP, poses as SEI."""
+
+import contextlib
+import queue
+import socket
+import threading
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.demo.setting import HEIGHT, WIDTH, Errors, Setting
+from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.twin.camera.ray_marching import lens_rays, render
+from orthoswarm.twin.camera.sensor import Sensor
+from telemetry.samples.sample import Sample
+
+if TYPE_CHECKING:
+    from gcs_plugin.sim.mission_flight import Exposure
+    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.site import Site
+
+_POSITION_M: Final = 0.8
+_JITTER_RAD: Final = float(np.radians(0.2))
+_CLOCK: Final = 90_000
+_MOST_WAITING: Final = 512
+_NEXT: Final = b"\0\0\0\1\x09\xf0"
+"""The next picture's delimiter, sent behind each picture, so that a reader knows at once that the picture is whole."""
+
+
+class TwinCamera:
+    """The camera of one vehicle in the twin.
+
+    Args:
+        stage: the city. site: where it lies.
+        setting: the demonstration's.
+        system: the vehicle's MAVLink system id.
+        rays: along the side of a pixel; 2 smooth edges, 1 is four times faster.
+    """
+
+    def __init__(self, stage: "Stage", site: "Site", setting: Setting, system: int, rays: int = 2) -> None:
+        self._stage, self._site, self._system = stage, site, system
+        self._errors = Errors.of(setting, system)
+        self._lens = Lens(WIDTH, HEIGHT, focal_px(self._errors.fov_rad, WIDTH))
+        self._rays = lens_rays(self._lens, rays)
+        self._sensor = Sensor(WIDTH, HEIGHT, setting.seed)
+        self._seed = setting.seed
+
+    def take(self, exposure: "Exposure", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
+        """The picture, uint8 (480, 640, 3), and what is recorded about it; a gimbal holds the camera level."""
+        pose = exposure.pose
+        true = Sample(
+            time_s=time_s, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg, height_m=pose.height_m,
+            yaw_deg=float(np.degrees(pose.yaw_rad)), pitch_deg=-90.0, roll_deg=0.0,
+        )  # fmt: skip
+        return self.shoot(true, exposure.index, seen=(exposure.lat_deg, exposure.lon_deg))
+
+    def shoot(
+        self, true: Sample, index: int, *, seen: tuple[float, float] | None = None
+    ) -> tuple[NDArray[np.uint8], Sample]:
+        """The picture at a pose, uint8 (480, 640, 3), and what is recorded about it.
+
+        Args:
+            true: where the camera is (with position, height and angles), and when.
+            index: number of the picture; equal arguments give equal pictures.
+            seen: latitude and longitude as the receiver has them, before its own noise; the true ones unless said.
+        """
+        errors, grid = self._errors, self._site.grid
+        lat, lon, height, time_s = (float(v or 0.0) for v in (true.lat_deg, true.lon_deg, true.height_m, true.time_s))
+        yaw, pitch, roll = np.radians([true.yaw_deg or 0.0, true.pitch_deg or 0.0, true.roll_deg or 0.0])
+        rng = np.random.default_rng([self._seed, 223, self._system, index, round(time_s)])
+        east, north = grid.to_grid(lat, lon)
+        turn = float(grid.convergence_rad(lat, lon))
+        wobble = rng.normal(0.0, _JITTER_RAD, 3)
+        # the mount has fixed errors of its own, of which the record knows nothing
+        angles = np.array([yaw + errors.yaw_rad - turn, pitch + errors.pitch_rad, roll + errors.roll_rad]) + wobble
+        camera = Camera(np.array([east, north, height]), rotation_from_angles(*angles), self._lens)
+        motion = rng.uniform(0.0, 1024.0, 8)
+        image = self._sensor.expose(render(self._stage, camera, self._rays, motion), rng)
+        off = rng.uniform(-_POSITION_M, _POSITION_M, 2)
+        lat, lon = (float(v) for v in grid.to_geographic(grid.to_grid(*(seen or (lat, lon))) + off))
+        return image, replace(true, lat_deg=lat, lon_deg=lon, vehicle=f"v{self._system}")
+
+
+class Sink(Protocol):
+    """Takes bytes, as a file does."""
+
+    def write(self, data: bytes) -> int:
+        """Take bytes; gives how many."""
+
+
+class VideoStream:
+    """Encodes pictures to H.264 in MPEG-TS, every picture a key picture with its pose as SEI.
+
+    Args:
+        sink: takes the stream's bytes, whole transport packets of 188 bytes each time.
+    """
+
+    def __init__(self, sink: "Sink") -> None:
+        self._sink = sink
+        self._container: Any = None
+        self._stream: Any = None
+        self._form: Any = None
+        self._first_s = 0.0
+
+    def send(self, image: NDArray[np.uint8], sample: Sample) -> None:
+        """Encode and send a picture, uint8 (rows, columns, 3)."""
+        import av
+
+        from telemetry.formats.bitstream import StreamFormat
+        from telemetry.write.sei_writer import with_sei
+
+        time_s = float(sample.time_s or 0.0)
+        if self._container is None:
+            self._open(time_s)
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
+        frame.pts = round((time_s - self._first_s) * _CLOCK)
+        for packet in self._stream.encode(frame):
+            if self._form is None:
+                self._form = StreamFormat.of("h264", self._stream.codec_context.extradata)
+            marked = av.Packet(with_sei(bytes(packet), sample, self._form) + _NEXT)
+            marked.pts, marked.dts, marked.time_base = packet.pts, packet.dts, packet.time_base
+            marked.is_keyframe, marked.stream = packet.is_keyframe, self._stream
+            self._container.mux(marked)
+
+    def close(self) -> None:
+        """End the stream."""
+        if self._container is not None:
+            with contextlib.suppress(OSError):
+                self._container.close()
+
+    def _open(self, time_s: float) -> None:
+        from fractions import Fraction
+
+        import av
+
+        self._first_s = time_s
+        # A PES packet that states its length is whole for the reader at once, not when the next one begins.
+        options = {"omit_video_pes_length": "0", "flush_packets": "1"}
+        self._container = av.open(self._sink, "w", format="mpegts", options=options)
+        stream = self._container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, _CLOCK)
+        # constant quality, and never more than a PES packet with a stated length can hold
+        x264 = "keyint=1:vbv-maxrate=4000:vbv-bufsize=400:bframes=0"
+        stream.options = {"preset": "veryfast", "tune": "zerolatency", "crf": "17", "x264-params": x264}
+        self._stream = stream
+
+
+class VideoServer(VideoStream):
+    """Serves one live stream over TCP.
+
+    Args:
+        host: address to serve on; port: 0 takes any free one.
+        live: True keeps the newest hundred pictures or so for a reader who comes late, however late; False keeps all
+            for half a minute.
+
+    Attributes:
+        url: where it is.
+
+    Raises:
+        OSError: the port is taken.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, *, live: bool = False) -> None:
+        super().__init__(self)
+        self._live = live
+        self._listener = socket.create_server((host, port))
+        self.url = f"tcp://{host}:{self._listener.getsockname()[1]}"
+        self._bytes: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._serve, name="video", daemon=True)
+        self._thread.start()
+
+    def write(self, data: bytes) -> int:
+        """Take bytes of the muxer (it writes to this object as to a file)."""
+        if self._live and self._bytes.qsize() >= _MOST_WAITING:
+            with contextlib.suppress(queue.Empty):
+                self._bytes.get_nowait()
+        self._bytes.put(bytes(data))
+        return len(data)
+
+    def close(self) -> None:
+        """End the stream."""
+        super().close()
+        self._bytes.put(None)
+        self._thread.join(5.0)
+        self._listener.close()
+
+    def _serve(self) -> None:
+        connection: socket.socket | None = None
+        while True:
+            data = self._bytes.get()
+            if data is None:
+                break
+            while connection is None or not _sent(connection, data):
+                connection = None
+                self._listener.settimeout(30.0)
+                try:
+                    connection = self._newest()
+                except TimeoutError:
+                    if not self._live:  # nobody watches any more
+                        return
+                except OSError:  # closed
+                    return
+        if connection is not None:
+            connection.close()
+
+    def _newest(self) -> socket.socket:
+        """The connection that was made last; a reader that was tired of waiting has come again."""
+        connection, _ = self._listener.accept()
+        self._listener.settimeout(0.2)
+        with contextlib.suppress(TimeoutError):
+            while True:
+                newer, _ = self._listener.accept()
+                connection.close()
+                connection = newer
+        return connection
+
+
+def _sent(connection: socket.socket, data: bytes) -> bool:
+    """Send, unless the reader has hung up: what is sent to nobody would be lost without an error."""
+    try:
+        connection.settimeout(0.0)
+        try:
+            if connection.recv(1) == b"":
+                return False
+        except BlockingIOError:
+            pass
+        connection.settimeout(30.0)
+        connection.sendall(data)
+    except OSError:
+        return False
+    return True
+
+
+class VideoSender(VideoStream):
+    """Sends one live stream by UDP, whether anybody listens or not.
+
+    Args:
+        host: to whom; port: where.
+    """
+
+    _DATAGRAM: Final = 7 * 188  # what fits an Ethernet frame
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(self)
+        self.url = f"udp://{host}:{port}"
+        self._to = (host, port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def write(self, data: bytes) -> int:
+        """Take bytes of the muxer."""
+        for at in range(0, len(data), self._DATAGRAM):
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data[at : at + self._DATAGRAM], self._to)
+        return len(data)
+
+    def close(self) -> None:
+        """End the stream."""
+        super().close()
+        self._socket.close()
+
+
+@dataclass(slots=True)
+class Studio:
+    """Takes the pictures of all vehicles, one after the other, as they are asked for.
+
+    Attributes:
+        cameras, servers: by system id. taken: pictures so far.
+    """
+
+    cameras: dict[int, TwinCamera]
+    servers: dict[int, VideoServer]
+    taken: int = 0
+    _waiting: "queue.SimpleQueue[tuple[int, Exposure, float] | None]" = None  # type: ignore[assignment]
+    _thread: threading.Thread = None  # type: ignore[assignment]
+    problem: str = ""
+
+    def __post_init__(self) -> None:
+        """Begin to work."""
+        self._waiting = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
+        self._thread.start()
+
+    @property
+    def backlog(self) -> int:
+        """Pictures that are not taken yet."""
+        return self._waiting.qsize()
+
+    def expose(self, vehicle: Any, exposure: "Exposure") -> None:
+        """Ask for a picture (SimVehicle.on_exposure)."""
+        self._waiting.put((vehicle.system, exposure, vehicle.utc_s(exposure.time_s)))
+
+    def close(self) -> None:
+        """Take what is still waiting, and end the streams."""
+        self._waiting.put(None)
+        self._thread.join(60.0)
+        for server in self.servers.values():
+            server.close()
+
+    def _run(self) -> None:
+        while True:
+            asked = self._waiting.get()
+            if asked is None:
+                return
+            system, exposure, time_s = asked
+            try:
+                self.servers[system].send(*self.cameras[system].take(exposure, time_s))
+                self.taken += 1
+            except Exception as error:  # told at the end; the flight goes on
+                self.problem = f"{type(error).__name__}: {error}"

@@ -1,0 +1,1 @@
+"""The vehicles on the links: discovery, routing by system id, state, message rates, events."""

@@ -1,0 +1,174 @@
+"""The messages that a vehicle is asked to send, and asked again when they stop.
+
+Each message is asked for by MAV_CMD_SET_MESSAGE_INTERVAL: ArduPilot sends nothing without it, PX4 sends 50 Hz of
+everything. Acknowledgements do not say which message they are about, so one is asked for at a time.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.mission.exchange import Address
+
+_COMMAND: Final = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+_ANSWER_S: Final = 0.7
+_TRIES: Final = 4
+_CHECK_S: Final = 1.0
+_WINDOW_S: Final = 5.0
+_BACKOFF_S: Final = (3.0, 60.0)
+
+GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """What is asked for, message id to Hz.
+
+    Attributes:
+        wanted: asked for until it comes.
+        optional: asked for once; vehicles without a gimbal do not have its attitude.
+    """
+
+    wanted: dict[int, float]
+    optional: dict[int, float] = field(default_factory=dict)
+
+
+def default_rates(pose_hz: float = 10.0) -> Rates:
+    """Position and attitude at one rate, the state of the mission at 2 Hz, the rest at 1 Hz."""
+    return Rates(
+        {
+            GLOBAL_POSITION_INT: pose_hz,
+            ATTITUDE: pose_hz,
+            int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT): 2.0,
+            int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 1.0,
+            int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): 1.0,
+        },
+        {
+            int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): 1.0,
+            int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 1.0,
+            int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS): pose_hz,
+            # A rangefinder that states its limits; a height from a coarse terrain map is worse than none.
+            int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
+            int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
+        },
+    )
+
+
+@dataclass(slots=True)
+class _Stream:
+    hz: float
+    optional: bool
+    count: int = 0
+    last: float = 0.0
+    asked: int = 0
+    again_at: float = 0.0
+    backoff_s: float = _BACKOFF_S[0]
+
+
+@dataclass(slots=True)
+class Streams:
+    """Keeps the streams of one vehicle running. Not a dialogue that ends, so driven by `seen`, `acknowledged`, `tick`.
+
+    Attributes:
+        vehicle: whom to ask; own: who asks.
+        deadline: when `tick` wants to be called.
+        refused: messages that the vehicle does not have.
+    """
+
+    vehicle: Address
+    own: Address
+    rates: Rates
+    deadline: float = 0.0
+    refused: set[int] = field(default_factory=set)
+    _streams: dict[int, _Stream] = field(default_factory=dict)
+    _queue: list[int] = field(default_factory=list)
+    _asking: int | None = None
+    _tries: int = 0
+    _window: float = 0.0
+
+    @property
+    def started(self) -> bool:
+        """True once everything has been asked for."""
+        return bool(self._streams)
+
+    def start(self, now: float) -> list[Message]:
+        """Ask for everything (again: after a reboot, or when a vehicle is found again)."""
+        wanted = {**self.rates.wanted, **self.rates.optional}
+        self._streams = {
+            kind: _Stream(hz, kind in self.rates.optional, again_at=now + _BACKOFF_S[0]) for kind, hz in wanted.items()
+        }
+        self.refused.clear()
+        self._queue, self._asking, self._window = list(wanted), None, now
+        return self._next(now)
+
+    def seen(self, kind: int, now: float) -> None:
+        """A message has arrived."""
+        stream = self._streams.get(kind)
+        if stream is not None:
+            stream.count += 1
+            stream.last = now
+
+    def acknowledged(self, message: Message, now: float) -> list[Message]:
+        """Take a COMMAND_ACK."""
+        if message.command != _COMMAND or self._asking is None or message.target_system not in (0, self.own.system):
+            return []
+        if message.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
+            self.refused.add(self._asking)
+        return self._next(now)
+
+    def tick(self, now: float) -> list[Message]:
+        """Repeat a question, and look from time to time whether everything comes as asked."""
+        if now < self.deadline or not self._streams:
+            return []
+        if self._asking is not None:
+            return self._ask(now) if self._tries < _TRIES else self._next(now)
+        self._look(now)
+        return self._next(now)
+
+    def ask_clock(self) -> Message:
+        """A question for the vehicle's clock, once a second, for a link beside the one that is used."""
+        kind, to = float(dialect.MAVLINK_MSG_ID_SYSTEM_TIME), self.vehicle
+        return dialect.MAVLink_command_long_message(to.system, to.component, _COMMAND, 0, kind, 1e6, 0, 0, 0, 0, 0)
+
+    def _next(self, now: float) -> list[Message]:
+        self._tries = 0
+        self._asking = self._queue.pop(0) if self._queue else None
+        if self._asking is None:
+            self.deadline = now + _CHECK_S
+            return []
+        return self._ask(now)
+
+    def _ask(self, now: float) -> list[Message]:
+        kind = self._asking
+        assert kind is not None
+        self._tries += 1
+        self.deadline = now + _ANSWER_S
+        stream = self._streams[kind]
+        stream.asked += 1
+        to = self.vehicle
+        interval_us = 1e6 / stream.hz if stream.hz > 0 else -1.0
+        return [
+            dialect.MAVLink_command_long_message(
+                to.system, to.component, _COMMAND, 0, float(kind), interval_us, 0, 0, 0, 0, 0
+            )
+        ]
+
+    def _look(self, now: float) -> None:
+        """Queue what has stopped, or comes at another rate than asked (another ground station has changed it)."""
+        whole_window = now - self._window >= _WINDOW_S
+        for kind, stream in self._streams.items():
+            if stream.optional or now < stream.again_at:
+                continue
+            stopped = now - stream.last > max(3.0, 4.0 / stream.hz)
+            rate = stream.count / (now - self._window) if whole_window else stream.hz
+            if stopped or not 0.4 * stream.hz <= rate <= 2.0 * stream.hz + 1.0:
+                self._queue.append(kind)
+                stream.again_at = now + stream.backoff_s
+                stream.backoff_s = min(_BACKOFF_S[1], 2.0 * stream.backoff_s)
+            elif whole_window:
+                stream.backoff_s = _BACKOFF_S[0]
+        if whole_window:
+            self._window = now
+            for stream in self._streams.values():
+                stream.count = 0

@@ -1,0 +1,85 @@
+"""Is the mission in the vehicle the one that was sent? Compares what makes a difference in flight.
+
+Autopilots do not store items byte by byte: ArduPilot keeps altitudes in centimetres, the first parameter of many
+commands as a whole number, no frame for commands without a place, and no second to fourth parameter of a waypoint;
+item 0 is its home. PX4 turns degrees into doubles and back.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.items import (
+    CHANGE_SPEED,
+    DELAY,
+    JUMP,
+    LAND,
+    LOITER_UNLIM,
+    PLAIN_FRAME,
+    RTL,
+    TAKEOFF,
+    TRIGGER_DISTANCE,
+    VTOL_LAND,
+    WAYPOINT,
+    Mission,
+    MissionItem,
+)
+
+# Which of param1 to param4 (0 to 3) decide how a command is flown; for other commands all of them are compared.
+_DECISIVE: dict[int, tuple[int, ...]] = {
+    WAYPOINT: (0,), TAKEOFF: (), RTL: (), LAND: (), VTOL_LAND: (), LOITER_UNLIM: (),
+    DELAY: (0, 1, 2, 3), JUMP: (0, 1), CHANGE_SPEED: (0, 1), TRIGGER_DISTANCE: (0,),
+}  # fmt: skip
+_PLACE_E7 = 2
+_ALTITUDE_M = 0.011
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where two missions differ.
+
+    Attributes:
+        item: sequence number of the first difference, None if the number of items differs.
+        text: what differs, in words.
+    """
+
+    item: int | None
+    text: str
+
+
+def difference(mission: Mission, stored: Sequence[MissionItem]) -> Difference | None:
+    """The first difference between a mission and what a vehicle has stored, None if it will fly the mission."""
+    if len(stored) != len(mission):
+        return Difference(None, f"{len(stored)} items are stored, not {len(mission)}")
+    start = 1 if mission.autopilot is Autopilot.ARDUPILOT else 0
+    for seq in range(start, len(stored)):
+        text = _item_difference(mission.items[seq], stored[seq])
+        if text:
+            return Difference(seq, f"item {seq} ({mission.items[seq].name}): {text}")
+    return None
+
+
+def _item_difference(sent: MissionItem, stored: MissionItem) -> str:
+    if sent.command != stored.command:
+        return f"{stored.name} is stored instead"
+    for index in _DECISIVE.get(sent.command, (0, 1, 2, 3)):
+        ours, theirs = sent.params[index], stored.params[index]
+        if not _same(ours, theirs):
+            return f"param{index + 1} is {theirs:g} instead of {ours:g}"
+    if not sent.has_place:
+        return ""
+    if PLAIN_FRAME.get(sent.frame, sent.frame) != PLAIN_FRAME.get(stored.frame, stored.frame):
+        return f"its frame is {stored.frame} instead of {sent.frame}"
+    if abs(sent.x - stored.x) > _PLACE_E7 or abs(sent.y - stored.y) > _PLACE_E7:
+        return (
+            f"it lies at {stored.lat_deg:.7f}, {stored.lon_deg:.7f} instead of {sent.lat_deg:.7f}, {sent.lon_deg:.7f}"
+        )
+    if not abs(sent.z - stored.z) <= _ALTITUDE_M:
+        return f"its height is {stored.z:g} m instead of {sent.z:g} m"
+    return ""
+
+
+def _same(ours: float, theirs: float) -> bool:
+    a, b = (0.0 if math.isnan(value) else value for value in (ours, theirs))
+    return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-4)

@@ -1,0 +1,135 @@
+"""From a plan or a mission file to the items that one autopilot wants.
+
+ArduPilot's item 0 is home, which it overwrites: a list without it loses its takeoff. PX4's item 0 is flown: a list with
+home in front is refused at MISSION_START. ArduPilot refuses NaN in a parameter; PX4 reads a yaw of 0 as "turn north",
+so there it is NaN: nose along the path.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission import mission_files
+from gcs_plugin.mission.items import (
+    FRAME_GLOBAL,
+    FRAME_MISSION,
+    LAND,
+    TAKEOFF,
+    TRIGGER_DISTANCE,
+    WAYPOINT,
+    Mission,
+    MissionItem,
+)
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Plan, Sortie
+
+_CAPACITY: Final = 650
+_WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND})
+
+
+def build_mission(
+    autopilot: Autopilot,
+    items: Iterable[mission_files.MissionItem],
+    home: tuple[float, float, float] | None = None,
+    name: str = "",
+) -> Mission:
+    """The mission for one autopilot of items without home.
+
+    Args:
+        autopilot: the dialect.
+        items: what is flown, in order.
+        home: latitude, longitude (degrees) and altitude (metres) of home; only ArduPilot's item 0 needs it, and the
+            vehicle overwrites it with its own.
+        name: for messages.
+
+    Raises:
+        InputError: nothing to fly, a place that is none, or more items than the autopilot holds.
+    """
+    flown = [_wire(item, autopilot) for item in items]
+    if not flown:
+        raise InputError(f"{name or 'the mission'} has no items; plan one with: orthoswarm plan")
+    if autopilot is Autopilot.ARDUPILOT:
+        place = home or _first_place(flown) or (0.0, 0.0, 0.0)
+        flown.insert(0, MissionItem.at(WAYPOINT, place[0], place[1], place[2], frame=FRAME_GLOBAL))
+    mission = Mission(autopilot, tuple(flown), name)
+    _check(mission)
+    return mission
+
+
+def sortie_mission(plan: Plan, sortie: Sortie, autopilot: Autopilot, name: str = "") -> Mission:
+    """The mission of one sortie of a plan: takeoff, legs with the camera's trigger on and off, the way home."""
+    dialect_name: mission_files.Autopilot = "ardupilot" if autopilot is Autopilot.ARDUPILOT else "px4"
+    items = mission_files.sortie_items(plan, sortie, dialect_name)
+    return build_mission(autopilot, items, (sortie.home_lat_deg, sortie.home_lon_deg, 0.0), name)
+
+
+def read_mission(path: Path, autopilot: Autopilot) -> Mission:
+    """The mission in a `.plan` or `.waypoints` file, for one autopilot whichever it was written for.
+
+    Raises:
+        InputError: the file cannot be read or is no mission.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
+    parsed = mission_files.parse_mission(text, path.name)
+    return build_mission(autopilot, parsed.items, parsed.home, path.name)
+
+
+def trigger_sections(items: Sequence[MissionItem]) -> list[tuple[int, int, float]]:
+    """Where the camera is on: sequence number of the trigger, of its end, and its distance in metres."""
+    sections: list[tuple[int, int, float]] = []
+    begun: tuple[int, float] | None = None
+    for seq, item in enumerate(items):
+        if item.command != TRIGGER_DISTANCE:
+            continue
+        if begun is not None:
+            sections.append((begun[0], seq, begun[1]))
+        begun = (seq, item.params[0]) if item.params[0] > 0 else None
+    if begun is not None:
+        sections.append((begun[0], len(items), begun[1]))
+    return sections
+
+
+def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
+    placed = MissionItem.at(item.command, item.lat_deg, item.lon_deg, item.alt_m, item.params, item.frame)
+    if not placed.has_place:
+        x, y = (int(value) if math.isfinite(value) else 0 for value in (item.lat_deg, item.lon_deg))
+        placed = replace(placed, x=x, y=y)
+        if item.command == TRIGGER_DISTANCE:  # its param5 to 7 mean nothing; files carry rests of other items there
+            placed = MissionItem.do(item.command, *item.params)
+    params = [_for(value, autopilot) for value in placed.params]
+    if autopilot is Autopilot.PX4 and item.command in _WITH_YAW and not params[3]:
+        params[3] = math.nan
+    frame = FRAME_MISSION if not placed.has_place and placed.frame == FRAME_GLOBAL else placed.frame
+    z = placed.z if math.isfinite(placed.z) else 0.0
+    return replace(
+        placed, params=(params[0], params[1], params[2], params[3]), frame=frame, z=z, autocontinue=item.autocontinue
+    )
+
+
+def _for(value: float, autopilot: Autopilot) -> float:
+    return 0.0 if autopilot is Autopilot.ARDUPILOT and math.isnan(value) else value
+
+
+def _first_place(items: Sequence[MissionItem]) -> tuple[float, float, float] | None:
+    for item in items:
+        if item.has_place and (item.x or item.y):
+            return item.lat_deg, item.lon_deg, 0.0
+    return None
+
+
+def _check(mission: Mission) -> None:
+    name = mission.name or "the mission"
+    if mission.autopilot is Autopilot.ARDUPILOT and len(mission) > _CAPACITY:
+        raise InputError(f"{name} has {len(mission)} items, ArduPilot holds {_CAPACITY}; plan more sorties or vehicles")
+    for seq, item in enumerate(mission.items):
+        if item.has_place and not (abs(item.lat_deg) <= 90.0 and abs(item.lon_deg) <= 180.0):
+            where = f"{item.lat_deg:g}, {item.lon_deg:g}"
+            raise InputError(f"{name}: item {seq} ({item.name}) lies at {where}, which is no place; correct it")
+        if not math.isfinite(item.z) or abs(item.z) >= 1e6:
+            raise InputError(f"{name}: item {seq} ({item.name}) has the height {item.z:g} m; correct it")

@@ -1,0 +1,300 @@
+"""Missions as files: QGroundControl `.plan` (JSON) and `.waypoints` ("QGC WPL 110"), read and written.
+
+A mission here is a row of items WITHOUT the home position, numbered from nothing: seq 0 is home on ArduPilot and the
+first item on PX4, so only whoever uploads or writes adds it. `.plan` never holds home as an item; `.waypoints` always
+does, as line 0.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Plan, Sortie
+
+Autopilot = Literal["ardupilot", "px4"]
+LatLon = tuple[float, float]
+
+FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE = 0, 2, 3
+NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 17, 20, 21, 22, 82
+DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
+_FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
+_GROUND_SPEED = 1.0
+_WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
+_FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
+_MULTIROTOR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class MissionItem:
+    """One mission item, free of any autopilot's numbering.
+
+    Attributes:
+        command: MAV_CMD.
+        frame: MAV_FRAME; 3 = heights above home.
+        params: params 1 to 4; NaN where the autopilot chooses.
+        lat_deg: latitude in degrees (param 5), 0 for commands without a position; lon_deg longitude (param 6).
+        alt_m: height in metres in the item's frame (param 7).
+        autocontinue: go on to the next item by itself.
+    """
+
+    command: int
+    frame: int = FRAME_MISSION
+    params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    alt_m: float = 0.0
+    autocontinue: bool = True
+
+    @property
+    def has_position(self) -> bool:
+        """True for items that are flown to."""
+        return self.command in _WITH_POSITION and (self.lat_deg != 0.0 or self.lon_deg != 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Mission:
+    """A mission file's content.
+
+    Attributes:
+        items: the items in order, home not among them.
+        home: latitude, longitude (degrees) and altitude (metres) of home, where the file tells.
+        surveys: outlines of survey items, each a ring of (latitude, longitude) in degrees.
+        polylines: centre lines of corridor items, (latitude, longitude) in degrees.
+        no_fly: rings of exclusion fences, (latitude, longitude) in degrees.
+        speed_m_s: speed that the file asks for, or None.
+    """
+
+    items: tuple[MissionItem, ...]
+    home: tuple[float, float, float] | None = None
+    surveys: tuple[tuple[LatLon, ...], ...] = ()
+    polylines: tuple[tuple[LatLon, ...], ...] = ()
+    no_fly: tuple[tuple[LatLon, ...], ...] = field(default=())
+    speed_m_s: float | None = None
+
+    def lines(self) -> tuple[tuple[LatLon, ...], ...]:
+        """What is to be photographed: the stretches flown with the camera triggering by distance, if any, else all.
+
+        Each is a row of latitudes and longitudes in degrees of two or more waypoints; takeoff and landing are left out.
+        """
+        if not any(i.command == DO_SET_CAM_TRIGG_DIST and i.params[0] > 0.0 for i in self.items):
+            path = [(i.lat_deg, i.lon_deg) for i in self.items if i.command in _FLOWN and i.has_position]
+            return (tuple(path),) if len(path) > 1 else ()
+        found: list[list[LatLon]] = []
+        here: LatLon | None = None
+        triggering = False
+        for item in self.items:
+            if item.command == DO_SET_CAM_TRIGG_DIST:
+                triggering = item.params[0] > 0.0
+                if triggering:
+                    found.append([here] if here else [])
+            elif item.command in _FLOWN and item.has_position:
+                here = (item.lat_deg, item.lon_deg)
+                if triggering:
+                    found[-1].append(here)
+        return tuple(tuple(line) for line in found if len(line) > 1)
+
+
+def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[MissionItem, ...]:
+    """The mission of one sortie: takeoff, speed, waypoints with camera triggers, the end; home not among them.
+
+    DO_SET_CAM_TRIGG_DIST follows a leg's first waypoint (its third parameter takes a picture at once) and its last
+    one with distance 0. PX4 reads yaw 0 as "turn north", so there the yaw is NaN: nose along the path, as ArduPilot
+    does by itself, which lays the picture's width across the leg.
+    """
+    yaw = math.nan if autopilot == "px4" else 0.0
+
+    def nav(command: int, lat: float, lon: float, height: float) -> MissionItem:
+        return MissionItem(command, FRAME_GLOBAL_RELATIVE, (0.0, 0.0, 0.0, yaw), lat, lon, height)
+
+    items = [
+        nav(NAV_TAKEOFF, sortie.home_lat_deg, sortie.home_lon_deg, sortie.takeoff_height_m),
+        MissionItem(DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
+    ]
+    for point in sortie.waypoints:
+        items.append(nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.height_m))
+        if point.camera is not None:
+            distance, at_once = (plan.trigger_m, 1.0) if point.camera else (0.0, 0.0)
+            items.append(MissionItem(DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
+    if plan.end == "rtl":
+        items.append(MissionItem(NAV_RTL))
+    elif plan.end == "land":
+        items.append(nav(NAV_LAND, sortie.home_lat_deg, sortie.home_lon_deg, 0.0))
+    else:  # a plain waypoint last: both autopilots then report the mission as complete
+        last = sortie.waypoints[-1]
+        items.append(nav(NAV_WAYPOINT, last.lat_deg, last.lon_deg, last.height_m))
+    return tuple(items)
+
+
+def plan_text(
+    items: Sequence[MissionItem], home: tuple[float, float, float], autopilot: Autopilot, speed_m_s: float
+) -> str:
+    """The text of a QGroundControl `.plan`: file type "Plan", version 1, mission version 2, simple items only."""
+    document = {
+        "fileType": "Plan",
+        "version": 1,
+        "groundStation": "QGroundControl",
+        "geoFence": {"circles": [], "polygons": [], "version": 2},
+        "rallyPoints": {"points": [], "version": 2},
+        "mission": {
+            "version": 2,
+            "firmwareType": _FIRMWARE[autopilot],
+            "vehicleType": _MULTIROTOR,
+            "globalPlanAltitudeMode": 1,
+            "cruiseSpeed": speed_m_s,
+            "hoverSpeed": speed_m_s,
+            "plannedHomePosition": [round(home[0], 8), round(home[1], 8), home[2]],
+            "items": [_simple_item(item, number) for number, item in enumerate(items, start=1)],
+        },
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
+    lat, lon, alt = round(item.lat_deg, 8), round(item.lon_deg, 8), round(item.alt_m, 3)
+    values = [*(None if math.isnan(p) else p for p in item.params), lat, lon, alt]
+    result: dict[str, Any] = {
+        "type": "SimpleItem",
+        "autoContinue": item.autocontinue,
+        "command": item.command,
+        "doJumpId": number,
+        "frame": item.frame,
+        "params": values,
+    }
+    if item.frame == FRAME_GLOBAL_RELATIVE:
+        result |= {"AMSLAltAboveTerrain": None, "Altitude": alt, "AltitudeMode": 1}
+    return result
+
+
+def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float]) -> str:
+    """The text of a `.waypoints` file: "QGC WPL 110", twelve tab-separated columns, line 0 is home."""
+    first = MissionItem(NAV_WAYPOINT, FRAME_GLOBAL, (0.0, 0.0, 0.0, 0.0), *home)
+    lines = ["QGC WPL 110"]
+    for number, item in enumerate([first, *items]):
+        params = "\t".join(f"{0.0 if math.isnan(p) else p:.8g}" for p in item.params)
+        position = f"{item.lat_deg:.8f}\t{item.lon_deg:.8f}\t{item.alt_m:.3f}"
+        head = f"{number}\t{int(number == 0)}\t{item.frame}\t{item.command}"
+        lines.append(f"{head}\t{params}\t{position}\t{int(item.autocontinue)}")
+    return "\n".join(lines) + "\n"
+
+
+def parse_mission(text: str, name: str = "the file") -> Mission:
+    """Read a `.plan` or a `.waypoints` file, told apart by content.
+
+    Args:
+        text: the file's content.
+        name: how to call the file in an error.
+
+    Raises:
+        InputError: it is neither, or a field is missing or no number.
+    """
+    head = text.lstrip("\ufeff \t\r\n")
+    if head.startswith("QGC WPL"):
+        return _parse_waypoints(head, name)
+    if not head.startswith("{"):
+        raise InputError(f"{name} is neither a .plan (JSON) nor a .waypoints file ('QGC WPL 110'); check what it holds")
+    try:
+        document = json.loads(head)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
+    if not isinstance(document, dict) or document.get("fileType") != "Plan":
+        raise InputError(f"{name} is JSON but no QGroundControl plan (fileType is not 'Plan'); export a .plan file")
+    try:
+        return _parse_plan(document)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise InputError(f"{name} is a .plan with a broken item ({error!r}); save it again in QGroundControl") from None
+
+
+def _parse_waypoints(text: str, name: str) -> Mission:
+    version, *lines = [line for line in text.splitlines() if line.strip()]
+    if version.split()[-1] not in ("110", "120"):
+        raise InputError(f"{name} is '{version.strip()}', but only 'QGC WPL 110' is understood; export it again")
+    rows = []
+    for number, line in enumerate(lines):
+        columns = line.split()
+        try:
+            rows.append([float(c) for c in columns])
+            if len(columns) != 12:
+                raise ValueError
+        except ValueError:
+            raise InputError(
+                f"{name}, item {number}: {len(columns)} columns, but each line has twelve numbers; export it again"
+            ) from None
+    if not all(math.isfinite(r[2]) and math.isfinite(r[3]) for r in rows):
+        raise InputError(f"{name} has a command or a frame that is not finite; export it again")
+    items = [MissionItem(int(r[3]), int(r[2]), (r[4], r[5], r[6], r[7]), r[8], r[9], r[10], r[11] != 0) for r in rows]
+    home = (items[0].lat_deg, items[0].lon_deg, items[0].alt_m) if items else None
+    for item in items:
+        _check_position(item.lat_deg, item.lon_deg, name, item.has_position)
+    return Mission(tuple(items[1:]), home)
+
+
+def _parse_plan(document: Mapping[str, Any]) -> Mission:
+    mission = document["mission"]
+    items: list[MissionItem] = []
+    surveys: list[tuple[LatLon, ...]] = []
+    polylines: list[tuple[LatLon, ...]] = []
+    for entry in mission["items"]:
+        if entry.get("type") == "ComplexItem":
+            if "polygon" in entry:
+                surveys.append(_ring(entry["polygon"]))
+            if "polyline" in entry:
+                polylines.append(_ring(entry["polyline"]))
+            style = entry.get("TransectStyleComplexItem") or {}
+            items.extend(_read_item(i) for i in style.get("Items") or [])
+        else:
+            items.append(_read_item(entry))
+    for item in items:
+        _check_position(item.lat_deg, item.lon_deg, "an item", item.has_position)
+    fence = document.get("geoFence") or {}
+    no_fly = [_ring(p["polygon"]) for p in fence.get("polygons") or [] if not p.get("inclusion", True)]
+    no_fly += [_circle(c["circle"]) for c in fence.get("circles") or [] if not c.get("inclusion", True)]
+    home = mission.get("plannedHomePosition")
+    speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
+    return Mission(
+        tuple(items),
+        (float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,
+        tuple(surveys),
+        tuple(polylines),
+        tuple(no_fly),
+        float(speed) if speed else None,
+    )
+
+
+def _read_item(entry: Mapping[str, Any]) -> MissionItem:
+    values = [math.nan if v is None else float(v) for v in entry["params"]]
+    if len(values) != 7:
+        raise ValueError(f"an item has {len(values)} params instead of 7")
+    lat, lon, alt = (0.0 if math.isnan(v) else v for v in values[4:])
+    p1, p2, p3, p4 = values[:4]
+    return MissionItem(
+        int(entry["command"]),
+        int(entry["frame"]),
+        (p1, p2, p3, p4),
+        lat,
+        lon,
+        alt,
+        bool(entry.get("autoContinue", True)),
+    )
+
+
+def _check_position(lat: float, lon: float, name: str, used: bool) -> None:
+    if used and not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
+        raise InputError(f"{name} has the position {lat:g}, {lon:g}, which is no latitude and longitude; correct it")
+
+
+def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:
+    ring = tuple((float(p[0]), float(p[1])) for p in points)
+    for lat, lon in ring:
+        _check_position(lat, lon, "a polygon", True)
+    return ring
+
+
+def _circle(circle: Mapping[str, Any]) -> tuple[LatLon, ...]:
+    """A circular fence as a 32-gon around it."""
+    (lat, lon), radius = circle["center"], float(circle["radius"]) / math.cos(math.pi / 32)
+    north, east = 111_195.0, 111_195.0 * math.cos(math.radians(float(lat)))
+    angles = [2.0 * math.pi * k / 32 for k in range(32)]
+    return tuple((lat + radius * math.cos(a) / north, lon + radius * math.sin(a) / east) for a in angles)

@@ -1,0 +1,196 @@
+"""A plan as files: a mission per vehicle and sortie, one GeoJSON of all, a report, and the folder that holds them."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Plan, Sortie, VehiclePlan
+from orthoswarm.planning.area.area import Area
+
+MISSION_SUFFIXES = (".plan", ".waypoints")
+REPORT = "plan.json"
+
+
+def sortie_name(vehicle: VehiclePlan, index: int) -> str:
+    """Name of a sortie's files without suffix: v3, or v3-sortie2 where a vehicle flies several."""
+    return vehicle.id if len(vehicle.sorties) == 1 else f"{vehicle.id}-sortie{index + 1}"
+
+
+def mission_files(plan: Plan, autopilot: Autopilot) -> dict[str, str]:
+    """Texts of all `.plan` and `.waypoints` files by name."""
+    texts = {}
+    for vehicle in plan.vehicles:
+        for index, sortie in enumerate(vehicle.sorties):
+            name = sortie_name(vehicle, index)
+            home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
+            items = sortie_items(plan, sortie, autopilot)
+            texts[f"{name}.plan"] = plan_text(items, home, autopilot, plan.speed_m_s)
+            texts[f"{name}.waypoints"] = waypoints_text(items, home)
+    return texts
+
+
+def report(plan: Plan, autopilot: Autopilot) -> dict[str, Any]:
+    """The plan's figures as JSON: per vehicle and altogether."""
+    return {
+        "method": plan.method,
+        "covered_share": plan.covered_share,
+        "complete": plan.covered_share is None or plan.covered_share >= 0.999,
+        "makespan_s": round(plan.makespan_s, 1),
+        "balance": round(plan.balance, 4),
+        "altitude_m": plan.altitude_m,
+        "speed_m_s": plan.speed_m_s,
+        "spacing_m": round(plan.spacing_m, 3),
+        "trigger_m": round(plan.trigger_m, 3),
+        "footprint_m": [round(side, 3) for side in plan.footprint_m],
+        "area_m2": None if plan.area_m2 is None else round(plan.area_m2, 1),
+        "epsg": plan.epsg,
+        "autopilot": autopilot,
+        "end": plan.end,
+        "separation": plan.separation,
+        "vehicles": [_vehicle(vehicle) for vehicle in plan.vehicles],
+        "gaps": [{"lat_deg": g.lat_deg, "lon_deg": g.lon_deg, "area_m2": g.area_m2} for g in plan.gaps],
+        "warnings": list(plan.warnings),
+    }
+
+
+def _vehicle(vehicle: VehiclePlan) -> dict[str, Any]:
+    flights = [
+        {
+            "files": [sortie_name(vehicle, index) + suffix for suffix in MISSION_SUFFIXES],
+            "start_s": round(sortie.start_s, 1),
+            "time_s": round(sortie.time_s, 1),
+            "length_m": round(sortie.length_m, 1),
+            "turns": sortie.turns,
+            "photos": sortie.photos,
+            "legs": len(sortie.legs),
+            "takeoff_height_m": sortie.takeoff_height_m,
+        }
+        for index, sortie in enumerate(vehicle.sorties)
+    ]
+    return {
+        "id": vehicle.id,
+        "length_m": round(vehicle.length_m, 1),
+        "turns": vehicle.turns,
+        "time_s": round(vehicle.time_s, 1),
+        "flight_s": round(vehicle.flight_s, 1),
+        "sorties": len(vehicle.sorties),
+        "photos": vehicle.photos,
+        "flights": flights,
+    }
+
+
+def geojson(plan: Plan, area: Area | None) -> str:
+    """One GeoJSON of everything: area, no-fly zones, legs, ways between them, starts and gaps."""
+    features: list[dict[str, Any]] = []
+    if area is not None:
+        for kind, geometry in (("area", area.ground), ("no-fly zone", area.no_fly)):
+            features += [_feature("Polygon", _rings(area, part), kind=kind) for part in geometry.geoms]
+    for vehicle in plan.vehicles:
+        for index, sortie in enumerate(vehicle.sorties):
+            features += _sortie_features(vehicle, index, sortie)
+    features += [_feature("Point", [g.lon_deg, g.lat_deg], kind="gap", area_m2=g.area_m2) for g in plan.gaps]
+    return json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
+
+
+def _sortie_features(vehicle: VehiclePlan, index: int, sortie: Sortie) -> list[dict[str, Any]]:
+    who = {"vehicle": vehicle.id, "sortie": index + 1}
+    home = [round(sortie.home_lon_deg, 8), round(sortie.home_lat_deg, 8)]
+    features = [_feature("Point", home, kind="start", **who, start_s=sortie.start_s)]
+    way, number = [[*home, sortie.takeoff_height_m]], 0
+    for point in sortie.waypoints:
+        here = [round(point.lon_deg, 8), round(point.lat_deg, 8), point.height_m]
+        way.append(here)
+        if point.camera is False:
+            number += 1
+            features.append(_feature("LineString", way, kind="leg", **who, leg=number))
+            way = [here]
+        elif point.camera is True:
+            features.append(_feature("LineString", way, kind="way", **who))
+            way = [here]
+    if len(way) > 1:
+        features.append(_feature("LineString", way, kind="way", **who))
+    return features
+
+
+def _feature(shape: str, coordinates: Any, /, **properties: Any) -> dict[str, Any]:
+    return {"type": "Feature", "properties": properties, "geometry": {"type": shape, "coordinates": coordinates}}
+
+
+def _rings(area: Area, polygon: Any) -> list[list[list[float]]]:
+    import shapely
+
+    rings = shapely.get_rings(shapely.geometry.polygon.orient(polygon))
+    places = [area.grid.to_geographic(shapely.get_coordinates(ring)) for ring in rings]
+    return [[[round(float(lon), 8), round(float(lat), 8)] for lat, lon in ring] for ring in places]
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder whose missions are not from an earlier plan of ours: they would mix with the new ones.
+
+    Raises:
+        InputError: the folder is a file, or holds other mission files.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; name a folder with --out")
+    foreign = sorted(p.name for p in _missions(folder) if p.name not in _own_missions(folder))
+    if foreign:
+        raise InputError(f"{folder} holds other missions ({', '.join(foreign[:3])}); name an empty folder with --out")
+
+
+def write_folder(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write files into a folder, all or none: into a temporary one beside it first.
+
+    Missions of an earlier plan in the folder are replaced; other files stay.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    check_folder(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made ({error.strerror}); name another folder with --out") from None
+    try:
+        for name, content in files.items():
+            data = content.encode() if isinstance(content, str) else content
+            with (temporary / name).open("wb") as file:  # a mission that a power cut has shortened would still be flown
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        if not folder.exists():
+            temporary.chmod(0o755)
+            os.replace(temporary, folder)
+            return
+        for old in _missions(folder):
+            if old.name not in files:
+                old.unlink()
+        for name in _report_last(files):
+            os.replace(temporary / name, folder / name)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written ({error.strerror}); name another folder with --out") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _report_last(names: Mapping[str, Any]) -> Sequence[str]:
+    """The report names the missions that are ours, so it goes last (an earlier one still names the old ones)."""
+    return sorted(names, key=lambda name: name == REPORT)
+
+
+def _missions(folder: Path) -> list[Path]:
+    return [p for p in folder.glob("*") if p.suffix in MISSION_SUFFIXES] if folder.is_dir() else []
+
+
+def _own_missions(folder: Path) -> set[str]:
+    try:
+        document = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+        return {name for vehicle in document["vehicles"] for flight in vehicle["flights"] for name in flight["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()

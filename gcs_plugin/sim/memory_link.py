@@ -1,0 +1,146 @@
+"""Simulated vehicles behind a link in memory, in a time of its own: hours of flight in seconds, the same every time."""
+
+import selectors
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.links.packets import Framer
+from gcs_plugin.links.transports import Link, Peer
+from gcs_plugin.mission.completion import MissionEvent
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+
+
+@dataclass(slots=True)
+class VirtualClock:
+    """A clock that is set by hand.
+
+    Attributes:
+        now: seconds.
+        utc_0: UTC epoch seconds at 0.
+    """
+
+    now: float = 0.0
+    utc_0: float = 1_700_000_000.0
+
+    def __call__(self) -> float:
+        """Seconds."""
+        return self.now
+
+    def utc(self) -> float:
+        """UTC epoch seconds."""
+        return self.utc_0 + self.now
+
+
+class SimLink(Link):
+    """A link whose other end are simulated vehicles, each a peer of its own.
+
+    Attributes:
+        vehicles: the vehicles.
+        up: from the ground to the vehicles; down: back.
+    """
+
+    def __init__(
+        self, vehicles: Sequence[SimVehicle], clock: VirtualClock, up: Faults = NO_FAULTS, down: Faults = NO_FAULTS
+    ) -> None:
+        super().__init__("simulation")
+        self.vehicles, self._clock = list(vehicles), clock
+        self.up: Channel[tuple[int, bytes]] = Channel(up)
+        self.down: Channel[tuple[int, bytes]] = Channel(down)
+        self._packers = [dialect.MAVLink(None, vehicle.system, 1) for vehicle in self.vehicles]
+        self._framers = [Framer() for _ in self.vehicles]
+
+    def open(self, selector: selectors.BaseSelector, now: float) -> None:
+        """Nothing to wait for."""
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    @property
+    def polled(self) -> Any:
+        """Always read."""
+        return self
+
+    def greet(self) -> list[Peer]:
+        """All vehicles."""
+        return list(range(len(self.vehicles)))
+
+    def send(self, peer: Peer, data: bytes) -> None:
+        """Hand bytes to the radio."""
+        self.up.put((peer, data), self._clock.now)
+
+    def receive(self, source: Any, events: int, now: float) -> Iterator[tuple[Peer, bytes]]:
+        """Let the vehicles take what has arrived, live up to now, and speak."""
+        for peer, data in self.up.take(now):
+            for packet in self._framers[peer].feed(data):
+                sender = Address(packet.system, packet.component)
+                self._say(peer, self.vehicles[peer].handle(packet.message, sender, now), now)
+        for peer, vehicle in enumerate(self.vehicles):
+            self._say(peer, vehicle.advance(now), now)
+        yield from self.down.take(now)
+
+    def _say(self, peer: int, messages: Sequence[Message], now: float) -> None:
+        packer = self._packers[peer]
+        for message in messages:
+            self.down.put((peer, message.pack(packer)), now)
+            packer.seq = (packer.seq + 1) & 0xFF
+
+
+class World:
+    """Simulated vehicles and a fleet that watches them, stepped together in virtual time.
+
+    Attributes:
+        vehicles: by system id.
+        fleet: the ground station.
+        clock: the time of both.
+        events: what the fleet has said.
+        link: the radio between them.
+    """
+
+    def __init__(
+        self, vehicles: Sequence[SimVehicle], up: Faults = NO_FAULTS, down: Faults = NO_FAULTS, **options: Any
+    ) -> None:
+        self.clock = VirtualClock()
+        self.vehicles = {vehicle.system: vehicle for vehicle in vehicles}
+        self.link = SimLink(vehicles, self.clock, up, down)
+        self.fleet = Fleet([self.link], clock=self.clock, wall=self.clock.utc, **options)
+        self.events: list[FleetEvent] = []
+        self.fleet.on_event(self.events.append)
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.fleet.close()
+
+    def until(self, done: Callable[[], bool], limit_s: float = 600.0, step_s: float = 0.02) -> bool:
+        """Let time pass until something is so, at most so long; returns whether it is."""
+        end = self.clock.now + limit_s
+        while not done() and self.clock.now < end:
+            self.clock.now += step_s
+            self.fleet.poll(0.0)
+        return done()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        self.until(lambda: False, seconds)
+
+    def finish(self, *dialogues: Exchange, limit_s: float = 600.0) -> list[Outcome | None]:
+        """Let time pass until dialogues have ended; returns how."""
+        self.until(lambda: all(dialogue.outcome is not None for dialogue in dialogues), limit_s)
+        return [dialogue.outcome for dialogue in dialogues]
+
+    def meet(self) -> None:
+        """Let time pass until all vehicles are found and their streams run."""
+        self.until(lambda: all(v in self.fleet.vehicles for v in self.vehicles), 30.0)
+        self.until(lambda: all(v.lat_deg is not None and v.landed for v in self.fleet.vehicles.values()), 30.0)
+
+    def kinds(self, system: int) -> list[str]:
+        """What has happened to a vehicle's mission."""
+        missions = {event.value for event in MissionEvent}
+        return [event.kind for event in self.events if event.system == system and event.kind in missions]

@@ -1,0 +1,387 @@
+"""How a simulated vehicle flies its mission: item by item, with the camera, and ending it as its autopilot does."""
+
+import enum
+from dataclasses import dataclass, field
+from random import Random
+from typing import Final
+
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.flight_modes import Modes
+from gcs_plugin.mission.items import (
+    CHANGE_SPEED,
+    DELAY,
+    JUMP,
+    LAND,
+    LOITER_UNLIM,
+    RTL,
+    TAKEOFF,
+    TRIGGER_DISTANCE,
+    VTOL_LAND,
+    MissionItem,
+)
+from gcs_plugin.sim.mission_store import MissionStore
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion, Pose
+
+_LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
+_RTL_HEIGHT_M: Final = 15.0
+_REACHED_M: Final = 1.5
+_FINAL_SINK_M_S: Final = 0.7
+
+
+class Landed(enum.IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class State(enum.IntEnum):
+    """MISSION_STATE."""
+
+    NONE = 1
+    NOT_STARTED = 2
+    ACTIVE = 3
+    PAUSED = 4
+    COMPLETE = 5
+
+
+class Task(enum.Enum):
+    """What the vehicle is doing."""
+
+    STAND = "stand"
+    HOLD = "hold"
+    ITEM = "item"
+    CLIMB_HOME = "climb home"
+    GO_HOME = "go home"
+    DESCEND = "descend"
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """A picture that the vehicle has taken.
+
+    Attributes:
+        index: counts from 0.
+        time_s: seconds since boot.
+        pose: where the vehicle truly was.
+        lat_deg: where it believed to be; lon_deg: longitude.
+    """
+
+    index: int
+    time_s: float
+    pose: Pose
+    lat_deg: float
+    lon_deg: float
+
+
+@dataclass(slots=True)
+class Flight:
+    """Everything about flying.
+
+    Attributes:
+        autopilot: the dialect; modes: its modes.
+        store: the mission.
+        motion: where it is.
+        mode: custom mode number.
+        armed: motors on.
+        seq: current item; state: MISSION_STATE.
+        landed: MAV_LANDED_STATE.
+        reached: items reached since the last look; texts: texts since then; exposures: all pictures.
+    """
+
+    autopilot: Autopilot
+    modes: Modes
+    store: MissionStore
+    motion: Motion
+    mode: int = 0
+    armed: bool = False
+    seq: int = 0
+    state: State = State.NONE
+    landed: Landed = Landed.ON_GROUND
+    reached: list[int] = field(default_factory=list)
+    texts: list[str] = field(default_factory=list)
+    exposures: list[Exposure] = field(default_factory=list)
+    time_s: float = 0.0
+    paused: bool = False
+    _task: Task = Task.STAND
+    _waited: float = 0.0
+    _trigger_m: float = 0.0
+    _last_photo: tuple[float, float] | None = None
+    _jumps: dict[int, int] = field(default_factory=dict)
+    _ends_mission: bool = False
+    _reached_any: bool = False
+    _generation: int = 0
+
+    @classmethod
+    def make(
+        cls, autopilot: Autopilot, modes: Modes, store: MissionStore, chart: Chart, frame: Airframe, seed: int
+    ) -> "Flight":
+        """A vehicle standing at home."""
+        mode = modes.hold if autopilot is Autopilot.PX4 else 0
+        return cls(autopilot, modes, store, Motion(chart, frame, Random(seed), speed=frame.speed_m_s), mode)
+
+    # --- commands ---
+
+    def arm(self) -> str:
+        """Arm; returns why not."""
+        if self.armed:
+            return ""
+        if self.autopilot is Autopilot.ARDUPILOT and self.mode == self.modes.mission:
+            return "Arm: Auto mode not armable"
+        self.armed = True
+        return ""
+
+    def disarm(self) -> None:
+        """Motors off, and what that does to the mission."""
+        if not self.armed:
+            return
+        self.armed, self._task, self.landed = False, Task.STAND, Landed.ON_GROUND
+        self.motion.still()
+        self._trigger_m = 0.0
+        if self.state is State.COMPLETE or self.autopilot is Autopilot.ARDUPILOT:
+            self.seq = 0
+
+    def set_mode(self, mode: int) -> None:
+        """Change the mode; leaving the mission's mode suspends the mission."""
+        was, self.mode = self.mode, mode
+        modes = self.modes
+        if mode == modes.mission:
+            if self.armed and self.state is not State.COMPLETE:
+                self._enter_mission()
+            return
+        if was == modes.mission and self.state is State.ACTIVE:
+            self.state = State.NOT_STARTED if self.autopilot is Autopilot.ARDUPILOT else State.PAUSED
+        self.paused = False
+        if not self.armed or self.landed is Landed.ON_GROUND:
+            return
+        if mode == modes.rtl:
+            self._ends_mission = False
+            self._go_home()
+        else:
+            self._hold()
+
+    def start_mission(self) -> str:
+        """MISSION_START; returns why not."""
+        first = self._first
+        if len(self.store.items) <= first:
+            return "No mission"
+        begins = self._next_nav(first)
+        if self.landed is Landed.ON_GROUND and (begins is None or self.store.items[begins].command != TAKEOFF):
+            return "Auto: Missing Takeoff Cmd" if self.autopilot is Autopilot.ARDUPILOT else "Takeoff waypoint required"
+        if self.autopilot is Autopilot.ARDUPILOT and not self.armed:
+            return "Mission start: not armed"
+        self.armed, self.mode = True, self.modes.mission
+        if self.state is not State.ACTIVE or self._task is Task.STAND:
+            self.seq, self.state, self._jumps = first, State.NOT_STARTED, {}
+            self._enter_mission()
+        return ""
+
+    def pause(self, go_on: bool) -> bool:
+        """DO_PAUSE_CONTINUE: between waypoints only."""
+        if self.state is not State.ACTIVE or self._task is not Task.ITEM or self.mode != self.modes.mission:
+            return False
+        item = self.store.items[self.seq]
+        if item.command in (TAKEOFF, LAND, RTL):
+            return False
+        if go_on == self.paused:
+            self.paused = not go_on
+            self._aim(item)
+        return True
+
+    def set_current(self, seq: int) -> bool:
+        """Jump to an item."""
+        if not self._first <= seq < len(self.store.items):
+            return False
+        self.seq = seq
+        if self.state is State.ACTIVE:
+            self._run_from(seq)
+        return True
+
+    # --- time ---
+
+    def step(self, time_s: float) -> None:
+        """Advance by STEP_S."""
+        self.time_s = time_s
+        if self.store.generation != self._generation:
+            self._generation = self.store.generation
+            self._mission_changed()
+        if not self.armed:
+            return
+        self.motion.step(time_s)
+        match self._task:
+            case Task.ITEM:
+                self._fly_item(self.store.items[self.seq])
+            case Task.CLIMB_HOME if self.motion.distance()[1] < 1.0:
+                self.motion.go((0.0, 0.0, self.motion.up))
+                self._task = Task.GO_HOME
+            case Task.GO_HOME if self.motion.distance()[0] < _REACHED_M:
+                self._descend(0.0, 0.0)
+            case Task.DESCEND:
+                self._touch_down()
+        if self._trigger_m > 0.0 and self.landed is Landed.IN_AIR:
+            self._photograph()
+
+    # --- the mission ---
+
+    @property
+    def _first(self) -> int:
+        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
+
+    def _next_nav(self, seq: int) -> int | None:
+        return next((i for i in range(seq, len(self.store.items)) if self.store.items[i].is_nav), None)
+
+    def _mission_changed(self) -> None:
+        """A new mission lies in the store. The mission's state goes stale: it still says complete."""
+        if self._task is Task.ITEM:
+            if self.seq < len(self.store.items) and self.store.items[self.seq].is_nav:
+                self._begin(self.store.items[self.seq])
+            else:
+                self._finish()
+                self._hold()
+            return
+        if self.state is not State.COMPLETE:
+            self.state = State.NOT_STARTED if len(self.store.items) > self._first else State.NONE
+        if not self.armed:
+            self.seq = 0
+
+    def _enter_mission(self) -> None:
+        self.state, self.paused, self._reached_any = State.ACTIVE, False, False
+        self._run_from(max(self.seq, self._first))
+
+    def _run_from(self, seq: int) -> None:
+        """Do what needs no flying, up to the next item that is flown."""
+        while seq < len(self.store.items):
+            item = self.store.items[seq]
+            if item.is_nav:
+                self.seq, self._task, self._waited = seq, Task.ITEM, 0.0
+                self._begin(item)
+                return
+            jump = self._do(seq, item)
+            seq = jump if jump is not None else seq + 1
+        self.seq = len(self.store.items) - 1
+        self._finish()
+        self._hold(at_target=True)
+
+    def _do(self, seq: int, item: MissionItem) -> int | None:
+        if item.command == TRIGGER_DISTANCE:
+            self._trigger_m, self._last_photo = item.params[0], None
+            if item.params[0] > 0.0 and not item.params[2]:  # the first picture only after the distance
+                self._last_photo = self.motion.seen
+        elif item.command == CHANGE_SPEED and item.params[1] > 0.0:
+            self.motion.speed = item.params[1]
+        elif item.command == JUMP and self._jumps.get(seq, 0) < item.params[1]:
+            self._jumps[seq] = self._jumps.get(seq, 0) + 1
+            return int(item.params[0])
+        return None
+
+    def _begin(self, item: MissionItem) -> None:
+        self.texts.append(f"Mission: {self.seq} {item.name}")
+        if item.command == RTL:
+            if self.autopilot is Autopilot.PX4:
+                self._finish()
+                self.mode = self.modes.rtl
+            self._ends_mission = self.autopilot is Autopilot.ARDUPILOT
+            self._go_home()
+        elif item.command in (LAND, VTOL_LAND):
+            self._aim(item)
+            self._ends_mission = True
+        else:
+            if item.command == TAKEOFF and self.landed is Landed.ON_GROUND:
+                self.landed = Landed.TAKEOFF
+            self._aim(item)
+
+    def _aim(self, item: MissionItem) -> None:
+        motion = self.motion
+        north, east = motion.seen
+        if self.paused:
+            motion.stop()
+            return
+        if item.command != TAKEOFF and (item.x or item.y):
+            north, east = motion.chart.to_metres(item.lat_deg, item.lon_deg)
+        height = item.z - (motion.chart.alt_m if item.frame in (0, 5) else 0.0)
+        stays_high = item.command in (LAND, VTOL_LAND) or not item.has_place
+        # On a leg it keeps to the line, which is what makes the leg straight.
+        motion.go((north, east, motion.up if stays_high else height), along_line=bool(self._reached_any))
+
+    def _fly_item(self, item: MissionItem) -> None:
+        if self.paused:
+            return
+        horizontal, vertical = self.motion.distance()
+        if self.landed is Landed.TAKEOFF and self.motion.up > 2.0 and item.command != TAKEOFF:
+            self.landed = Landed.IN_AIR
+        if horizontal > _REACHED_M or vertical > 1.0:
+            return
+        if item.command in (LAND, VTOL_LAND):
+            self._descend(self.motion.target[0], self.motion.target[1]) if self.motion.target else None
+            return
+        if item.command == LOITER_UNLIM:
+            return
+        self._waited += STEP_S
+        hold = item.params[0] if item.command in (16, _LOITER_TIME, DELAY) else 0.0
+        if self._waited <= hold:
+            return
+        if item.command == TAKEOFF:
+            self.landed = Landed.IN_AIR
+        self._reach(self.seq)
+        self._run_from(self.seq + 1)
+
+    def _reach(self, seq: int) -> None:
+        self._reached_any = True
+        self.reached.append(seq)
+        self.texts.append(f"Reached command #{seq}")
+
+    def _finish(self) -> None:
+        self.state = State.COMPLETE
+        self._trigger_m = 0.0
+
+    # --- going home and landing ---
+
+    def _hold(self, *, at_target: bool = False) -> None:
+        """Stay: at the last waypoint, or where it is."""
+        if not at_target:
+            self.motion.stop()
+        self._task = Task.HOLD
+
+    def _go_home(self) -> None:
+        self._trigger_m = 0.0
+        north, east = self.motion.seen
+        self.motion.go((north, east, max(self.motion.up, _RTL_HEIGHT_M)))
+        self._task = Task.CLIMB_HOME
+
+    def _descend(self, north: float, east: float) -> None:
+        self.landed, self._task = Landed.LANDING, Task.DESCEND
+        self.motion.go((north, east, -1.0))
+
+    def _touch_down(self) -> None:
+        motion = self.motion
+        if motion.up < 5.0 and motion.vu < -_FINAL_SINK_M_S:
+            motion.vu = -_FINAL_SINK_M_S
+        if motion.up > 0.05:
+            return
+        in_mission = self.mode == self.modes.mission and self._ends_mission
+        landing = in_mission and self.store.items[self.seq].command in (LAND, VTOL_LAND)
+        if in_mission and self.autopilot is Autopilot.ARDUPILOT and not landing:
+            self._reach(self.seq)  # RTL is reached, LAND is not
+            self._finish()
+        if landing and self.autopilot is Autopilot.PX4:
+            self._finish()
+        self.texts.append("Disarming motors")
+        state = self.state
+        self.disarm()
+        if landing and self.autopilot is Autopilot.ARDUPILOT:
+            self.seq, self.state = 1, State.ACTIVE  # measured: back at the first item, still "active"
+        elif state is not State.COMPLETE:
+            self.state = State.NOT_STARTED
+
+    # --- the camera ---
+
+    def _photograph(self) -> None:
+        north, east = self.motion.seen
+        last = self._last_photo
+        if last is not None and (north - last[0]) ** 2 + (east - last[1]) ** 2 < self._trigger_m**2:
+            return
+        self._last_photo = (north, east)
+        lat, lon = self.motion.chart.to_degrees(north, east)
+        self.exposures.append(Exposure(len(self.exposures), self.time_s, self.motion.pose(self.time_s), lat, lon))

@@ -1,0 +1,201 @@
+"""The vehicle's side of the mission protocol, in both dialects, with their oddities."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
+from gcs_plugin.mission.refusal import (
+    ACCEPTED,
+    CANCELLED,
+    DENIED,
+    ERROR,
+    INVALID_SEQUENCE,
+    NO_SPACE,
+    UNSUPPORTED,
+    UNSUPPORTED_FRAME,
+)
+
+_MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
+_FRAMES: Final = frozenset({0, 2, 3, 5, 6, 10, 11})
+_COMMANDS: Final = frozenset({
+    16, 17, 18, 19, 20, 21, 22, 82, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 183, 189, 195, 197, 201, 203,
+    205, 206, 207, 210, 212, 218, 222, 530, 2000, 2001, 2500, 2501,
+})  # fmt: skip
+_CAPACITY: Final = 650
+# (requests again after, gives up after) seconds without an item.
+_TIMING: Final = {Autopilot.ARDUPILOT: (1.0, 8.0), Autopilot.PX4: (0.25, 5.0)}
+
+
+@dataclass(slots=True)
+class _Transfer:
+    partner: Address
+    count: int
+    wanted: int
+    asked_at: float
+    heard_at: float
+    items: list[MissionItem] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class MissionStore:
+    """What a vehicle holds, and the dialogue by which it changes.
+
+    Attributes:
+        autopilot: the dialect.
+        home: ArduPilot's item 0.
+        items: the stored mission; for ArduPilot item 0 is home.
+        generation: rises whenever an upload or a clear has ended, so that the flight logic can notice.
+    """
+
+    autopilot: Autopilot
+    home: MissionItem
+    items: list[MissionItem] = field(default_factory=list)
+    generation: int = 0
+    _transfer: _Transfer | None = None
+
+    def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
+        """Take a message of the mission protocol that is meant for this vehicle; returns the answers."""
+        if getattr(message, "mission_type", _MISSION) != _MISSION:
+            return [self._ack(sender, UNSUPPORTED, int(message.mission_type))]
+        match message.get_type():
+            case "MISSION_COUNT":
+                return self._count(int(message.count), sender, now)
+            case "MISSION_ITEM_INT" | "MISSION_ITEM":
+                return self._item(message, sender, now)
+            case "MISSION_REQUEST_LIST":
+                if self._transfer is not None:
+                    return [self._ack(sender, DENIED if self.autopilot is Autopilot.ARDUPILOT else ERROR)]
+                return [
+                    dialect.MAVLink_mission_count_message(sender.system, sender.component, len(self.items), _MISSION)
+                ]
+            case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
+                if message.seq >= len(self.items) or self._transfer is not None:
+                    return [self._ack(sender, ERROR)]
+                return [self.items[message.seq].message(message.seq, sender.system, sender.component)]
+            case "MISSION_CLEAR_ALL":
+                self.items, self._transfer = [self.home] if self.autopilot is Autopilot.ARDUPILOT else [], None
+                self.generation += 1
+                return [self._ack(sender, ACCEPTED)]
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Ask again for an item that does not come, and give up in the end."""
+        transfer = self._transfer
+        if transfer is None:
+            return []
+        again, give_up = _TIMING[self.autopilot]
+        if now - transfer.heard_at >= give_up:
+            self._transfer = None
+            return [self._ack(transfer.partner, CANCELLED)] if self.autopilot is Autopilot.ARDUPILOT else []
+        return self._ask(transfer, now) if now - transfer.asked_at >= again else []
+
+    def rebooted(self) -> None:
+        """Forget the dialogue; what was stored stays."""
+        self._transfer = None
+
+    @property
+    def receiving(self) -> bool:
+        """True in the middle of an upload."""
+        return self._transfer is not None
+
+    def _count(self, count: int, sender: Address, now: float) -> list[Message]:
+        transfer = self._transfer
+        if transfer is not None and transfer.partner != sender:
+            return [self._ack(sender, DENIED)]
+        if transfer is not None and self.autopilot is Autopilot.PX4:
+            return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, ERROR)]
+        if count > _CAPACITY:
+            return [self._ack(sender, NO_SPACE)]
+        if count == 0:
+            self.items = []
+            self.generation += 1
+            return [self._ack(sender, ACCEPTED)]
+        self._transfer = _Transfer(sender, count, 0, now, now)
+        return self._ask(self._transfer, now)
+
+    def _ask(self, transfer: _Transfer, now: float) -> list[Message]:
+        transfer.asked_at = now
+        to = transfer.partner
+        # ArduPilot asks with the old message and wants MISSION_ITEM_INT all the same.
+        if self.autopilot is Autopilot.ARDUPILOT:
+            return [dialect.MAVLink_mission_request_message(to.system, to.component, transfer.wanted, _MISSION)]
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, transfer.wanted, _MISSION)]
+
+    def _item(self, message: Message, sender: Address, now: float) -> list[Message]:
+        transfer = self._transfer
+        if transfer is None or transfer.partner != sender:
+            return [self._ack(sender, ERROR)]
+        if message.seq != transfer.wanted:
+            return [self._ack(sender, INVALID_SEQUENCE)]
+        item = MissionItem.of(message)
+        code = self._check(item, transfer.count)
+        if code != ACCEPTED:
+            self._transfer = None
+            return [self._ack(sender, code)]
+        if self.autopilot is Autopilot.ARDUPILOT:  # written at once, so that a broken upload leaves a mixture
+            self._write(transfer.wanted, self._as_stored(item, transfer.wanted))
+        else:
+            transfer.items.append(replace(item, frame=PLAIN_FRAME.get(item.frame, item.frame)))
+        transfer.wanted, transfer.heard_at = transfer.wanted + 1, now
+        if transfer.wanted < transfer.count:
+            return self._ask(transfer, now)
+        if self.autopilot is Autopilot.ARDUPILOT:
+            del self.items[transfer.count :]
+        else:
+            self.items = transfer.items
+        self._transfer = None
+        self.generation += 1
+        return [self._ack(sender, ACCEPTED)]
+
+    def _write(self, seq: int, item: MissionItem) -> None:
+        self.items[seq : seq + 1] = [item]
+
+    def _as_stored(self, item: MissionItem, seq: int) -> MissionItem:
+        """What ArduPilot gives back: see `mission.compare`."""
+        if seq == 0:
+            return self.home
+        params = tuple(_kept(value) for value in item.params)
+        if item.command in (WAYPOINT, TAKEOFF):
+            params = (float(int(params[0])), 0.0, 0.0, 0.0)
+        if not item.has_place:
+            return MissionItem(item.command, FRAME_GLOBAL, (params[0], params[1], params[2], params[3]))
+        return MissionItem(
+            item.command,
+            PLAIN_FRAME.get(item.frame, item.frame),
+            (params[0], params[1], params[2], params[3]),
+            item.x,
+            item.y,
+            round(item.z * 100.0) / 100.0,
+        )
+
+    def _check(self, item: MissionItem, count: int) -> int:
+        """MAV_MISSION_RESULT for an item, in the order in which ArduPilot looks at it."""
+        ardupilot = self.autopilot is Autopilot.ARDUPILOT
+        if item.command not in _COMMANDS:
+            return UNSUPPORTED
+        if item.frame not in _FRAMES:
+            return UNSUPPORTED_FRAME
+        for index, value in enumerate(item.params):
+            if math.isnan(value) and (ardupilot or index == 0):
+                return 6 + index
+        if item.has_place:
+            if abs(item.x) > 900_000_000:
+                return 10
+            if abs(item.y) > 1_800_000_000:
+                return 11
+            if not abs(item.z) < 1e6:
+                return 12
+        if item.command == JUMP and not 1 <= item.params[0] < count:
+            return ERROR
+        return ACCEPTED
+
+    def _ack(self, to: Address, code: int, kind: int = 0) -> Message:
+        return dialect.MAVLink_mission_ack_message(to.system, to.component, code, kind)
+
+
+def _kept(value: float) -> float:
+    """A parameter as it is kept (NaN becomes 0)."""
+    return 0.0 if math.isnan(value) else float(value)

@@ -1,0 +1,248 @@
+"""How a simulated multirotor moves: straight to its target, with limited acceleration, leaning into it, nose ahead.
+
+Positions are metres north and east of home and up from it, in a chart of the ellipsoid around home (degrees have the
+length everywhere that they have at home's latitude). Angles are radians: yaw clockwise from true north, pitch nose up,
+roll right side down. Control sees the position with the receiver's error, as a real autopilot
+does, so that the true path drifts while the recorded one looks straight.
+"""
+
+import bisect
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from random import Random
+from typing import Final
+
+from orthoswarm.model.angles import wrap_rad
+
+_GRAVITY: Final = 9.80665
+_SEMI_MAJOR_M: Final = 6378137.0
+_ECCENTRICITY2: Final = 6.69437999014e-3
+STEP_S: Final = 0.05
+_FILTER_S: Final = 3.0
+_LOOK_AHEAD_S: Final = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Metres around a point of the ellipsoid WGS 84.
+
+    Attributes:
+        lat_deg: latitude of the origin; lon_deg: longitude; alt_m: altitude of height 0.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float = 0.0
+
+    @property
+    def metres_per_deg(self) -> tuple[float, float]:
+        """Length of a degree of latitude and of longitude."""
+        sin2 = math.sin(math.radians(self.lat_deg)) ** 2
+        w = 1.0 - _ECCENTRICITY2 * sin2
+        meridian = _SEMI_MAJOR_M * (1.0 - _ECCENTRICITY2) / w**1.5
+        parallel = _SEMI_MAJOR_M / math.sqrt(w) * math.cos(math.radians(self.lat_deg))
+        return math.radians(meridian), math.radians(parallel)
+
+    def to_metres(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        """North and east."""
+        per_lat, per_lon = self.metres_per_deg
+        return (lat_deg - self.lat_deg) * per_lat, (lon_deg - self.lon_deg) * per_lon
+
+    def to_degrees(self, north: float, east: float) -> tuple[float, float]:
+        """Latitude and longitude."""
+        per_lat, per_lon = self.metres_per_deg
+        return self.lat_deg + north / per_lat, self.lon_deg + east / per_lon
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a vehicle truly is.
+
+    Attributes:
+        time_s: seconds since its boot.
+        lat_deg: latitude; lon_deg: longitude.
+        height_m: above home; alt_m: above sea level.
+        yaw_rad: of the airframe, with pitch_rad and roll_rad.
+    """
+
+    time_s: float
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    alt_m: float
+    yaw_rad: float
+    pitch_rad: float
+    roll_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Airframe:
+    """What a vehicle can do.
+
+    Attributes:
+        speed_m_s: cruise, until a mission says otherwise; climb_m_s, sink_m_s: vertical speeds.
+        accel_m_s2: greatest horizontal acceleration.
+        drag: forward lean at speed, m/s2 per m/s.
+        yaw_rate: turning speed, rad/s.
+        gps_sigma_m: one sigma of the receiver's horizontal error, which wanders with gps_tau_s.
+    """
+
+    speed_m_s: float = 8.0
+    climb_m_s: float = 3.0
+    sink_m_s: float = 2.0
+    accel_m_s2: float = 2.5
+    drag: float = 0.12
+    yaw_rate: float = math.radians(60.0)
+    gps_sigma_m: float = 0.0
+    gps_tau_s: float = 60.0
+
+
+@dataclass(slots=True)
+class Motion:
+    """The state of motion of one vehicle, advanced in steps of STEP_S.
+
+    Attributes:
+        chart: around home.
+        north: true position with east and up; velocities vn, ve, vu.
+        speed: present cruise speed, m/s.
+        target: where it wants to be (north, east, up), None to stay on the ground; see `go`.
+    """
+
+    chart: Chart
+    airframe: Airframe
+    random: Random
+    north: float = 0.0
+    east: float = 0.0
+    up: float = 0.0
+    vn: float = 0.0
+    ve: float = 0.0
+    vu: float = 0.0
+    yaw: float = 0.0
+    pitch: float = 0.0
+    roll: float = 0.0
+    speed: float = 8.0
+    target: tuple[float, float, float] | None = None
+    _an: float = 0.0
+    _ae: float = 0.0
+    _start: tuple[float, float] = (0.0, 0.0)
+    _drift: tuple[float, float] = (0.0, 0.0)
+    _error: tuple[float, float] = (0.0, 0.0)
+    _track: "deque[tuple[float, ...]]" = field(default_factory=lambda: deque(maxlen=20 * 600))
+
+    def step(self, time_s: float) -> None:
+        """Advance by STEP_S to a time since boot."""
+        self._wander()
+        if self.target is not None:
+            self._fly(self.target)
+        self._track.append((time_s, self.north, self.east, self.up, self.yaw, self.pitch, self.roll))
+
+    def go(self, target: tuple[float, float, float], *, along_line: bool = False) -> None:
+        """Fly to a point; along the line from the target before, or straight from here."""
+        before = self.target
+        self._start = (before[0], before[1]) if along_line and before is not None else self.seen
+        self.target = target
+
+    def stop(self) -> None:
+        """Come to rest as soon as it can, ahead of here."""
+        north, east = self.seen
+        after_s = math.hypot(self.vn, self.ve) / (2.0 * self.airframe.accel_m_s2) + 0.7
+        self.go((north + self.vn * after_s, east + self.ve * after_s, self.up))
+
+    def still(self) -> None:
+        """Stand on the ground."""
+        self.vn = self.ve = self.vu = self._an = self._ae = self.pitch = self.roll = self.up = 0.0
+        self.target = None
+
+    @property
+    def seen(self) -> tuple[float, float]:
+        """North and east as its receiver has it."""
+        return self.north + self._error[0], self.east + self._error[1]
+
+    def distance(self) -> tuple[float, float]:
+        """Horizontal and vertical distance to the target as the autopilot sees it."""
+        if self.target is None:
+            return 0.0, 0.0
+        north, east = self.seen
+        return math.hypot(self.target[0] - north, self.target[1] - east), abs(self.target[2] - self.up)
+
+    def pose(self, time_s: float) -> Pose:
+        """The true pose now."""
+        return self._pose(time_s, (self.north, self.east, self.up, self.yaw, self.pitch, self.roll))
+
+    def pose_at(self, time_s: float) -> Pose:
+        """The true pose at a time since boot, in the last ten minutes of flight; beyond its ends, the nearest."""
+        track = self._track
+        if not track:
+            return self.pose(time_s)
+        index = bisect.bisect_left(track, time_s, key=lambda sample: sample[0])
+        if index == 0:
+            return self._pose(time_s, track[0][1:])
+        if index == len(track):
+            return self._pose(time_s, track[-1][1:])
+        before, after = track[index - 1], track[index]
+        share = (time_s - before[0]) / (after[0] - before[0])
+        values = [a + share * (b - a) for a, b in zip(before[1:], after[1:])]
+        values[3] = before[4] + share * wrap_rad(after[4] - before[4])
+        return self._pose(time_s, tuple(values))
+
+    def _pose(self, time_s: float, values: tuple[float, ...]) -> Pose:
+        north, east, up, yaw, pitch, roll = values
+        lat, lon = self.chart.to_degrees(north, east)
+        return Pose(time_s, lat, lon, up, self.chart.alt_m + up, yaw, pitch, roll)
+
+    def _wander(self) -> None:
+        sigma, tau = self.airframe.gps_sigma_m, self.airframe.gps_tau_s
+        if sigma > 0.0:  # Ornstein-Uhlenbeck, smoothed as a filter does it that trusts inertia for some seconds
+            keep = math.exp(-STEP_S / tau)
+            kick = sigma * math.sqrt(1.0 - keep * keep)
+            gauss = self.random.gauss
+            dn, de = (keep * value + kick * gauss(0.0, 1.0) for value in self._drift)
+            share = STEP_S / _FILTER_S
+            en, ee = self._error
+            self._drift, self._error = (dn, de), (en + share * (dn - en), ee + share * (de - ee))
+
+    def _fly(self, target: tuple[float, float, float]) -> None:
+        frame, dt = self.airframe, STEP_S
+        seen_north, seen_east = self.seen
+        distance = math.hypot(target[0] - seen_north, target[1] - seen_east)
+        dn, de = self._carrot(target, seen_north, seen_east)
+        ahead = math.hypot(dn, de)
+        # As fast as it may go and still stop in time, with a little in hand for the lag of its lean.
+        wanted = min(self.speed, math.sqrt(1.4 * frame.accel_m_s2 * distance), 0.8 * distance)
+        scale = wanted / ahead if ahead > 1e-6 else 0.0
+        an, ae = (dn * scale - self.vn) / 0.5, (de * scale - self.ve) / 0.5
+        size = math.hypot(an, ae)
+        limit = min(1.0, frame.accel_m_s2 / size) if size > 0.0 else 1.0
+        lag = dt / 0.2
+        self._an += lag * (an * limit - self._an)
+        self._ae += lag * (ae * limit - self._ae)
+        self.vn += dt * self._an
+        self.ve += dt * self._ae
+        rise = target[2] - self.up
+        wanted_up = max(-frame.sink_m_s, min(frame.climb_m_s, 1.0 * rise))
+        self.vu += max(-1.5 * dt, min(1.5 * dt, wanted_up - self.vu))
+        self.north += dt * self.vn
+        self.east += dt * self.ve
+        self.up += dt * self.vu
+        if distance > 3.0:
+            turn = wrap_rad(math.atan2(de, dn) - self.yaw)
+            self.yaw = wrap_rad(self.yaw + max(-frame.yaw_rate * dt, min(frame.yaw_rate * dt, turn)))
+        self._lean()
+
+    def _carrot(self, target: tuple[float, float, float], north: float, east: float) -> tuple[float, float]:
+        """The way to a point on the line to the target, a little ahead of where the line is nearest."""
+        ln, le = target[0] - self._start[0], target[1] - self._start[1]
+        length = math.hypot(ln, le)
+        if length < 1e-6:
+            return target[0] - north, target[1] - east
+        along = ((north - self._start[0]) * ln + (east - self._start[1]) * le) / length
+        share = min(1.0, max(0.0, along + _LOOK_AHEAD_S * self.speed) / length)
+        return self._start[0] + share * ln - north, self._start[1] + share * le - east
+
+    def _lean(self) -> None:
+        """Thrust points where the acceleration and the drag ask for."""
+        north, east = self._an + self.airframe.drag * self.vn, self._ae + self.airframe.drag * self.ve
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        self.pitch = -math.atan2(north * cos + east * sin, _GRAVITY)
+        self.roll = math.atan2(east * cos - north * sin, _GRAVITY)

@@ -1,0 +1,242 @@
+"""A swarm of simulated vehicles on real sockets, in real time or faster, as a ground station sees many autopilots."""
+
+import queue
+import selectors
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any, Final
+
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.packets import Framer
+from gcs_plugin.links.signing import Signing
+from gcs_plugin.links.transports import Link, TcpLink, UdpLink, parse_link
+from gcs_plugin.mission.exchange import Address
+from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
+from gcs_plugin.sim.multirotor import Airframe, Chart
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.model.errors import InputError
+
+_TICK_S: Final = 0.02
+
+
+@dataclass(slots=True, eq=False)
+class _End:
+    """One link of the swarm and the vehicles behind it."""
+
+    link: Link
+    vehicles: list[SimVehicle]
+    up: Channel[bytes]
+    down: Channel[bytes]
+    packers: dict[int, Any]
+    signing: Signing | None
+    framers: dict[Any, Framer] = field(default_factory=dict)
+
+
+class SimSwarm:
+    """Runs simulated vehicles on links of their own, in a thread (`with SimSwarm(...)`) or in the caller's (`run`).
+
+    Attributes:
+        vehicles: by system id.
+        speed: vehicle seconds in a second.
+    """
+
+    def __init__(
+        self,
+        vehicles: Sequence[SimVehicle],
+        address: str,
+        *,
+        together: bool = False,
+        speed: float = 1.0,
+        up: Faults = NO_FAULTS,
+        down: Faults = NO_FAULTS,
+        key: bytes | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Open the links.
+
+        Args:
+            vehicles: the vehicles.
+            address: `udpout:HOST:PORT`, each vehicle from a port of its own to a ground station there, or
+                `tcpin:HOST:PORT`, the vehicles serving PORT, PORT + 1 and so on (0: any free ones).
+            together: all of them behind one link, as behind a router or a radio.
+            speed: vehicle seconds in a second.
+            up: faults from the ground to the vehicles, in vehicle time.
+            down: faults back.
+            key: signing key.
+            clock: real seconds.
+
+        Raises:
+            InputError: a link cannot be opened, or is of another kind.
+        """
+        self.vehicles = {vehicle.system: vehicle for vehicle in vehicles}
+        self.speed, self._clock = speed, clock
+        self._selector = selectors.DefaultSelector()
+        self._work: queue.SimpleQueue[Callable[[float], None]] = queue.SimpleQueue()
+        self._muted: dict[int, float] = {}
+        self._began = clock()
+        self._ends: list[_End] = []
+        self._by_link: dict[Link, _End] = {}
+        groups = [list(vehicles)] if together else [[vehicle] for vehicle in vehicles]
+        for number, group in enumerate(groups):
+            link = _open(address, number)
+            seeded = [Faults(f.loss, f.duplicate, f.delay_s, f.silent, f.seed + 2 * number) for f in (up, down)]
+            packers = {vehicle.system: dialect.MAVLink(None, vehicle.system, 1) for vehicle in group}
+            for packer in packers.values():
+                packer.signing.secret_key, packer.signing.sign_outgoing = key, key is not None
+            signing = Signing(key) if key else None
+            end = _End(link, group, Channel(seeded[0]), Channel(seeded[1]), packers, signing)
+            self._ends.append(end)
+            self._by_link[link] = end
+            link.open(self._selector, self._began)
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def addresses(self) -> list[str]:
+        """Where a ground station connects to vehicles that serve TCP."""
+        return [f"tcp:127.0.0.1:{end.link.port}" for end in self._ends if isinstance(end.link, TcpLink)]
+
+    @property
+    def now(self) -> float:
+        """Seconds since the vehicles' first boot."""
+        return (self._clock() - self._began) * self.speed
+
+    def reboot(self, system: int, silence_s: float = 3.0) -> None:
+        """Restart a vehicle (any thread)."""
+        self._work.put(lambda now: self.vehicles[system].reboot(now, silence_s))
+
+    def silence(self, system: int, seconds: float) -> None:
+        """Let a vehicle go on but not be heard, nor hear, for so many of its seconds (any thread)."""
+        self._work.put(lambda now: self._muted.__setitem__(system, now + seconds))
+
+    def __enter__(self) -> "SimSwarm":
+        self._thread = threading.Thread(target=self.run, args=(self._stop,), daemon=True, name="simulated swarm")
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop, and close the links."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        for end in self._ends:
+            end.link.close()
+        self._selector.close()
+
+    def run(self, stop: threading.Event, until_s: float = float("inf")) -> None:
+        """Fly until told to stop, or until so many vehicle seconds have passed."""
+        while not stop.is_set() and self.now < until_s:
+            started = self._clock()
+            self.step()
+            spare = _TICK_S / max(1.0, self.speed) - (self._clock() - started)
+            self._selector.select(max(0.0, spare))
+
+    def step(self) -> None:
+        """Take what has arrived, let time pass, and speak."""
+        now = self.now
+        while not self._work.empty():
+            self._work.get()(now)
+        for key, events in self._selector.select(0.0):
+            end = self._by_link[key.data]
+            for peer, data in end.link.receive(key.fileobj, events, self._clock()):
+                end.up.put(data, now) if end.up.faults.any else self._take(end, peer, data, now)
+        for end in self._ends:
+            for data in end.up.take(now):
+                self._take(end, None, data, now)
+            for vehicle in end.vehicles:
+                self._say(end, vehicle, vehicle.advance(now), now)
+            for raw in end.down.take(now):
+                self._put(end, raw)
+            end.link.tick(self._clock())
+
+    def _take(self, end: _End, peer: Any, data: bytes, now: float) -> None:
+        framer = end.framers.setdefault(peer, Framer())
+        for packet in framer.feed(data):
+            if end.signing is not None and not end.signing.accept(packet, time.time()):
+                continue
+            for vehicle in end.vehicles:
+                if self._muted.get(vehicle.system, 0.0) <= now:
+                    answers = vehicle.handle(packet.message, Address(packet.system, packet.component), now)
+                    self._say(end, vehicle, answers, now)
+
+    def _say(self, end: _End, vehicle: SimVehicle, messages: Sequence[Message], now: float) -> None:
+        if not messages:
+            return
+        muted = self._muted.get(vehicle.system, 0.0) > now
+        packer = end.packers[vehicle.system]
+        for message in messages:
+            if end.signing is not None:
+                packer.signing.timestamp = end.signing.next_timestamp(time.time())
+            raw = message.pack(packer)
+            packer.seq = (packer.seq + 1) & 0xFF
+            if muted:
+                continue
+            if end.down.faults.any:
+                end.down.put(raw, now)
+            else:
+                self._put(end, raw)
+
+    def _put(self, end: _End, raw: bytes) -> None:
+        for peer in end.link.greet():
+            end.link.send(peer, raw)
+
+
+def _open(address: str, number: int) -> Link:
+    """The link of the vehicle with this number."""
+    kind, _, rest = address.partition(":")
+    if kind == "tcpin" and number:
+        host, _, port = rest.rpartition(":")
+        address = f"{kind}:{host}:{int(port) + number if int(port) else 0}"
+    link = parse_link(address)
+    serves = isinstance(link, TcpLink) and kind == "tcpin"
+    if not serves and not (isinstance(link, UdpLink) and kind == "udpout"):
+        link.close()
+        raise InputError(
+            f"simulated vehicles speak on udpout:HOST:PORT or serve on tcpin:HOST:PORT, not on '{address}'"
+        )
+    return link
+
+
+def make_swarm(
+    count: int,
+    *,
+    autopilots: Sequence[Autopilot] = (Autopilot.ARDUPILOT,),
+    home: tuple[float, float, float] = (47.397742, 8.545594, 488.0),
+    spacing_m: float = 5.0,
+    airframe: Airframe | None = None,
+    seed: int = 0,
+    boot_utc_s: float | None = None,
+    **options: Any,
+) -> list[SimVehicle]:
+    """Vehicles 1 to count, standing in rows of ten beside home.
+
+    Args:
+        count: how many, up to 250.
+        autopilots: dialects, taken in turn.
+        home: latitude, longitude (degrees), altitude (metres) of the first.
+        spacing_m: distance between neighbours.
+        airframe: what they can do.
+        seed: varies their receivers' errors and, a little, their headings.
+        boot_utc_s: UTC of their boot; now unless said.
+        options: more of SimVehicle.
+    """
+    if not 1 <= count <= 250:
+        raise InputError(f"{count} simulated vehicles are not possible; choose 1 to 250")
+    chart, random = Chart(*home), Random(seed)
+    utc = time.time() if boot_utc_s is None else boot_utc_s
+    swarm = []
+    for number in range(count):
+        lat, lon = chart.to_degrees(spacing_m * (number // 10), spacing_m * (number % 10))
+        vehicle = SimVehicle(
+            number + 1, autopilots[number % len(autopilots)], (lat, lon, home[2]), airframe or Airframe(),
+            boot_utc_s=utc, seed=seed, **options,
+        )  # fmt: skip
+        vehicle.flight.motion.yaw = random.uniform(-0.3, 0.3)
+        swarm.append(vehicle)
+    return swarm

@@ -1,0 +1,359 @@
+"""A simulated vehicle: a small autopilot that takes and gives MAVLink messages, in a time of its own.
+
+ArduPilot's dialect sends heartbeats only until it is asked for more; PX4's sends 50 Hz of position and attitude as soon
+as a ground station is there. Both answer commands and missions as measured (docs/vehicles.md).
+"""
+
+import heapq
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.flight_modes import modes_of
+from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
+from gcs_plugin.sim.mission_flight import Exposure, Flight, Landed, State
+from gcs_plugin.sim.mission_store import MissionStore
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
+
+_OK, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = (
+    int(dialect.MAV_RESULT_ACCEPTED), int(dialect.MAV_RESULT_TEMPORARILY_REJECTED), int(dialect.MAV_RESULT_DENIED),
+    int(dialect.MAV_RESULT_UNSUPPORTED), int(dialect.MAV_RESULT_FAILED),
+)  # fmt: skip
+_HEARTBEAT: Final = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
+_POSITION: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+_ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
+_CURRENT: Final = int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT)
+_PX4_DEFAULTS: Final = {_POSITION: 50.0, _ATTITUDE: 50.0, _CURRENT: 1.0, 245: 5.0, 1: 1.0, 24: 1.0, 2: 1.0}
+_HOME: Final = (47.397742, 8.545594, 488.0)
+
+
+@dataclass(slots=True)
+class SimVehicle:
+    """One simulated vehicle; drive it with `handle` and `advance`, in seconds since its boot.
+
+    Attributes:
+        system: system id.
+        autopilot: dialect.
+        home: latitude, longitude (degrees), altitude (metres).
+        airframe: what it can do.
+        boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
+        ready_s: when its position is good enough to arm.
+        seed: of its receiver's errors.
+        on_exposure: called at each picture.
+    """
+
+    system: int
+    autopilot: Autopilot = Autopilot.ARDUPILOT
+    home: tuple[float, float, float] = _HOME
+    airframe: Airframe = field(default_factory=Airframe)
+    boot_utc_s: float = 1_700_000_000.0
+    ready_s: float = 0.0
+    seed: int = 0
+    on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
+    flight: Flight = field(init=False)
+    store: MissionStore = field(init=False)
+    reboots: int = field(default=0, init=False)
+    _now: float = field(default=0.0, init=False)
+    _booted: float = field(default=0.0, init=False)
+    _off_until: float = field(default=-1.0, init=False)
+    _stepped: float = field(default=0.0, init=False)
+    _rates: dict[int, float] = field(default_factory=dict, init=False)
+    _due: list[tuple[float, int]] = field(default_factory=list, init=False)
+    _greeted: bool = field(default=False, init=False)
+    _photos_sent: int = field(default=0, init=False)
+    _told: tuple[bool, int] = field(default=(False, 0), init=False)
+
+    def __post_init__(self) -> None:
+        """Stand at home with an empty store."""
+        home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
+        items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
+        self.store = MissionStore(self.autopilot, home, items)
+        chart = Chart(*self.home)
+        modes = modes_of(self.autopilot, dialect.MAV_TYPE_QUADROTOR)
+        self.flight = Flight.make(self.autopilot, modes, self.store, chart, self.airframe, self.seed + self.system)
+        self._boot(0.0)
+
+    # --- for tests and cameras ---
+
+    @property
+    def exposures(self) -> list[Exposure]:
+        """All pictures so far."""
+        return self.flight.exposures
+
+    @property
+    def off(self) -> bool:
+        """True while it restarts."""
+        return self._now < self._off_until
+
+    def pose_at(self, time_s: float) -> Pose:
+        """Where it truly was at a time since boot, in the last ten minutes of flight."""
+        return self.flight.motion.pose_at(time_s)
+
+    def utc_s(self, time_s: float) -> float:
+        """A time since boot as UTC epoch seconds on its clock."""
+        return self.boot_utc_s + time_s
+
+    def reboot(self, now: float, silence_s: float = 3.0) -> None:
+        """Restart: silent for a while, all but the stored mission forgotten."""
+        self._off_until = now + silence_s
+        self.reboots += 1
+        self.store.rebooted()
+        flight = self.flight
+        flight.disarm()
+        flight.mode = flight.modes.hold if self.autopilot is Autopilot.PX4 else 0
+        flight.seq, flight.paused = 0, False
+        flight.state = State.NOT_STARTED if len(self.store.items) > 1 else State.NONE
+        self._boot(now + silence_s)
+
+    def _boot(self, at: float) -> None:
+        self._booted, self._greeted = at, False
+        self._rates = {_HEARTBEAT: 1.0}
+        self._due = [(at, _HEARTBEAT)]
+
+    # --- messages in ---
+
+    def handle(self, message: Message, sender: Address, now: float) -> list[Message]:
+        """Take a message that is meant for this vehicle or for all; returns the answers."""
+        self._now = max(self._now, now)
+        if self.off or getattr(message, "target_system", self.system) not in (0, self.system):
+            return []
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            if not self._greeted and self.autopilot is Autopilot.PX4:
+                for number, hz in _PX4_DEFAULTS.items():
+                    self._stream(number, hz)
+            self._greeted = True
+            return []
+        if kind.startswith("MISSION_") and kind != "MISSION_SET_CURRENT":
+            return self.store.feed(message, sender, now)
+        if kind == "MISSION_SET_CURRENT":
+            self.flight.set_current(int(message.seq))
+        if kind in ("COMMAND_LONG", "COMMAND_INT"):
+            result = self._command(message)
+            texts = self._texts()
+            ack = dialect.MAVLink_command_ack_message(message.command, result, 0, 0, sender.system, sender.component)
+            return [*texts, ack, *self._change()]
+        return []
+
+    def _command(self, message: Message) -> int:
+        flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3
+        match message.command:
+            case dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+                if int(p1) not in _MAKERS:
+                    return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED
+                self._stream(int(p1), 1e6 / p2 if p2 > 0 else 0.0)
+                return _OK
+            case dialect.MAV_CMD_DO_SET_MODE:
+                px4 = self.autopilot is Autopilot.PX4
+                flight.set_mode((int(p2) << 16) | (int(p3) << 24) if px4 else int(p2))
+                return _OK
+            case dialect.MAV_CMD_COMPONENT_ARM_DISARM:
+                return self._arm(bool(p1))
+            case dialect.MAV_CMD_MISSION_START:
+                why = flight.start_mission()
+                flight.texts += [why] if why else []
+                return (_FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED) if why else _OK
+            case dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+                flight.set_mode(flight.modes.rtl)
+                return _OK
+            case dialect.MAV_CMD_DO_PAUSE_CONTINUE:
+                if self.autopilot is Autopilot.PX4:
+                    return _UNSUPPORTED
+                return _OK if flight.pause(go_on=bool(p1)) else _FAILED
+            case dialect.MAV_CMD_DO_SET_MISSION_CURRENT:
+                return _OK if flight.set_current(int(p1)) else _DENIED
+        return _UNSUPPORTED
+
+    def _arm(self, wanted: bool) -> int:
+        if not wanted:
+            self.flight.disarm()
+            return _OK
+        if self._now - self._booted < self.ready_s:
+            self.flight.texts.append("Arm: Need Position Estimate")
+            return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _REJECTED
+        why = self.flight.arm()
+        self.flight.texts += [why] if why else []
+        return _FAILED if why else _OK
+
+    # --- messages out ---
+
+    def advance(self, now: float) -> list[Message]:
+        """Let time pass up to now; returns what it says meanwhile."""
+        self._now = now
+        if self.off:
+            self._stepped = now
+            return []
+        messages: list[Message] = []
+        while self._stepped + STEP_S <= now + 1e-9:
+            self._stepped += STEP_S
+            self.flight.step(self._stepped - self._booted)
+            messages += self._happened()
+        messages += self.store.tick(now)
+        while self._due and self._due[0][0] <= now:
+            at, kind = heapq.heappop(self._due)
+            hz = self._rates.get(kind, 0.0)
+            if hz > 0.0:
+                heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
+                messages.append(_MAKERS[kind](self))
+        return messages
+
+    @property
+    def next_due(self) -> float:
+        """When it has something to say next, as far as is known now."""
+        return min(self._due[0][0] if self._due else math.inf, self._stepped + STEP_S)
+
+    def _stream(self, kind: int, hz: float) -> None:
+        self._rates[kind] = hz
+        self._due = [entry for entry in self._due if entry[1] != kind]
+        heapq.heapify(self._due)
+        if hz > 0.0:
+            heapq.heappush(self._due, (self._now + 1.0 / hz, kind))
+
+    def _happened(self) -> list[Message]:
+        """What must be told at once: reached items, texts, pictures, arming."""
+        flight = self.flight
+        messages: list[Message] = []
+        if flight.reached:
+            messages += [dialect.MAVLink_mission_item_reached_message(seq) for seq in flight.reached]
+            flight.reached.clear()
+        messages += self._texts()
+        for exposure in flight.exposures[self._photos_sent :]:
+            messages += self._photo(exposure)
+            if self.on_exposure is not None:
+                self.on_exposure(self, exposure)
+        self._photos_sent = len(flight.exposures)
+        return messages + self._change()
+
+    def _texts(self) -> list[Message]:
+        texts, self.flight.texts = self.flight.texts, []
+        return [dialect.MAVLink_statustext_message(_severity(text), text.encode()[:50]) for text in texts]
+
+    def _change(self) -> list[Message]:
+        """ArduPilot sends a heartbeat at once when it arms, disarms or changes its mode."""
+        state = (self.flight.armed, self.flight.mode)
+        changed, self._told = self._told != state, state
+        return [self._heartbeat()] if changed and self.autopilot is Autopilot.ARDUPILOT else []
+
+    def _photo(self, exposure: Exposure) -> list[Message]:
+        pose, utc_us = exposure.pose, int(self.utc_s(self._booted + exposure.time_s) * 1e6)
+        lat, lon = round(exposure.lat_deg * 1e7), round(exposure.lon_deg * 1e7)
+        if self.autopilot is Autopilot.ARDUPILOT:
+            roll, pitch, yaw = (math.degrees(a) for a in (pose.roll_rad, pose.pitch_rad, pose.yaw_rad))
+            return [
+                dialect.MAVLink_camera_feedback_message(
+                    utc_us,
+                    1,
+                    0,
+                    exposure.index,
+                    lat,
+                    lon,
+                    pose.alt_m,
+                    pose.height_m,
+                    roll,
+                    pitch,
+                    yaw % 360.0,
+                    0.0,
+                    0,
+                    0,
+                )
+            ]
+        boot_ms, index = int(exposure.time_s * 1e3), exposure.index
+        turn = _quaternion(pose.roll_rad, pose.pitch_rad, pose.yaw_rad)
+        alt, rel = round(pose.alt_m * 1e3), round(pose.height_m * 1e3)
+        return [
+            dialect.MAVLink_camera_trigger_message(utc_us, index),
+            dialect.MAVLink_camera_image_captured_message(boot_ms, utc_us, 1, lat, lon, alt, rel, turn, index, 1, b""),
+        ]
+
+    # --- one method for each stream ---
+
+    @property
+    def _boot_ms(self) -> int:
+        return max(0, int((self._now - self._booted) * 1e3))
+
+    def _heartbeat(self) -> Message:
+        flight = self.flight
+        kind = (
+            dialect.MAV_AUTOPILOT_ARDUPILOTMEGA if self.autopilot is Autopilot.ARDUPILOT else dialect.MAV_AUTOPILOT_PX4
+        )
+        base = 81 | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0)
+        status = dialect.MAV_STATE_STANDBY if flight.landed is Landed.ON_GROUND else dialect.MAV_STATE_ACTIVE
+        return dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_QUADROTOR, kind, base, flight.mode, status, 3)
+
+    def _position(self) -> Message:
+        motion = self.flight.motion
+        lat, lon = motion.chart.to_degrees(*motion.seen)
+        heading = round(math.degrees(motion.yaw) % 360.0 * 100.0) % 36000
+        return dialect.MAVLink_global_position_int_message(
+            self._boot_ms, round(lat * 1e7), round(lon * 1e7), round((motion.chart.alt_m + motion.up) * 1e3),
+            round(motion.up * 1e3), round(motion.vn * 100), round(motion.ve * 100), round(-motion.vu * 100), heading,
+        )  # fmt: skip
+
+    def _attitude(self) -> Message:
+        motion = self.flight.motion
+        return dialect.MAVLink_attitude_message(self._boot_ms, motion.roll, motion.pitch, motion.yaw, 0.0, 0.0, 0.0)
+
+    def _current(self) -> Message:
+        flight, count = self.flight, len(self.store.items)
+        total = count - 1 if self.autopilot is Autopilot.ARDUPILOT else count
+        mode = 1 if flight.mode == flight.modes.mission else 2
+        return dialect.MAVLink_mission_current_message(flight.seq, max(0, total), int(flight.state), mode)
+
+    def _extended(self) -> Message:
+        return dialect.MAVLink_extended_sys_state_message(0, int(self.flight.landed))
+
+    def _system_time(self) -> Message:
+        return dialect.MAVLink_system_time_message(int(self.utc_s(self._now) * 1e6), self._boot_ms)
+
+    def _gps(self) -> Message:
+        motion = self.flight.motion
+        lat, lon = motion.chart.to_degrees(*motion.seen)
+        return dialect.MAVLink_gps_raw_int_message(
+            int((self._now - self._booted) * 1e6), 3, round(lat * 1e7), round(lon * 1e7),
+            round((motion.chart.alt_m + motion.up) * 1e3), 80, 120, round(math.hypot(motion.vn, motion.ve) * 100),
+            65535, 14,
+        )  # fmt: skip
+
+    def _power(self) -> Message:
+        left = max(0, 100 - int((self._now - self._booted) / 18.0))
+        return dialect.MAVLink_sys_status_message(0, 0, 0, 250, 15800, 1200, left, 0, 0, 0, 0, 0, 0)
+
+    def _home(self) -> Message:
+        lat, lon, alt = self.home
+        return dialect.MAVLink_home_position_message(
+            round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
+        )
+
+
+_MAKERS: Final = {
+    _HEARTBEAT: SimVehicle._heartbeat,
+    _POSITION: SimVehicle._position,
+    _ATTITUDE: SimVehicle._attitude,
+    _CURRENT: SimVehicle._current,
+    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): SimVehicle._extended,
+    int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): SimVehicle._system_time,
+    int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): SimVehicle._gps,
+    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): SimVehicle._power,
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): SimVehicle._home,
+}
+
+
+def _severity(text: str) -> int:
+    bad = text.startswith(("Arm:", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
+    return int(dialect.MAV_SEVERITY_CRITICAL if bad else dialect.MAV_SEVERITY_INFO)
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
+    """Rotation from north-east-down to the airframe, w first."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]

@@ -1,0 +1,205 @@
+"""The output folder of a run, and what an interrupted run left there for the next one to go on from."""
+
+import contextlib
+import hashlib
+import os
+import pickle
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any, Generic, TypeVar
+
+from orthoswarm import __version__
+from orthoswarm.model.atomic_file import disk_error, written_whole
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Frame
+
+Result = TypeVar("Result")
+
+VIDEO = "video"
+"""Sub-folder of `.work` for pictures that were taken out of videos."""
+
+
+def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
+    """What a run is made of: pictures (name, size, date, fix), options, other files (map, heights) by size and date.
+
+    A run with another key starts afresh.
+    """
+    digest = hashlib.sha256(f"{__version__} {options!r}".encode())
+    for file in files:
+        with contextlib.suppress(OSError):
+            digest.update(f"{file and (file.stat().st_size, file.stat().st_mtime_ns)}".encode())
+    for frame in frames:
+        with contextlib.suppress(OSError):
+            stat = frame.path.stat()
+            # Pictures of videos are taken out anew each time.
+            digest.update(f"{stat.st_size} {0 if '#' in frame.image else stat.st_mtime_ns}".encode())
+        digest.update(repr((frame.image, frame.vehicle, frame.time_s, frame.fix, frame.fov_hint_rad)).encode())
+    return digest.hexdigest()
+
+
+class Workspace:
+    """An output folder that one run writes to at a time.
+
+    Intermediate results lie in its sub-folder `.work` until the run is complete. Used as a context, a run that failed
+    before it had anything to go on from (by refused input, for instance) leaves no `.work` and no folder that it made.
+
+    Attributes:
+        out: the output folder; made if absent.
+
+    Raises:
+        InputError: if another run is writing there, or it is no folder.
+        OrthoSwarmError: if it cannot be written.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self._work = out / ".work"
+        self._afresh = not self._work.exists()
+        self._missing = missing(out)
+        if out.exists() and not out.is_dir():
+            raise InputError(f"{out} is a file; choose a folder for --out")
+        try:
+            self._work.mkdir(parents=True, exist_ok=True)
+            self._lock: IO[bytes] | None = (self._work / "lock").open("ab")
+        except OSError as error:
+            raise disk_error(error, out) from None
+        if not _try_lock(self._lock):
+            self._lock.close()
+            raise InputError(f"another run is writing to {out}; wait for it or choose another folder")
+
+    def begin(self, key: str) -> bool:
+        """Get ready for a run with a key; True if results of an interrupted one with the same key are there."""
+        for part in self.out.glob(".*.part*"):  # of a run that was killed
+            _remove(part)
+        marker = self._work / "key"
+        with contextlib.suppress(OSError):
+            if marker.read_text() == key:
+                return any(self._work.glob("*.pickle"))
+        for entry in self._work.iterdir():
+            if entry.name not in ("lock", VIDEO):
+                _remove(entry)
+        with written_whole(marker) as part:
+            part.write_text(key)
+        return False
+
+    def recall(self, name: str) -> Any:
+        """What an earlier run remembered under a name; None if nothing usable."""
+        try:
+            return pickle.loads((self._work / f"{name}.pickle").read_bytes())
+        except Exception:  # damaged or of another version: do it again
+            return None
+
+    def remember(self, name: str, value: Any) -> None:
+        """Keep a result for a later run.
+
+        Raises:
+            OrthoSwarmError: if the disk is full.
+        """
+        with written_whole(self._work / f"{name}.pickle") as part, part.open("wb") as file:
+            pickle.dump(value, file, pickle.HIGHEST_PROTOCOL)
+
+    def scratch(self, name: str) -> Path:
+        """An empty sub-folder of `.work`."""
+        path = self._work / "scratch" / name
+        _remove(path)
+        try:
+            path.mkdir(parents=True)
+        except OSError as error:
+            raise disk_error(error, path) from None
+        return path
+
+    def clear_scratch(self) -> None:
+        """Remove what cannot be gone on from."""
+        _remove(self._work / "scratch")
+
+    def remembering(self, name: str, run: Callable[..., Iterable[Result]]) -> "RememberingRun[Result]":
+        """A `run` (function, items) that keeps each result, and asks for none that is there already."""
+        return RememberingRun(self, name, run)
+
+    def complete(self) -> None:
+        """Remove all intermediate results: the run is done."""
+        self.close()
+        _remove(self._work)
+
+    def close(self) -> None:
+        """Let another run write to the folder; what was remembered stays."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> "Workspace":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.clear_scratch()
+        self.close()
+        failed = kind is not None and issubclass(kind, Exception)  # and not interrupted
+        if failed and self._afresh and not any(self._work.glob("*.pickle")):
+            _remove(self._work)
+            unmake(self._missing)
+
+
+class RememberingRun(Generic[Result]):
+    """See Workspace.remembering. Calls are told apart by their order, which is the same in every run."""
+
+    def __init__(self, workspace: Workspace, name: str, run: Callable[..., Iterable[Result]]) -> None:
+        self._workspace, self._name, self._run = workspace, name, run
+        self._calls = 0
+
+    def __call__(self, function: Callable[[Any], Result], items: Sequence[Any], /) -> Iterator[Result]:
+        """Yield function(item) for each item, in order."""
+        self._calls += 1
+        return self._results(self._calls, function, items)
+
+    def _results(self, call: int, function: Callable[[Any], Result], items: Sequence[Any]) -> Iterator[Result]:
+        names = [f"{self._name}-{call}-{i}" for i in range(len(items))]
+        known = [self._workspace.recall(name) for name in names]
+        missing = [i for i, value in enumerate(known) if value is None]
+        fresh = iter(self._run(function, [items[i] for i in missing]))
+        for i, name in enumerate(names):
+            if known[i] is not None:
+                yield known[i]
+                known[i] = None
+                continue
+            value = next(fresh)
+            self._workspace.remember(name, value)
+            yield value
+
+
+def missing(folder: Path) -> list[Path]:
+    """The folders that have to be made for one to be there: itself and its parents, the innermost first."""
+    return [p for p in (folder, *folder.parents) if not p.exists()]
+
+
+def unmake(folders: Iterable[Path]) -> None:
+    """Remove folders that nothing came into, the innermost first."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _try_lock(file: IO[bytes]) -> bool:
+    """Take a lock that goes with the process, however it ends."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+        else:
+            import fcntl
+
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        return not isinstance(error, PermissionError)  # a file system without locks
+    return True
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()

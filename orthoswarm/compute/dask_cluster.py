@@ -1,0 +1,209 @@
+"""Work on a Dask cluster (paper III.E): the second implementation of `workers.Workers`.
+
+Tasks and results travel over the network; pictures, map and output folder do not: every worker must see them under the
+same paths, through a shared folder (docs/cluster.md). A task whose worker dies is done again by another one.
+"""
+
+import os
+import pickle
+import re
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+from uuid import uuid4
+
+from orthoswarm import __version__
+from orthoswarm.compute.workers import Usage, peak_rss_mb, single_threaded
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+CONNECT_S = 20.0
+_QUEUE_PER_WORKER = 3
+_POLL_S = 1.0
+_PATIENCE_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """A pickled result, or the pickled exception, with what its process has used since it started."""
+
+    value: bytes
+    raised: bool
+    process: str
+    cpu_s: float
+    rss_mb: float
+
+
+class Cluster:
+    """The workers of a Dask scheduler; each works on one item at a time.
+
+    Args:
+        address: of the scheduler, for example tcp://192.168.1.10:8786.
+        shared: files and folders that every worker must see under the same path.
+        patience_s: how long to wait for a worker to come back when all are gone.
+
+    Raises:
+        InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
+            does not see a shared path or that uses several threads for sums.
+    """
+
+    def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float = _PATIENCE_S) -> None:
+        self._client = _connect(address)
+        self._patience_s = patience_s
+        self._cpu_s: dict[str, float] = {}
+        self._rss_mb: dict[str, float] = {}
+        self._first_cpu_s: dict[str, float] = {}
+        try:
+            self._check(address, [p.absolute() for p in shared])
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def count(self) -> int:
+        """How many items are worked on at once: the workers that are there now."""
+        return max(1, len(self._workers()))
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """See Workers."""
+        source = iter(items)
+        queue: deque[Any] = deque()
+        try:
+            while True:
+                wanted = _QUEUE_PER_WORKER * self.count
+                while len(queue) < wanted:
+                    for item in source:
+                        queue.append(self._submit(function, item))
+                        break
+                    else:
+                        break
+                if not queue:
+                    return
+                yield self._take(queue.popleft())
+        finally:
+            for future in queue:
+                future.cancel()
+
+    def usage(self) -> Usage:
+        """See Workers."""
+        cpu = sum(self._cpu_s.values()) - sum(self._first_cpu_s.values())
+        return Usage(cpu, sum(self._rss_mb.values()))
+
+    def close(self) -> None:
+        """Leave the cluster; its workers stay for others."""
+        self._client.close(timeout=5)
+
+    def __enter__(self) -> "Cluster":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _workers(self) -> dict[str, Any]:
+        known: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        return known
+
+    def _submit(self, function: Callable[[Any], Any], item: Any) -> Any:
+        payload = pickle.dumps((function, item), pickle.HIGHEST_PROTOCOL)
+        # A name of its own, so that equal items are worked on each, as in Processes.
+        return self._client.submit(_work, payload, key=f"orthoswarm-{uuid4().hex}", pure=False)
+
+    def _take(self, future: Any) -> Any:
+        from distributed import KilledWorker
+        from distributed import TimeoutError as Late
+
+        alone_since = None
+        while True:
+            try:
+                outcome: _Outcome = future.result(timeout=_POLL_S)
+                break
+            except Late:
+                if self._workers():
+                    alone_since = None
+                    continue
+                now = time.monotonic()
+                alone_since = alone_since or now
+                if now - alone_since > self._patience_s:
+                    raise OrthoSwarmError(
+                        "all workers of the cluster are gone; start some and run the same command again to go on"
+                    ) from None
+            except KilledWorker:
+                raise OrthoSwarmError(
+                    "several workers died at the same task, mostly for lack of memory; give workers more memory"
+                ) from None
+        self._cpu_s[outcome.process] = max(outcome.cpu_s, self._cpu_s.get(outcome.process, 0.0))
+        self._rss_mb[outcome.process] = max(outcome.rss_mb, self._rss_mb.get(outcome.process, 0.0))
+        value = pickle.loads(outcome.value)
+        if outcome.raised:
+            raise value
+        return value
+
+    def _check(self, address: str, shared: list[Path]) -> None:
+        if not self._workers():
+            raise InputError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
+        for worker, found in self._client.run(_inspect, [str(p) for p in shared]).items():
+            version, missing, process, cpu_s, alone = found
+            if not alone:  # sums over several threads differ in their last digits, and threads fight over the cores
+                raise InputError(
+                    f"the worker {worker} uses several threads for sums; start it without --no-nanny, or with "
+                    "OMP_NUM_THREADS=1 in its environment"
+                )
+            if version != __version__:
+                raise InputError(
+                    f"the worker {worker} has OrthoSwarm {version} and not {__version__}; install the same everywhere"
+                )
+            if missing:
+                raise InputError(
+                    f"the worker {worker} does not see {missing[0]}; share it under the same path on all machines"
+                )
+            self._first_cpu_s[process] = cpu_s
+            self._cpu_s[process] = cpu_s
+
+
+def _connect(address: str) -> Any:
+    try:
+        import dask
+        from distributed import Client
+    except ImportError:
+        raise InputError("a cluster needs dask.distributed; pip install orthoswarm[cluster]") from None
+    if not re.search(r":\d+/?$", address):  # Dask would complain in its own words, and hang on leaving
+        raise InputError(f"{address} is no address of a Dask scheduler; give one like tcp://192.168.1.10:8786")
+    # States of vehicles are megabytes large; they have to travel, and a warning for each helps nobody.
+    dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:  # no route, wrong form
+        raise InputError(f"there is no Dask scheduler at {address} ({_short(error)}); check the address") from None
+
+
+def _short(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+def _work(payload: bytes) -> _Outcome:
+    """Runs on a worker."""
+    single_threaded()
+    function, item = pickle.loads(payload)
+    raised = False
+    try:
+        value = pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)
+    except Exception as error:  # told at its item's turn, as by Processes; Dask would try some again
+        value, raised = pickle.dumps(error, pickle.HIGHEST_PROTOCOL), True
+    return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())
+
+
+def _inspect(shared: list[str]) -> tuple[str, list[str], str, float, bool]:
+    """Runs on a worker: version, unseen paths, who it is, CPU seconds so far, whether sums keep to one thread."""
+    missing = [p for p in shared if not os.path.exists(p)]
+    return __version__, missing, _process(), time.process_time(), os.environ.get("OMP_NUM_THREADS") == "1"
+
+
+def _process() -> str:
+    return f"{socket.gethostname()}:{os.getpid()}"

@@ -1,0 +1,281 @@
+"""Where work runs: in this process, or in several processes of this machine (paper III.E).
+
+Work is a function of one item. Results come back in the order of the items, so that nothing depends on the number
+of workers or on which of them was faster. Every item is pickled, also for work in this process, so that a function
+that changes what it was given changes the same copy everywhere: hand over paths and small arrays.
+"""
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Generic, Protocol, TypeVar
+
+from orthoswarm.model.errors import OrthoSwarmError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_LONG_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What the other processes have used so far.
+
+    Attributes:
+        cpu_s: their CPU seconds (user and system).
+        peak_rss_mb: sum of their largest resident sizes, megabytes.
+    """
+
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+
+
+class Workers(Protocol):
+    """The seam: something that maps a function over items."""
+
+    @property
+    def count(self) -> int:
+        """How many items are worked on at once."""
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Results in the order of the items; items are taken as workers become free.
+
+        Raises:
+            OrthoSwarmError: if a worker died. What the function raises is raised at its item's turn.
+        """
+
+    def usage(self) -> Usage:
+        """What the workers outside this process have used since they started."""
+
+    def close(self) -> None:
+        """Stop the workers; what they are at is given up."""
+
+
+class Serial:
+    """Everything in this process, one item after the other."""
+
+    count = 1
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """See Workers."""
+        return (_alone(function, item) for item in items)
+
+    def usage(self) -> Usage:
+        """See Workers."""
+        return Usage()
+
+    def close(self) -> None:
+        """See Workers."""
+
+
+class Processes:
+    """Several processes on this machine; the calling process is one of them.
+
+    The others start with the first map. They are spawned, not forked: forking a process with threads can hang.
+
+    Args:
+        count: how many items are worked on at once, the calling process included (2 starts one more process).
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = max(1, count)
+        self._pool: ProcessPoolExecutor | None = None
+        self._cpu_s: dict[int, float] = {}
+        self._rss_mb: dict[int, float] = {}
+
+    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """See Workers."""
+        if self.count == 1:
+            yield from (_alone(function, item) for item in items)
+            return
+        source = iter(items)
+        queue: deque[Future[_Outcome[Result]]] = deque()
+        try:
+            while True:
+                while sum(not f.done() for f in queue) < self.count and len(queue) < 4 * self.count:
+                    for item in source:
+                        queue.append(self._started().submit(_measured, function, item))
+                        break
+                    else:
+                        break
+                if not queue:
+                    return
+                if not queue[0].done() and len(queue) < 4 * self.count:
+                    for item in source:  # rather than wait, do one here
+                        queue.append(_here(function, item))
+                        break
+                    else:
+                        yield self._account(queue.popleft())
+                    continue
+                yield self._account(queue.popleft())
+        finally:
+            for future in queue:
+                future.cancel()
+
+    def usage(self) -> Usage:
+        """See Workers."""
+        return Usage(sum(self._cpu_s.values()), sum(self._rss_mb.values()))
+
+    def close(self) -> None:
+        """See Workers."""
+        if self._pool is not None:
+            children = list(getattr(self._pool, "_processes", None) or {})
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                if process.pid in children:
+                    process.terminate()
+            self._pool = None
+
+    def __enter__(self) -> "Processes":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            single_threaded()
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.count - 1, mp_context=context, initializer=_prepare)
+        return self._pool
+
+    def _account(self, future: "Future[_Outcome[Result]]") -> Result:
+        try:
+            outcome = future.result()
+        except BrokenProcessPool:
+            self.close()
+            raise OrthoSwarmError(
+                "a worker process was stopped from outside, mostly for lack of memory; run again with fewer --workers"
+            ) from None
+        if outcome.pid != os.getpid():
+            self._cpu_s[outcome.pid] = max(outcome.cpu_s, self._cpu_s.get(outcome.pid, 0.0))
+            self._rss_mb[outcome.pid] = max(outcome.rss_mb, self._rss_mb.get(outcome.pid, 0.0))
+        return outcome.value
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome(Generic[Result]):
+    """A result with what its process has used since it started."""
+
+    value: Result
+    pid: int
+    cpu_s: float
+    rss_mb: float
+
+
+def _measured(function: Callable[[Item], Result], item: Item) -> _Outcome[Result]:
+    value = _tidily(function, item)
+    return _Outcome(value, os.getpid(), time.process_time(), peak_rss_mb())
+
+
+def _tidily(function: Callable[[Item], Result], item: Item) -> Result:
+    """Apply a function; what a long one leaves unused goes back to the system, or it piles up over a hundred tasks."""
+    begun = time.process_time()
+    value = function(item)
+    if time.process_time() - begun > _LONG_S:
+        trim_memory()
+    return value
+
+
+def trim_memory() -> None:
+    """Give unused memory of the C library's heap back to the system, where there is a call for it (glibc)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _own(item: Item) -> Item:
+    """A copy that nobody else sees, as another process would get it."""
+    copy: Item = pickle.loads(pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
+    return copy
+
+
+def _alone(function: Callable[[Item], Result], item: Item) -> Result:
+    """Apply a function here as another process would: nothing is shared, and what is not pickled is let go."""
+    return _own(_tidily(function, _own(item)))
+
+
+def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Result]]":
+    future: Future[_Outcome[Result]] = Future()
+    try:
+        future.set_result(_Outcome(_alone(function, item), os.getpid(), 0.0, 0.0))
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
+
+def _prepare() -> None:
+    """First thing in a new process: the parent handles Ctrl-C, and threads would only fight over the cores."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def end_with_parent() -> None:
+    """End this process as soon as the one that started it is gone, killed or not; a pool's workers would wait on."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def follow() -> None:
+        parent.join()  # also wakes up when it was killed
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def workers(count: int | None = None) -> Serial | Processes:
+    """Workers for a number of items at once; None takes one for each core."""
+    count = count or cores()
+    return Serial() if count == 1 else Processes(count)
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def single_threaded() -> None:
+    """Keep BLAS, OpenMP and OpenCV to one thread each; call it before numpy is imported.
+
+    Small matching calls take ten times as long otherwise. Settings that the user made in the environment stay.
+    """
+    for name in _THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+
+
+def peak_rss_mb() -> float:
+    """Largest resident size of this process so far, megabytes (10^6 bytes); 0 where the system does not tell."""
+    try:
+        # Not ru_maxrss: that is inherited from the process that started this one.
+        with open("/proc/self/status", encoding="ascii", errors="replace") as status:
+            for line in status:
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) * 1024 / 1e6
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(largest if sys.platform == "darwin" else largest * 1024) / 1e6

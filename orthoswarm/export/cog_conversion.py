@@ -1,0 +1,45 @@
+"""A COG in another coordinate system, or compressed as JPEG with a mask, by GDAL's own writer."""
+
+from pathlib import Path
+from typing import Any
+
+from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.model.errors import InputError
+
+
+def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quality: int | None = None) -> None:
+    """Write a raster as a COG.
+
+    Args:
+        source: a georeferenced RGBA raster.
+        path: the file; appears when it is complete.
+        epsg: its coordinate system; None keeps the source's.
+        jpeg_quality: 1 to 100 for JPEG with a mask instead of the alpha band; None is lossless.
+
+    Raises:
+        InputError: if the raster cannot be read or brought to the coordinate system.
+        OrthoSwarmError: if the disk is full.
+    """
+    import rasterio
+    import rasterio.shutil
+    from rasterio.errors import CRSError, RasterioError
+    from rasterio.vrt import WarpedVRT
+
+    settings: dict[str, Any] = {
+        "driver": "COG",
+        "bigtiff": "IF_SAFER",  # by default GDAL never makes one of a compressed picture, and fails at 4 GB
+        "compress": "DEFLATE",
+        "predictor": 2,
+        "overview_resampling": "AVERAGE",
+    }
+    if jpeg_quality is not None:
+        settings |= {"compress": "JPEG", "quality": jpeg_quality}
+        settings.pop("predictor")
+    try:
+        with rasterio.open(source) as raster, written_whole(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
+            crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
+            with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
+                rasterio.shutil.copy(raster if crs == raster.crs else vrt, part, **settings)
+    except (CRSError, RasterioError) as error:
+        text = str(error).splitlines()[0]
+        raise InputError(f"{source.name} cannot be written as asked ({text}); check --epsg") from None

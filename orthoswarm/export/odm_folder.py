@@ -1,0 +1,102 @@
+"""A folder for OpenDroneMap: the pictures, and a geo.txt with the refined positions and angles."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from orthoswarm.model.atomic_file import disk_error, written_whole
+from orthoswarm.model.errors import InputError
+
+
+def write_odm(
+    rows: Sequence[Mapping[str, Any]],
+    find: Callable[[Mapping[str, Any]], Path | None],
+    folder: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """Write `images/` and `geo.txt`.
+
+    geo.txt has longitude, latitude, altitude, yaw from true north, pitch (0 looks straight down, as ODM counts),
+    roll, and one sigma of the position. Where the photos told no altitude, the height over the takeoff level stands in.
+
+    Args:
+        rows: lines of frames.jsonl.
+        find: from a row to its picture file, None where it is gone.
+        folder: appears when it is complete; an existing one is replaced.
+        progress: called with pictures done and pictures in all.
+
+    Returns:
+        Images that were left out because their files are gone.
+
+    Raises:
+        InputError: if no picture was placed or found.
+        OrthoSwarmError: if the disk is full.
+    """
+    placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
+    if not placed:
+        raise InputError("the map has no placed picture to export; make it again")
+    names = unique_names([str(row["image"]) for row in placed])
+    gone: list[str] = []
+    lines = ["EPSG:4326"]
+    with written_whole(folder) as part:
+        (part / "images").mkdir(parents=True)
+        for done, row in enumerate(placed, 1):
+            file = find(row)
+            if file is None:
+                gone.append(str(row["image"]))
+            else:
+                name = names[str(row["image"])]
+                _link(file, part / "images" / name)
+                lines.append(_line(name, row))
+            if progress is not None:
+                progress(done, len(placed))
+        if len(lines) == 1:
+            raise InputError("none of the pictures is where it was when the map was made; give --images FOLDER")
+        (part / "geo.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return gone
+
+
+def _line(name: str, row: Mapping[str, Any]) -> str:
+    camera = row["camera"]
+    sigma = max(float(row["sigma_m"]), 0.01)
+    altitude = float(camera.get("altitude_m", camera["height_m"]))
+    return (
+        f"{name} {camera['lon_deg']:.9f} {camera['lat_deg']:.9f} {altitude:.3f} "
+        f"{camera['yaw_deg']:.4f} {camera['pitch_deg'] + 90.0:.4f} {camera['roll_deg']:.4f} {sigma:.3f} {2 * sigma:.3f}"
+    )
+
+
+def unique_names(images: Iterable[str]) -> dict[str, str]:
+    """Plain file names without blanks for images of several folders (`v1/a b.jpg` -> `v1_a_b.jpg`), all different."""
+    images = list(images)
+    heads = [image.split("/")[-1] for image in images]
+    repeated = len(set(heads)) < len(heads)
+    out: dict[str, str] = {}
+    taken: set[str] = set()
+    for image, head in zip(images, heads, strict=True):
+        plain = re.sub(r"[^A-Za-z0-9._-]", "_", image if repeated else head)
+        stem, suffix = os.path.splitext(plain)
+        if not suffix or not re.fullmatch(r"\.(jpe?g|png|tiff?)", suffix.lower()):
+            stem, suffix = plain, ".jpg"
+        name, number = stem + suffix, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{stem}_{number}{suffix}"
+        taken.add(name.lower())
+        out[image] = name
+    return out
+
+
+def _link(file: Path, target: Path) -> None:
+    """The same file under another name, without a copy where the file system can."""
+    try:
+        os.link(file, target)
+    except OSError:
+        try:
+            shutil.copyfile(file, target)
+        except OSError as error:
+            raise disk_error(error, target) from None

@@ -1,0 +1,253 @@
+"""What a run writes besides pictures: a line per picture (frames.jsonl), footprints, and the report's numbers."""
+
+import json
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.stage_times import Stage
+from orthoswarm.export.footprint_layer import write_footprints
+from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.model.camera import Camera, Lens, angles_from_rotation
+from orthoswarm.model.frame import Frame, Rejection
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Solution
+from orthoswarm.mosaic.footprint import footprint
+
+Array = NDArray[np.float64]
+
+
+def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[str, Any]:
+    """The line of frames.jsonl of a placed frame.
+
+    `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
+    `ground_z_m`; `camera` says where the camera was and how it looked (yaw from true north), for other programs.
+    """
+    frame, camera = placed.frame, placed.camera
+    lens = camera.lens
+    simple, to_full = simple_lens(lens)
+    h = camera_matrix(camera, ground_z_m) @ to_full @ np.linalg.inv(simple.matrix())
+    row: dict[str, Any] = {
+        "image": frame.image,
+        "vehicle": frame.vehicle,
+        "time": iso_time(frame.time_s),
+        "stage": placed.stage,
+        "epsg": grid.epsg,
+        "homography": (h / h[2, 2]).tolist(),
+    }
+    if not simple.is_pinhole or lens.cx or lens.cy:
+        row |= {"k1": simple.k1, "k2": simple.k2}
+    if max(abs(lens.cx), abs(lens.cy)) > 1e-6 or abs(lens.k3) > 1e-9:  # held at zero they come back as 1e-19
+        row |= {"cx": lens.cx, "cy": lens.cy, "k3": lens.k3}
+    row["fov_deg"] = math.degrees(lens.fov_rad)
+    row["sigma_m"] = placed.sigma_m
+    if placed.weak:
+        row["weak"] = True
+    row["camera"] = _camera_row(camera, grid)
+    return row
+
+
+def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
+    yaw, pitch, roll = angles_from_rotation(camera.rotation)
+    lat, lon = (float(v) for v in grid.to_geographic(camera.position[:2]))
+    true = math.degrees(float(yaw + grid.convergence_rad(lat, lon)))
+    return {
+        "lat_deg": lat,
+        "lon_deg": lon,
+        "height_m": float(camera.position[2]),
+        "yaw_deg": wrap_deg(true),
+        "pitch_deg": math.degrees(float(pitch)),
+        "roll_deg": math.degrees(float(roll)),
+    }
+
+
+def takeoff_altitudes(placed: Sequence[PlacedFrame]) -> dict[str, float]:
+    """Absolute altitude of each vehicle's takeoff level, from photos that tell their own; absent where none does."""
+    found: dict[str, list[float]] = {}
+    for p in placed:
+        if p.frame.fix.altitude_m is not None:
+            level = p.frame.fix.altitude_m - float(p.camera.position[2])
+            if -500.0 < level < 9000.0:
+                found.setdefault(p.frame.vehicle, []).append(level)
+    return {vehicle: statistics.median(levels) for vehicle, levels in found.items()}
+
+
+def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
+    """The 3x3 matrix from undistorted normalised coordinates (x, y, 1) to the ground plane, homogeneous."""
+    r = camera.rotation
+    drop = ground_z_m - float(camera.position[2])
+    return np.array(
+        [drop * r[0] + camera.position[0] * r[2], drop * r[1] + camera.position[1] * r[2], r[2]], dtype=np.float64
+    )
+
+
+@lru_cache(maxsize=256)
+def simple_lens(lens: Lens) -> tuple[Lens, Array]:
+    """A lens with k1 and k2 about the picture's centre alone that does nearly what a fuller one does.
+
+    Returns:
+        The lens (same focal length), and the 3x3 matrix from its normalised coordinates to those of the full one.
+    """
+    if not (lens.cx or lens.cy or lens.k3):
+        return lens, np.eye(3)
+    from scipy.optimize import least_squares
+
+    columns, rows = np.meshgrid(np.linspace(0, lens.width - 1, 17), np.linspace(0, lens.height - 1, 13))
+    pixels = np.stack([columns.ravel(), rows.ravel()], 1)
+    wanted = lens.undistort((pixels - np.array(lens.principal_point)) / lens.focal_px)
+
+    def parts(p: Array) -> tuple[Lens, Array]:
+        guess = Lens(lens.width, lens.height, lens.focal_px, p[8], p[9])
+        return guess, np.append(p[:8], 1.0).reshape(3, 3)
+
+    def misfit(p: Array) -> Array:
+        guess, matrix = parts(p)
+        xy = guess.undistort((pixels - np.array(guess.principal_point)) / guess.focal_px)
+        moved = np.c_[xy, np.ones(len(xy))] @ matrix.T
+        return np.asarray((moved[:, :2] / moved[:, 2:] - wanted).ravel() * lens.focal_px)
+
+    start = np.array([1, 0, -lens.cx / lens.focal_px, 0, 1, -lens.cy / lens.focal_px, 0, 0, lens.k1, lens.k2], float)
+    return parts(least_squares(misfit, start, method="lm").x)
+
+
+def rejection_row(rejection: Rejection, epsg: int | None) -> dict[str, Any]:
+    """The line of frames.jsonl of a picture that was left out."""
+    return {
+        "image": rejection.image,
+        "vehicle": rejection.vehicle,
+        "time": iso_time(rejection.time_s),
+        "stage": "rejected",
+        "reason": rejection.reason,
+        "epsg": epsg,
+    }
+
+
+def iso_time(time_s: float | None) -> str | None:
+    """UTC epoch seconds as ISO 8601 with Z; None if unknown or no date."""
+    if time_s is None:
+        return None
+    try:
+        text = datetime.fromtimestamp(round(time_s, 6), UTC).isoformat(timespec="microseconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+    head, _, tail = text.removesuffix("+00:00").partition(".")
+    return f"{head}.{tail[:3] if tail.endswith('000') else tail}Z"
+
+
+def write_frames(
+    out: Path, placed: Sequence[PlacedFrame], rejected: Sequence[Rejection], grid: LocalGrid, z: float
+) -> None:
+    """Write frames.jsonl and footprints.gpkg into the output folder.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    levels = takeoff_altitudes(placed)
+
+    def lines() -> Iterator[str]:  # one at a time: an area of 32,544 pictures has 60 MB of them
+        both: list[PlacedFrame | Rejection] = [*placed, *rejected]
+        for one in sorted(both, key=_image):
+            row = rejection_row(one, grid.epsg) if isinstance(one, Rejection) else frame_row(one, grid, z)
+            if "camera" in row and row["vehicle"] in levels:
+                row["camera"]["altitude_m"] = row["camera"]["height_m"] + levels[row["vehicle"]]
+            yield json.dumps(row, ensure_ascii=False) + "\n"
+
+    write_text(out / "frames.jsonl", lines())
+    outlines = ((_feature(p), footprint(p.camera, z, inset_px=-0.5)) for p in placed)
+    write_footprints(out / "footprints.gpkg", outlines, grid.epsg)
+
+
+def _feature(placed: PlacedFrame) -> dict[str, Any]:
+    """What a footprint tells about its picture."""
+    frame, fov = placed.frame, math.degrees(placed.camera.lens.fov_rad)
+    return {
+        "image": frame.image, "vehicle": frame.vehicle, "time": iso_time(frame.time_s), "stage": placed.stage,
+        "fov_deg": fov, "sigma_m": placed.sigma_m,
+    }  # fmt: skip
+
+
+def _image(one: PlacedFrame | Rejection) -> str:
+    return one.image if isinstance(one, Rejection) else one.frame.image
+
+
+def write_text(path: Path, lines: Iterable[str]) -> None:
+    """Write a text file that appears when it is complete.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    with written_whole(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(lines)
+
+
+def read_frames(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a frames.jsonl."""
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            if line.strip():
+                yield json.loads(line)
+
+
+def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -> list[dict[str, Any]]:
+    """`vehicles` of report.json: those that were refined, then those that were placed as recorded."""
+    used = Counter(p.frame.vehicle for p in placed)
+    rows: list[dict[str, Any]] = [
+        {
+            "id": s.vehicle,
+            "frames": used.pop(s.vehicle, 0),
+            "fov_deg": finite(s.fov_deg),
+            "fov_sigma_deg": finite(s.fov_sigma_deg),
+            "legs": len(s.legs),
+            "gsd_m": finite(s.gsd_m),
+        }
+        for s in solutions
+    ]
+    for vehicle, count in used.items():
+        assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
+        fov = statistics.median(assumed)
+        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None})
+    return rows
+
+
+def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
+    """`legs` of report.json."""
+    rows = [asdict(leg) for s in solutions for leg in s.legs]
+    return [row | {"confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])} for row in rows]
+
+
+def stage_row(stage: Stage) -> dict[str, Any]:
+    """One of `stages` of report.json."""
+    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
+
+
+def image_root(frames: Sequence[Frame]) -> str | None:
+    """The folder that picture names are relative to; None where they are pictures of videos."""
+    for frame in frames:
+        path = frame.path.absolute().as_posix()
+        if path.endswith("/" + frame.image):
+            return path.removesuffix("/" + frame.image) or "/"
+    return None
+
+
+def finite(value: float) -> float | None:
+    """A number that JSON can hold; None for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write one JSON document that appears when it is complete.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    write_text(path, [json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False), "\n"])

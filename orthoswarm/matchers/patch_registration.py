@@ -1,0 +1,141 @@
+"""A patch brought onto the map: matches in the prior window, MAGSAC, then rounds of CFOG tiles (paper III.D).
+
+The share of tiles that agree with the final homography says how far to trust it: on real pairs of different dates a
+share of a half or more was never wrong.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthoswarm.matchers import cfog
+from orthoswarm.matchers.matcher import Array, Floats, MapMatcher, Mask, Matches
+
+AGREE_PX = 3.0
+"""A tile agrees with a homography if it lies within this of where the homography puts it."""
+FEWEST_TILES = 12
+_COARSE_PX = 6.0
+_SEARCH = (10, 6)
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Where a patch lies in a window of the map.
+
+    Attributes:
+        homography: float64 (3, 3), patch pixel to window pixel, last element 1.
+        matches: tiles that agree. share: of all tiles with ground on both sides, those that agree.
+        rms_px: root mean square of their residuals per axis. tiles: how many tiles were tried.
+    """
+
+    homography: Array
+    matches: Matches
+    share: float
+    rms_px: float
+    tiles: int
+
+
+Keep = Callable[[Matches, Array], Mask]
+"""Which matches to keep, given them and the homography so far (outliers in height, for instance)."""
+
+
+def register(
+    patch: Floats,
+    valid: Mask,
+    window: Floats,
+    known: Mask,
+    reach: int,
+    matcher: MapMatcher,
+    keep: Keep | None = None,
+) -> Registration | None:
+    """Find a patch in a window of the map (see MapMatcher for the frames).
+
+    Returns:
+        None where no homography is found at all; else what was found, however little it is to be trusted.
+    """
+    first = matcher.match(patch, valid, window, known, reach)
+    fit = magsac(first, _COARSE_PX)
+    if fit is None or not plausible(fit, patch.shape, reach):
+        shift = robust_shift(first)
+        if shift is None:
+            return None
+        fit = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
+    own, other = cfog.features(patch, valid), cfog.features(window, known)
+    centres = cfog.tile_centres(valid)
+    inside = known_below(known, apply(fit, centres.astype(float)))
+    tried = centres[inside]
+    found = Matches.none()
+    for search in _SEARCH:
+        found = cfog.match_tiles(own, other, valid, apply(fit, tried.astype(float)), tried, search)
+        chosen = found if keep is None else found.take(keep(found, fit))
+        better = magsac(chosen, AGREE_PX)
+        if better is None or not plausible(better, patch.shape, reach):
+            return Registration(fit, Matches.none(), 0.0, float("nan"), len(tried))
+        fit = better
+    error = found.b - apply(fit, found.a)
+    agrees = np.hypot(*error.T) < AGREE_PX
+    if keep is not None:
+        agrees &= keep(found, fit)
+    share = float(agrees.sum()) / max(len(tried), 1)
+    rms = float(np.sqrt((error[agrees] ** 2).mean())) if agrees.any() else float("nan")
+    return Registration(fit, found.take(agrees), share, rms, len(tried))
+
+
+def magsac(matches: Matches, threshold_px: float) -> Array | None:
+    """Homography from a to b by MAGSAC++; None where there is none (also where OpenCV 5 throws because of it)."""
+    import cv2
+
+    if len(matches) < 8:
+        return None
+    cv2.setRNGSeed(1)
+    try:
+        found, _ = cv2.findHomography(matches.a, matches.b, cv2.USAC_MAGSAC, threshold_px, None, 5000, 0.999)
+    except cv2.error:
+        return None
+    if found is None or not np.isfinite(found).all() or abs(found[2, 2]) < 1e-12:
+        return None
+    return np.asarray(found / found[2, 2], np.float64)
+
+
+def apply(homography: Array, points: Array) -> Array:
+    """Points (N, 2) through a homography."""
+    moved = np.c_[points, np.ones(len(points))] @ homography.T
+    return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+def plausible(homography: Array, shape: tuple[int, ...], reach: int) -> bool:
+    """Whether a homography could be a correction of poses: mild scale and perspective, no corner beyond the reach."""
+    rows, cols = shape
+    corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], float)
+    depth = np.c_[corners, np.ones(4)] @ homography[2]
+    if (depth < 0.5).any() or (depth > 2.0).any():
+        return False
+    moved = apply(homography, corners)
+    if np.abs(moved - corners - reach).max() > 1.5 * reach + 0.05 * max(rows, cols):
+        return False
+    sides = np.linalg.norm(np.roll(moved, -1, 0) - moved, axis=1) / np.linalg.norm(
+        np.roll(corners, -1, 0) - corners, axis=1
+    )
+    return bool((sides > 0.8).all() and (sides < 1.25).all())
+
+
+def robust_shift(matches: Matches, width_px: float = 8.0) -> Array | None:
+    """The shift that most matches share within a width, None where fewer than 8 or a tenth of them do."""
+    if len(matches) < 8:
+        return None
+    shift = matches.b - matches.a
+    best = shift[np.argmax([np.count_nonzero(np.abs(shift - s).max(1) < width_px) for s in shift])]
+    near = np.abs(shift - best).max(1) < width_px
+    if near.sum() < max(8, 0.1 * len(shift)):
+        return None
+    return np.asarray(np.median(shift[near], axis=0))
+
+
+def known_below(known: Mask, points: Array) -> Mask:
+    """Whether the map has ground at points (column, row)."""
+    c, r = np.round(points).astype(np.int64).T
+    inside = (c >= 0) & (r >= 0) & (c < known.shape[1]) & (r < known.shape[0])
+    out = np.zeros(len(points), bool)
+    out[inside] = known[r[inside], c[inside]]
+    return out

@@ -1,0 +1,151 @@
+"""Sparse learned matchers through kornia: XFeat + LighterGlue, DISK + LightGlue, ALIKED + LightGlue.
+
+Weights are read from files of this machine (weights.py). Pictures are padded to the networks' strides instead of
+being resized or cropped, which would shift keypoints by fractions of a pixel.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+
+from orthoswarm.matchers import weight_files
+from orthoswarm.matchers.matcher import Gray, Matches, UnavailableError
+
+Kind = Literal["xfeat", "disk", "aliked"]
+_STRIDE = {"xfeat": 32, "disk": 16, "aliked": 32}
+_EXTRACTOR = {"xfeat": "xfeat", "disk": "disk", "aliked": "aliked"}
+_MATCHER = {"xfeat": "xfeat-lighterglue", "disk": "disk-lightglue", "aliked": "aliked-lightglue"}
+_DETECTION = 0.05
+
+
+def device() -> Any:
+    """The fastest device of this machine: CUDA, else the CPU."""
+    import torch
+
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def read_state(name: str) -> dict[str, Any]:
+    """The tensors of a weight file, read without running anything that the file may hold."""
+    import torch
+
+    path = weight_files.require(name)
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises anything from EOFError to UnpicklingError
+        raise UnavailableError(f"{path} is damaged ({type(error).__name__}); copy or install it again") from None
+    return state
+
+
+@lru_cache(maxsize=3)
+def extractor(kind: Kind) -> Any:
+    """A network that finds and describes keypoints, in evaluation mode, on `device()`."""
+    import kornia.feature as features
+
+    state = read_state(_EXTRACTOR[kind])
+    if kind == "xfeat":
+        model = features.XFeat()
+        model.net.load_state_dict(state)
+    elif kind == "disk":
+        model = features.DISK()
+        model.load_state_dict(state["extractor"])
+    else:
+        model = features.ALIKED()
+        model.load_state_dict(state, strict=False)
+    return model.to(device()).eval()
+
+
+@lru_cache(maxsize=3)
+def glue(kind: Kind) -> Any:
+    """The LightGlue network for a kind of keypoints, in evaluation mode, on `device()`."""
+    import kornia.feature as features
+
+    settings = {k: v for k, v in features.LightGlue.features[kind].items() if k != "weights"}
+    model = features.LightGlue(None, **settings)
+    renamed = {}
+    for key, value in read_state(_MATCHER[kind]).items():
+        if key.startswith("extractor."):  # LighterGlue's file holds its XFeat, too
+            continue
+        name = key.removeprefix("matcher.")
+        for part in ("self_attn", "cross_attn"):
+            pieces = name.split(".")
+            if pieces[0] == part:
+                name = ".".join(["transformers", pieces[1], part, *pieces[2:]])
+        renamed[name] = value
+    missing, _ = model.load_state_dict(renamed, strict=False)
+    if set(missing) - {"confidence_thresholds"}:
+        raise UnavailableError(
+            f"the weights '{_MATCHER[kind]}' do not fit LightGlue of this kornia; install kornia 0.9"
+        )
+    return model.to(device()).eval()
+
+
+def padded_tensor(gray: Gray, stride: int, channels: int = 1) -> Any:
+    """A picture as a float tensor (1, channels, H, W) in 0 to 1, its edge repeated up to multiples of a stride."""
+    import torch
+
+    rows, cols = gray.shape
+    pad = ((0, -rows % stride), (0, -cols % stride))
+    image = np.pad(gray, pad, mode="edge").astype(np.float32) / 255.0
+    return torch.from_numpy(image)[None, None].expand(1, channels, -1, -1).to(device())
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """Keypoints of one network, matched by LightGlue.
+
+    Attributes:
+        kind: which network. count: most keypoints a picture.
+    """
+
+    kind: Kind = "xfeat"
+    count: int = 1024
+
+    @classmethod
+    def make(cls, kind: Kind) -> "Learned":
+        """A matcher whose weights are known to be there.
+
+        Raises:
+            UnavailableError: if they are not.
+        """
+        weight_files.require(_EXTRACTOR[kind])
+        weight_files.require(_MATCHER[kind])
+        return cls(kind)
+
+    def match(self, a: Gray, b: Gray) -> Matches:
+        """See PictureMatcher."""
+        import torch
+
+        with torch.inference_mode():
+            one, two = self._features(a), self._features(b)
+            if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < 4:
+                return Matches.none()
+            found = glue(self.kind)({"image0": one, "image1": two})
+        pairs = found["matches"][0].cpu().numpy()
+        score = found["scores"][0].cpu().numpy().astype(np.float64)
+        first = one["keypoints"][0].cpu().numpy().astype(np.float64)
+        second = two["keypoints"][0].cpu().numpy().astype(np.float64)
+        return Matches(first[pairs[:, 0]], second[pairs[:, 1]], score)
+
+    def _features(self, gray: Gray) -> dict[str, Any]:
+        import torch
+
+        rows, cols = gray.shape
+        image = padded_tensor(gray, _STRIDE[self.kind], 1 if self.kind == "xfeat" else 3)
+        model = extractor(self.kind)
+        if self.kind == "xfeat":
+            found = model.detectAndCompute(image, top_k=self.count, detection_threshold=_DETECTION)[0]
+            points, descriptors = found["keypoints"], found["descriptors"]
+        elif self.kind == "disk":
+            result = model(image, n=self.count)[0]
+            points, descriptors = result.keypoints, result.descriptors
+        else:
+            result = model(image)[0]
+            best = torch.argsort(result.keypoint_scores, descending=True)[: self.count]
+            points, descriptors = result.keypoints[best], result.descriptors[best]
+        inside = (points[:, 0] <= cols - 1) & (points[:, 1] <= rows - 1)  # not in the padding
+        points, descriptors = points[inside].float(), descriptors[inside].float()
+        size = torch.tensor([[cols, rows]], dtype=torch.float32, device=image.device)
+        return {"keypoints": points[None], "descriptors": descriptors[None], "image_size": size}

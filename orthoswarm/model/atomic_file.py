@@ -1,0 +1,47 @@
+"""A product's name never stands on a half-written file: write under another name in the same folder, then rename."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from orthoswarm.model.errors import OrthoSwarmError
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a name to write a file or folder under; on success it takes the place of `path`, on failure it goes.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    part = path.with_name(f".{path.stem}.part{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove(part)
+        yield part
+        if part.is_dir() and path.is_dir():
+            shutil.rmtree(path)
+        os.replace(part, path)
+    except OSError as error:
+        _remove(part)
+        raise disk_error(error, path) from None
+    except BaseException:
+        _remove(part)
+        raise
+
+
+def disk_error(error: OSError, path: Path) -> OrthoSwarmError:
+    """One clear sentence about a file that could not be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return OrthoSwarmError(f"the disk is full, {path.name} was not written; free some space and run again")
+    return OrthoSwarmError(f"{path} cannot be written ({error.strerror or error}); choose another folder")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

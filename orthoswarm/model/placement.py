@@ -1,0 +1,168 @@
+"""Placed frames and what belongs to them: the refiner's result and the renderer's input."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.frame import Frame
+from orthoswarm.oldpickles import set_fields
+
+Array = NDArray[np.float64]
+Stage = Literal["realtime", "coarse", "fine"]
+LegState = Literal["matched", "carried", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedFrame:
+    """A frame with its camera in the area's grid.
+
+    Attributes:
+        frame: the picture.
+        camera: position (east, north, height over the common datum), orientation and lens.
+        stage: how far it was refined.
+        sigma_m: own estimate of the ground error at the picture's nadir, one sigma per axis, metres.
+        weak: True where too few observations hold it; it is placed but left out of the mosaic while others cover.
+    """
+
+    frame: Frame
+    camera: Camera
+    stage: Stage
+    sigma_m: float
+    weak: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A straight run of one vehicle's frames, and how well the map held it.
+
+    Attributes:
+        vehicle: id. first: index of its first frame among the vehicle's frames; last: of its last, inclusive.
+        state: matched to the map, carried by others, or failed.
+        confidence: 0 to 1. sigma_m: own error estimate in metres.
+    """
+
+    vehicle: str
+    first: int
+    last: int
+    state: LegState = "carried"
+    confidence: float = 0.0
+    sigma_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Terrain:
+    """Ground height on a regular grid of nodes, bilinear between them, constant beyond the border.
+
+    Attributes:
+        west: easting of node column 0; south: northing of node row 0 (rows go north), metres.
+        step_m: distance of nodes.
+        z: float32 (rows, columns), metres over the datum of the cameras.
+        bare: the same without what is broad and stands on the ground (halls, woods); None where z has no such tops.
+    """
+
+    west: float
+    south: float
+    step_m: float
+    z: NDArray[np.float32]
+    bare: NDArray[np.float32] | None = None
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
+
+    @classmethod
+    def flat(cls, z_m: float = 0.0) -> "Terrain":
+        """A level plane."""
+        return cls(0.0, 0.0, 1e6, np.full((2, 2), z_m, np.float32))
+
+    def bare_ground(self) -> "Terrain":
+        """The ground without the tops of what stands on it."""
+        return self if self.bare is None else replace(self, z=self.bare, bare=None)
+
+    def height(self, east_north: NDArray[Any]) -> Array:
+        """Heights (...,) at ground points (..., 2)."""
+        p = np.asarray(east_north, float)
+        rows, cols = self.z.shape
+        c = np.clip((p[..., 0] - self.west) / self.step_m, 0.0, cols - 1.000001)
+        r = np.clip((p[..., 1] - self.south) / self.step_m, 0.0, rows - 1.000001)
+        ci, ri = c.astype(np.intp), r.astype(np.intp)
+        fc, fr = c - ci, r - ri
+        z = self.z  # a float32 height times a float64 share is float64: the whole grid need not be converted
+        low = z[ri, ci] * (1 - fc) + z[ri, ci + 1] * fc
+        high = z[ri + 1, ci] * (1 - fc) + z[ri + 1, ci + 1] * fc
+        return np.asarray(low * (1 - fr) + high * fr)
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """What a refiner made of one vehicle.
+
+    Attributes:
+        vehicle: id.
+        placed: its frames in order, those it could place.
+        dropped: image -> reason for those it could not.
+        legs: its legs.
+        fov_deg: estimated horizontal field of view of its (main) camera; fov_sigma_deg: one sigma.
+        terrain: ground height under its frames (same datum as the cameras), None for flat at `ground_z_m`.
+        ground_z_m: height of the plane on which homographies are stated.
+        map_lean: metres of shift per metre of height in the basemap, (east, north).
+        state: what a second pass needs (refiner's own, picklable).
+        warnings: findings in plain words (yaw flips, wrong altitude, lag...).
+        timings: stage name -> CPU seconds, for the report.
+        gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count as
+            ground (rubble and hedges among them, so it is a little above the plane of the homographies) over the
+            focal length. NaN where not known.
+    """
+
+    vehicle: str
+    placed: list[PlacedFrame]
+    dropped: Mapping[str, str]
+    legs: list[Leg]
+    fov_deg: float
+    fov_sigma_deg: float
+    terrain: Terrain | None
+    ground_z_m: float = 0.0
+    map_lean: tuple[float, float] = (0.0, 0.0)
+    state: Any = None
+    warnings: list[str] = field(default_factory=list)
+    timings: dict[str, float] = field(default_factory=dict)
+    gsd_m: float = float("nan")
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
+
+
+class MapWindow(Protocol):
+    """The pre-disaster map as the core sees it: grey windows on any grid, read on demand (basemap.Basemap)."""
+
+    epsg: int
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north of the map in the area's grid."""
+
+    @property
+    def native_gsd_m(self) -> float:
+        """Size of the map's own pixel."""
+
+    def gray(
+        self, bounds: tuple[float, float, float, float], gsd_m: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Grey values (rows, columns), 0 to 255, and validity of a window; see GroundGrid.around for its frame."""
+
+
+class Refiner(Protocol):
+    """The seam of both refiners (swarm, paper): the unit is a vehicle."""
+
+    def refine(
+        self,
+        frames: Sequence[Frame],
+        neighbours: Sequence[Solution],
+        basemap: MapWindow | None,
+    ) -> Solution:
+        """Place one vehicle's frames; neighbours are held as they are."""

@@ -1,0 +1,192 @@
+"""Cameras straight from what was recorded: the real-time stage's placements (paper III.B), with defaults for gaps.
+
+Positions as recorded, an assumed field of view (theta-hat) where the pictures do not hint at one, straight down where
+no angles are known, yaw from the course flown where there is none. What was assumed is said in a warning.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.frame import Frame, Ingest, Rejection
+from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.placement import PlacedFrame
+
+Array = NDArray[np.float64]
+
+THETA_HAT_RAD = np.radians(70.0)
+"""The field of view that is assumed where nothing is known: below that of most drones' cameras."""
+DEFAULT_HEIGHT_M = 80.0
+_HEIGHTS_M = (50.0, 150.0)
+_USUAL_OVERLAP = 0.75
+_GPS_SIGMA_M = 3.0
+_TILT_SIGMA = {True: 0.03, False: 0.1}
+_FAR_M = 20_000.0
+_TURN_RAD = np.radians(50.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What became of frames in the real-time stage.
+
+    Attributes:
+        placed: in the order of the frames.
+        rejected: frames whose position cannot be true.
+        warnings: what was assumed, in plain words.
+    """
+
+    placed: list[PlacedFrame]
+    rejected: list[Rejection]
+    warnings: list[str]
+
+
+def area_grid(frames: Sequence[Frame]) -> LocalGrid:
+    """The UTM grid of the area that frames cover.
+
+    Raises:
+        InputError: if the positions lie outside UTM.
+    """
+    return LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+
+
+def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | None = None) -> Recorded:
+    """Place frames as recorded.
+
+    Args:
+        frames: sorted by vehicle, then time.
+        grid: the area's grid.
+        fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' own hints, else
+            THETA_HAT_RAD.
+    """
+    lat = np.array([f.fix.lat_deg for f in frames])
+    lon = np.array([f.fix.lon_deg for f in frames])
+    ground = grid.to_grid(lat, lon)
+    near = _near(ground)
+    rejected = [_too_far(frames[i], ground, i) for i in np.nonzero(~near)[0].tolist()]
+    convergence = grid.convergence_rad(lat, lon)
+    placed: list[PlacedFrame] = []
+    warnings: list[str] = []
+    members: dict[str, list[int]] = {}
+    for i in np.nonzero(near)[0].tolist():
+        members.setdefault(frames[i].vehicle, []).append(i)
+    for vehicle, index in members.items():
+        own = [frames[i] for i in index]
+        cameras, said = _vehicle(vehicle, own, ground[index], convergence[index], fov_rad)
+        warnings += said
+        placed += [
+            PlacedFrame(frame, camera, "realtime", _sigma(frame, camera))
+            for frame, camera in zip(own, cameras, strict=True)
+        ]
+    return Recorded(placed, rejected, warnings)
+
+
+def told_of_lone_ones(placed: Sequence[PlacedFrame]) -> list[Frame]:
+    """Frames of recorded cameras; that of a vehicle with a single one has the assumed field of view as its hint.
+
+    A flight tells its field of view by its own pictures, one photo cannot.
+    """
+    count = Counter(p.frame.vehicle for p in placed)
+    return [
+        replace(p.frame, fov_hint_rad=p.camera.lens.fov_rad) if count[p.frame.vehicle] == 1 else p.frame for p in placed
+    ]
+
+
+def _vehicle(
+    vehicle: str, frames: Sequence[Frame], ground: Array, convergence: Array, fov_rad: float | None
+) -> tuple[list[Camera], list[str]]:
+    """Cameras of one vehicle's frames, and what was assumed."""
+    warnings = []
+    lenses = [_lens(frame, fov_rad) for frame in frames]
+    heights = np.array([np.nan if f.fix.height_m is None else f.fix.height_m for f in frames])
+    heights[~(heights > 0)] = np.nan
+    if np.isnan(heights).any():
+        known = heights[np.isfinite(heights)]
+        filled = float(np.median(known)) if len(known) else usual_height(ground, lenses)
+        if not len(known):
+            warnings.append(
+                f"{vehicle}: no photo has a height above ground; the real-time picture assumes {filled:.0f} m"
+            )
+        heights = np.where(np.isnan(heights), filled, heights)
+    yaws = np.array([np.nan if f.fix.yaw_rad is None else f.fix.yaw_rad for f in frames]) - convergence
+    if np.isnan(yaws).any():
+        yaws = np.where(np.isnan(yaws), course(ground), yaws)
+        warnings.append(
+            f"{vehicle}: photos without a heading are taken to point along the flight"
+            if len(frames) > 1
+            else f"{vehicle}: its only photo has no heading and is taken to point north"
+        )
+    pitches = np.array([NADIR_PITCH_RAD if f.fix.pitch_rad is None else f.fix.pitch_rad for f in frames])
+    rolls = np.array([f.fix.roll_rad or 0.0 for f in frames])
+    rotations = rotation_from_angles(yaws, pitches, rolls)
+    positions = np.column_stack([ground, heights])
+    return [Camera(p, r, lens) for p, r, lens in zip(positions, rotations, lenses, strict=True)], warnings
+
+
+def _lens(frame: Frame, fov_rad: float | None) -> Lens:
+    if fov_rad is None and frame.fov_hint_rad:
+        return Lens(frame.width, frame.height, focal_px(frame.fov_hint_rad, frame.width))
+    # theta-hat belongs to the longer side, so that a portrait picture of the same camera has the same focal length
+    long_side = max(frame.width, frame.height)
+    return Lens(frame.width, frame.height, focal_px(fov_rad or THETA_HAT_RAD, long_side))
+
+
+def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
+    """A height at which consecutive pictures would overlap as they usually do, for photos that do not tell it."""
+    if len(ground) < 3:
+        return DEFAULT_HEIGHT_M
+    step = float(np.median(np.hypot(*np.diff(ground, axis=0).T)))
+    short = float(np.median([min(lens.width, lens.height) / lens.focal_px for lens in lenses]))
+    return float(np.clip(step / (1.0 - _USUAL_OVERLAP) / short, *_HEIGHTS_M)) if step > 1.0 else DEFAULT_HEIGHT_M
+
+
+def course(ground: Array) -> Array:
+    """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
+
+    Steps under a metre have no direction and take that of the nearest step that has; 0 where nothing moved.
+    """
+    n = len(ground)
+    steps = np.diff(ground, axis=0)
+    moved = np.nonzero(np.hypot(*steps.T) > 1.0)[0] if n > 1 else np.empty(0, np.intp)
+    if len(moved) == 0:
+        return np.zeros(n)
+    azimuth = np.arctan2(steps[moved, 0], steps[moved, 1])
+    after = np.searchsorted(moved, np.arange(n))  # the first step that begins here or later
+    into, out = azimuth[np.maximum(after - 1, 0)], azimuth[np.minimum(after, len(moved) - 1)]
+    before = azimuth[np.maximum(after - 2, 0)]
+    corner = np.abs(wrap_rad(out - into)) > _TURN_RAD
+    straight_in = np.abs(wrap_rad(into - before)) < _TURN_RAD
+    middle = into + 0.5 * wrap_rad(out - into)
+    return np.asarray(np.where(corner, np.where(straight_in, into, out), middle))
+
+
+def _sigma(frame: Frame, camera: Camera) -> float:
+    gps = frame.fix.position_sigma_m or _GPS_SIGMA_M
+    tilt = _TILT_SIGMA[frame.fix.pitch_rad is not None] * float(camera.position[2])
+    return float(np.hypot(gps, tilt))
+
+
+def _near(ground: Array) -> NDArray[np.bool_]:
+    """Which positions belong to the flight: within 20 km, or ten times the usual distance, of the middle."""
+    away = np.hypot(*(ground - np.median(ground, axis=0)).T)
+    return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, 10.0 * float(np.median(away)))))
+
+
+def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
+    away = float(np.hypot(*(ground[i] - np.median(ground, axis=0)))) / 1000
+    where = f"{away:,.0f} km from the others" if np.isfinite(away) else "on the other side of the world"
+    return Rejection(
+        frame.image, f"its position is {where}; correct it or map it by itself", frame.vehicle, frame.time_s
+    )
+
+
+def nothing_to_map(ingest: Ingest) -> str:
+    """Why inputs without a single frame are of no use, one sentence."""
+    if not ingest.rejected:
+        return "no picture was found in the input; name a folder of photos or a video"
+    reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
+    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"

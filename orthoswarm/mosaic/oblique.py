@@ -1,0 +1,69 @@
+"""Pictures that look far off among those that look straight down: good for the adjustment, no use for an orthoimage.
+
+What such a picture shows at its far end is smeared over ten times its size, and houses lean away over whole streets;
+since no other picture looks there, it would surround the map with that.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import PlacedFrame
+
+STRAY_RAD = float(np.radians(35.0))
+"""More than a fixed camera is tilted when its vehicle accelerates (28 degrees were seen)."""
+DOWN_RAD = float(np.radians(15.0))
+"""A flight whose usual tilt is below this looks straight down."""
+_FEW = 1.0 / 3.0
+
+
+def tilts(placed: Sequence[PlacedFrame]) -> NDArray[np.float64]:
+    """Angles (N,) between the middle of each picture's view and straight down, radians."""
+    down = np.array([-p.camera.rotation[2, 2] for p in placed], float)
+    return np.asarray(np.arccos(np.clip(down, -1.0, 1.0)))
+
+
+def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
+    """Pictures that look far off where the others of their vehicle look straight down: image -> why they are left out.
+
+    A vehicle that looks aside with more than a third of its pictures means to do so, and keeps them.
+    """
+    tilt = tilts(placed)
+    members: dict[str, list[int]] = {}
+    for i, p in enumerate(placed):
+        members.setdefault(p.frame.vehicle, []).append(i)
+    out = {}
+    for index in members.values():
+        off = tilt[index] > STRAY_RAD
+        if off.any() and off.mean() <= _FEW and np.median(tilt[index]) < DOWN_RAD:
+            for i in np.array(index)[off].tolist():
+                out[placed[i].frame.image] = (
+                    f"it looks {np.degrees(tilt[i]):.0f} degrees away from straight down, the others of its vehicle "
+                    f"{np.degrees(np.median(tilt[index])):.0f}; it would smear over the map"
+                )
+    return out
+
+
+def told(reasons: dict[str, str]) -> list[str]:
+    """The warning about strays that were left out of a map."""
+    if not reasons:
+        return []
+    many = f"{len(reasons)} pictures look" if len(reasons) > 1 else "1 picture looks"
+    return [f"{many} far aside among others that look straight down; left out of the map ({min(reasons)} first)"]
+
+
+def loose(placed: Sequence[PlacedFrame], told_already: Sequence[PlacedFrame] = ()) -> list[str]:
+    """The warning about pictures that too little holds in the adjustment; they are drawn where no other looks.
+
+    Those that were told already are left out, and so are all where none is better.
+    """
+    known = {p.frame.image for p in told_already}
+    weak = sorted(p.frame.image for p in placed if p.weak and p.frame.image not in known)
+    if not weak or all(p.weak for p in placed):
+        return []
+    many = f"{len(weak)} pictures have" if len(weak) > 1 else "1 picture has"
+    return [
+        f"{many} too little in common with the others to be placed well: used only where no other picture looks "
+        f"({weak[0]} first)"
+    ]

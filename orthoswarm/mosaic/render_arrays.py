@@ -1,0 +1,159 @@
+"""Cameras and terrain as the compiled kernels of the renderer want them: plain arrays about a tile's corner.
+
+A tile's frame: x east and y SOUTH in metres from its upper left corner, so that both grow with column and row;
+heights as they are. Terrain enters as a lattice of heights every STEP pixels, smooth (bicubic) between its nodes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.footprint import MAX_OFF_NADIR_RAD
+from orthoswarm.mosaic.lens_arrays import K1, K2, K3, F, U, V, lens_row
+
+Array = NDArray[np.float64]
+STEP = 8
+"""Pixels between heights of a tile's lattice (bilinear between them)."""
+MARGIN_PX = 0.0
+"""How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
+the neighbours that interpolation misses; a pixel's margin would cost a lone small picture 4 % of its ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shots:
+    """Cameras as arrays; positions are grid coordinates (subtract the tile's corner before use).
+
+    Attributes:
+        position: float64 (N, 3).
+        rotation: float64 (N, 3, 3), camera to ground.
+        lens: float64 (N, 18), see above.
+        size: int32 (N, 2), columns and rows of the pictures.
+        weak: bool (N,), used only where no other sees.
+    """
+
+    position: Array
+    rotation: Array
+    lens: Array
+    size: NDArray[np.int32]
+    weak: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], weak: Sequence[bool], margin_px: float = MARGIN_PX) -> "Shots":
+        """The arrays of cameras."""
+        n = len(cameras)
+        return cls(
+            np.array([c.position for c in cameras], float).reshape(n, 3),
+            np.array([c.rotation for c in cameras], float).reshape(n, 3, 3),
+            np.array([lens_row(c.lens, margin_px) for c in cameras], float).reshape(n, 18),
+            np.array([(c.lens.width, c.lens.height) for c in cameras], np.int32).reshape(n, 2),
+            np.array(weak, bool).reshape(n),
+        )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def take(self, index: NDArray[np.integer]) -> "Shots":
+        """Some of the cameras."""
+        return Shots(self.position[index], self.rotation[index], self.lens[index], self.size[index], self.weak[index])
+
+    def about(self, west: float, north: float) -> tuple[Array, Array]:
+        """Positions (N, 3) and ground-to-camera rotations (N, 3, 3) in the frame of a tile's corner."""
+        position = self.position * (1.0, -1.0, 1.0) + (-west, north, 0.0)
+        return position, np.ascontiguousarray(self.rotation.transpose(0, 2, 1) * (1.0, -1.0, 1.0))
+
+
+def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> NDArray[np.float32]:
+    """Heights every STEP pixels from a tile's corner, float32 (tile_px / STEP + 1, ...), rows going south.
+
+    Cubic convolution (Keys 1981, a = -1/2) between the terrain's nodes, so slopes are continuous; constant beyond
+    its border.
+    """
+    n = tile_px // STEP + 1
+    offset = np.arange(n) * (STEP * gsd_m)
+    column = _cubic(np.asarray((west + offset - terrain.west) / terrain.step_m, float), terrain.z.shape[1])
+    row = _cubic(np.asarray((north - offset - terrain.south) / terrain.step_m, float), terrain.z.shape[0])
+    rows, cols = np.unique(row[0]), np.unique(column[0])
+    part = terrain.z[np.ix_(rows, cols)].astype(float)
+    return np.asarray(_weights(row, rows) @ part @ _weights(column, cols).T, np.float32)
+
+
+def _cubic(at: Array, count: int) -> tuple[NDArray[np.intp], Array]:
+    """Node indices (n, 4) and weights (n, 4) of cubic convolution at positions in nodes, clamped to the border."""
+    at = np.clip(at, 0.0, count - 1.0)
+    base = np.minimum(at.astype(np.intp), max(0, count - 2))
+    t = at - base
+    w = np.stack(
+        [
+            t * (-0.5 + t * (1.0 - 0.5 * t)),
+            1.0 + t * t * (1.5 * t - 2.5),
+            t * (0.5 + t * (2.0 - 1.5 * t)),
+            t * t * (0.5 * t - 0.5),
+        ],
+        1,
+    )
+    return np.clip(base[:, None] + np.arange(-1, 3), 0, count - 1), w
+
+
+def _weights(cubic: tuple[NDArray[np.intp], Array], nodes: NDArray[np.intp]) -> Array:
+    """The weights as a matrix (n, nodes)."""
+    index, w = cubic
+    matrix = np.zeros((len(index), len(nodes)))
+    for k in range(4):
+        np.add.at(matrix, (np.arange(len(index)), np.searchsorted(nodes, index[:, k])), w[:, k])
+    return matrix
+
+
+def crop(terrain: Terrain, bounds: tuple[float, float, float, float]) -> Terrain:
+    """The part of a terrain that heights within bounds (west, south, east, north) depend on."""
+    rows, cols = terrain.z.shape
+    c0 = int(np.clip(np.floor((bounds[0] - terrain.west) / terrain.step_m) - 2, 0, cols - 2))
+    c1 = int(np.clip(np.ceil((bounds[2] - terrain.west) / terrain.step_m) + 3, c0 + 2, cols))
+    r0 = int(np.clip(np.floor((bounds[1] - terrain.south) / terrain.step_m) - 2, 0, rows - 2))
+    r1 = int(np.clip(np.ceil((bounds[3] - terrain.south) / terrain.step_m) + 3, r0 + 2, rows))
+    step = terrain.step_m
+    return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy())
+
+
+@kernel
+def height_at(lattice, row, column):  # type: ignore[no-untyped-def]
+    """Height at a pixel centre, bilinear in a tile's lattice (whose nodes lie on pixel CORNERS every STEP pixels)."""
+    y, x = (row + 0.5) / STEP, (column + 0.5) / STEP
+    i, j = int(y), int(x)
+    fy, fx = y - i, x - j
+    top = lattice[i, j] * (1.0 - fx) + lattice[i, j + 1] * fx
+    low = lattice[i + 1, j] * (1.0 - fx) + lattice[i + 1, j + 1] * fx
+    return top * (1.0 - fy) + low * fy
+
+
+@kernel
+def project(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
+    """Pixel (u, v) of a point in the tile's frame; (-1e9, -1e9) where it cannot be seen.
+
+    Args:
+        position: float64 (3,), see Shots.about.
+        rotation: float64 (3, 3), ground to camera.
+        lens: float64 (18,), a row as above.
+        x: metres east of the tile's corner.
+        y: metres SOUTH of it.
+        z: height.
+    """
+    dx, dy, dz = x - position[0], y - position[1], z - position[2]
+    depth = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+    if depth < 1e-3:
+        return -1e9, -1e9
+    px = (rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz) / depth
+    py = (rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz) / depth
+    r2 = px * px + py * py
+    if 1.0 + r2 * (3.0 * lens[K1] + r2 * (5.0 * lens[K2] + r2 * 7.0 * lens[K3])) < 0.2:
+        return -1e9, -1e9
+    s = lens[F] * (1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3])))
+    return s * px + lens[U], s * py + lens[V]
+
+
+TAN2_LIMIT = float(np.tan(MAX_OFF_NADIR_RAD) ** 2)
+"""Squared distance from the nadir point per squared height beyond which the ground is not drawn."""

@@ -1,0 +1,231 @@
+"""The two passes of the renderer as functions of one picklable argument, so that they can run in any process.
+
+A label task owns one tile; sample tasks write disjoint pixels (their own labels) of tiles that they may share.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.canvas.tile_store import Key, TileStore
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.downsampling import reduced
+from orthoswarm.mosaic.pixel_sampling import WEIGHTS, sample
+from orthoswarm.mosaic.render_arrays import Shots, heights
+from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
+from orthoswarm.raster.picture_file import PictureError
+
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int32]
+Read = Callable[[Path], Bytes]
+
+_UNCHANGED = np.tile(np.arange(256, dtype=np.uint8), (3, 1))
+THUMBNAIL = (12, 16)
+"""Rows and columns of a picture's thumbnail."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where tiles are: their folder, their side, and the grid under them."""
+
+    folder: Path
+    tile_px: int
+    grid: GroundGrid
+
+    def store(self) -> TileStore:
+        """The tiles, mapped in small number: tasks walk from tile to tile."""
+        return TileStore(self.folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
+
+    def corner(self, key: Key) -> tuple[float, float]:
+        """West and north of a tile."""
+        side = self.tile_px * self.grid.gsd_m
+        return self.grid.west + key[1] * side, self.grid.north - key[0] * side
+
+    def shape(self, key: Key) -> tuple[int, int]:
+        """Rows and columns of a tile that lie in the grid."""
+        return (
+            min(self.tile_px, self.grid.height - key[0] * self.tile_px),
+            min(self.tile_px, self.grid.width - key[1] * self.tile_px),
+        )
+
+    def heights(self, key: Key, terrain: Terrain) -> NDArray[np.float32]:
+        """A tile's lattice of heights."""
+        return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where in a tile a frame won: rows row0 to row1, columns col0 to col1, and how many pixels."""
+
+    key: Key
+    row0: int
+    row1: int
+    col0: int
+    col1: int
+    pixels: int
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTask:
+    """Label a tile.
+
+    Attributes:
+        place: where. key: the tile.
+        ids: int32 (K,), indices of the candidate frames. shots: their cameras.
+        terrain: the ground there.
+        again: int32, frames that turned out to be unreadable: only their pixels are labelled anew.
+    """
+
+    place: Place
+    key: Key
+    ids: Ints
+    shots: Shots
+    terrain: Terrain
+    again: Ints
+
+
+def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
+    """Label a tile in its file (frame index + 1); gives what each frame won, frames in order."""
+    place, store = task.place, task.place.store()
+    rows, cols = place.shape(task.key)
+    local = np.zeros((rows, cols), np.int32)
+    old = store.get(task.key) if len(task.again) else None
+    if old is not None:
+        owner = old.plane[:rows, :cols]
+        lost = np.isin(owner, task.again + 1)
+        local[~lost] = -1
+        old.rgba[:rows, :cols][lost] = 0
+        owner[lost] = 0
+    marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
+    lattice = place.heights(task.key, task.terrain)
+    label_tile(local, task.shots, marks, lattice, *place.corner(task.key), place.grid.gsd_m)
+    boxes = label_windows(local, len(task.ids))
+    won = np.nonzero(boxes[:, 4])[0]
+    if len(won):
+        tile = store.get(task.key, create=True)
+        assert tile is not None
+        write_labels(local, task.ids, tile.plane[:rows, :cols])
+    return [(int(task.ids[k]), Window(task.key, *map(int, boxes[k]))) for k in won]
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A picture's share of a layer.
+
+    Attributes:
+        layer: which of the task's layers. row: of its camera there. index: of its frame.
+        gain: float32 (3,), factor of its colours. factor: how much to reduce it first.
+        windows: where it won.
+    """
+
+    layer: int
+    row: int
+    index: int
+    gain: NDArray[np.float32]
+    factor: int
+    windows: list[Window]
+
+
+@dataclass(frozen=True, slots=True)
+class TaskLayer:
+    """What a task has to know of one of the maps that are drawn.
+
+    Attributes:
+        place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
+    """
+
+    place: Place
+    shots: Shots
+    terrain: dict[Key, Terrain]
+
+
+@dataclass(frozen=True, slots=True)
+class SampleTask:
+    """Read pictures and colour what they won.
+
+    Attributes:
+        layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture.
+    """
+
+    layers: list[TaskLayer]
+    pictures: list[tuple[Path, list[Shot]]]
+    read: Read
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """What became of a picture in a layer: its thumbnail, or the reason why it could not be used."""
+
+    layer: int
+    index: int
+    thumbnail: Bytes | None
+    reason: str | None = None
+
+
+class _Ground:
+    """A layer while it is drawn: its tiles, their heights, and the cameras about each tile."""
+
+    def __init__(self, layer: TaskLayer) -> None:
+        self.layer, self.store = layer, layer.place.store()
+        self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
+        self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
+
+    def draw(self, shot: Shot, small: Bytes, factor: int) -> None:
+        lens, levels = self.layer.shots.lens[shot.row], _levels(shot.gain)
+        for w in shot.windows:
+            tile = self.store.get(w.key)
+            assert tile is not None
+            position, rotation = self.about[w.key]
+            window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
+            sample(
+                tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row], lens,
+                self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor, levels, WEIGHTS,
+            )  # fmt: skip
+
+
+def sample_pass(task: SampleTask) -> list[Sampled]:
+    """Colour the pixels of some frames in the tiles' files, each picture read once for all layers."""
+    grounds = [_Ground(layer) for layer in task.layers]
+    results = []
+    for path, shots in task.pictures:
+        try:
+            picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
+        except OrthoSwarmError as error:
+            results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
+            continue
+        sizes = {shot.factor: reduced(picture, shot.factor) for shot in shots}
+        for shot in shots:
+            grounds[shot.layer].draw(shot, *sizes[shot.factor])
+        small = thumbnail(sizes[shots[0].factor][0])
+        results += [Sampled(shot.layer, shot.index, small) for shot in shots]
+    return results
+
+
+def _read(read: Read, path: Path, size: Ints) -> Bytes:
+    picture = read(path)
+    if picture.shape[:2] != (size[1], size[0]):
+        raise PictureError(
+            f"{path.name} is {picture.shape[1]}x{picture.shape[0]} pixels and not {size[0]}x{size[1]} as it was; "
+            "do not change pictures while they are mapped"
+        )
+    return np.ascontiguousarray(picture[..., :3])
+
+
+def _levels(gain: NDArray[np.float32]) -> Bytes:
+    """What each level 0 to 255 becomes under gains (3,): uint8 (3, 256)."""
+    if (gain == 1.0).all():
+        return _UNCHANGED
+    return np.asarray(np.clip(np.rint(gain[:, None] * np.arange(256)), 0, 255), np.uint8)
+
+
+def thumbnail(picture: Bytes) -> Bytes:
+    """The means of a picture's parts, uint8 (12, 16, 3), from 160 x 120 of its pixels."""
+    import cv2
+
+    small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(small, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA))

@@ -1,0 +1,326 @@
+"""The orthoimage from placed frames: each ground pixel once, from the frame that sees it most orthogonally.
+
+Two passes, both streamed, so that memory does not grow with the area or the number of frames: label every pixel with
+its frame (tiles independent of each other), then read each picture once and sample it where it won (frames
+independent of each other). Several maps of the same pictures (coarse and fine) share the reading. The tiles are
+prepared beside the canvas and moved into it when they are done, so a viewer sees the old ones until then. Nothing in
+the result depends on how the work is spread.
+"""
+
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.downsampling import reduction
+from orthoswarm.mosaic.footprint import rejections
+from orthoswarm.mosaic.render_arrays import Shots, crop
+from orthoswarm.mosaic.render_passes import (
+    LabelTask,
+    Place,
+    Read,
+    Sampled,
+    SampleTask,
+    Shot,
+    TaskLayer,
+    Window,
+    label_pass,
+    sample_pass,
+)
+from orthoswarm.mosaic.visible_ground import by_tile, coverage
+from orthoswarm.raster.picture_file import read_rgb
+
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int32]
+Bounds = tuple[float, float, float, float]
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""Applies a module-level function to every argument, in this process or in others; results in any order. It should
+take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
+Progress = Callable[[int, int], None]
+
+_FRAMES_PER_TASK = 64
+_STAGING = "staging"
+_COARSE_CELLS = 1_000_000
+
+
+def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable[Any]:
+    """Run the work here, one after the other: the default Run."""
+    return map(function, arguments)
+
+
+@dataclass(frozen=True, slots=True)
+class RenderStats:
+    """What was rendered.
+
+    Attributes:
+        pixels: int64 (N,), map pixels taken from each frame.
+        seen_m2: ground that any frame sees (that was not rejected), measured on cells of up to 64 pixels.
+        drawn_m2: ground that was drawn; both within what was rendered.
+        rejected: image -> why it was left out although it was placed (absurd pose, damaged picture).
+        thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
+    """
+
+    pixels: NDArray[np.int64]
+    seen_m2: float
+    drawn_m2: float
+    rejected: dict[str, str]
+    thumbnails: dict[str, Bytes] = field(default_factory=dict)
+
+    @property
+    def covered_share(self) -> float:
+        """Share of the ground that any frame sees that was drawn; 1 where nothing is seen."""
+        return min(1.0, self.drawn_m2 / self.seen_m2) if self.seen_m2 > 0 else 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One of the maps that are drawn together.
+
+    Attributes:
+        frames: placed frames; their order breaks ties of distance.
+        terrain: the ground's height, made smooth (bicubic) between its nodes.
+        canvas: made with plane "frame"; gets colours, and per pixel the index of its frame in `frames` plus 1.
+        gains: image -> factor of red, green, blue (3,); 1 where absent.
+        bounds: renew only the tiles that touch these (west, south, east, north); all if None.
+    """
+
+    frames: Sequence[PlacedFrame]
+    terrain: Terrain
+    canvas: Canvas
+    gains: Mapping[str, ArrayLike] = field(default_factory=dict)
+    bounds: Bounds | None = None
+
+
+def render(
+    frames: Sequence[PlacedFrame],
+    terrain: Terrain,
+    canvas: Canvas,
+    *,
+    gains: Mapping[str, ArrayLike] | None = None,
+    bounds: Bounds | None = None,
+    read: Read = read_rgb,
+    run: Run = serial,
+    progress: Progress | None = None,
+) -> RenderStats:
+    """Render frames onto a canvas: `render_layers` of a single layer, see there and `Layer`."""
+    layer = Layer(frames, terrain, canvas, gains or {}, bounds)
+    return render_layers([layer], read=read, run=run, progress=progress)[0]
+
+
+def render_layers(
+    layers: Sequence[Layer], *, read: Read = read_rgb, run: Run = serial, progress: Progress | None = None
+) -> list[RenderStats]:
+    """Render frames onto canvases, each picture read once for all of them.
+
+    Each map pixel is taken from the frame with the nearest nadir point that sees it (at most 75 degrees off
+    nadir; terrain and distortion honoured), from a weak frame only where no other sees, by
+    bicubic interpolation of the picture, averaged first where the map is coarser. No blending.
+
+    Args:
+        layers: what to draw.
+        read: reads a picture, uint8 (H, W, 3); must be picklable for `run` in other processes.
+        run: where the work runs; other processes need the canvases' folders and the pictures under the same paths.
+        progress: called with the number of pictures done and of pictures to do.
+
+    Returns:
+        What was rendered, layer by layer.
+
+    Raises:
+        InputError: if a canvas has another plane.
+        OrthoSwarmError: if the disk is full.
+    """
+    for layer in layers:
+        if layer.canvas.plane != "frame":
+            raise InputError(f"the canvas in {layer.canvas.path} belongs to the real-time module; use another folder")
+    staging = [layer.canvas.path / _STAGING for layer in layers]
+    for folder in staging:
+        shutil.rmtree(folder, ignore_errors=True)
+    try:
+        jobs = [_Job(layer, folder, run) for layer, folder in zip(layers, staging, strict=True)]
+        _draw(jobs, read, run, progress)
+        for job in jobs:
+            job.adopt()
+        return [job.stats() for job in jobs]
+    finally:
+        for folder in staging:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _draw(jobs: Sequence["_Job"], read: Read, run: Run, progress: Progress | None) -> None:
+    """Label and sample, and again for the pixels of pictures that turned out to be unreadable."""
+    while True:
+        for job in jobs:
+            job.label()
+        failed = False
+        pictures = sum(1 for _ in _by_picture(jobs))
+        done = 0
+        for result in run(sample_pass, _sample_tasks(jobs, read)):
+            for sampled in result:
+                jobs[sampled.layer].take(sampled)
+                failed |= sampled.reason is not None
+            done += len({sampled.index for sampled in result})
+            if progress is not None:
+                progress(min(done, pictures), pictures)
+        if not failed:
+            return
+
+
+def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, int]]]]:
+    """Files to read, and the layers and frames that each serves.
+
+    Their order walks over the tiles in a serpentine, so that few tiles are mapped at once.
+    """
+    shares: dict[Path, list[tuple[int, int]]] = defaultdict(list)
+    for number, job in enumerate(jobs):
+        for i in sorted(job.windows, key=job.home):
+            shares[job.frames[i].frame.path].append((number, i))
+    yield from shares.items()
+
+
+def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
+    """The pictures in groups, with what is needed to draw them."""
+    pictures = list(_by_picture(jobs))
+    for start in range(0, len(pictures), _FRAMES_PER_TASK):
+        some = pictures[start : start + _FRAMES_PER_TASK]
+        own: list[list[int]] = [
+            [i for _, shares in some for n, i in shares if n == number] for number in range(len(jobs))
+        ]
+        row = {(number, i): r for number, indices in enumerate(own) for r, i in enumerate(indices)}
+        shots = [(path, [jobs[n].shot(i, n, row[n, i]) for n, i in shares]) for path, shares in some]
+        yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read)
+
+
+def _tiles_within(canvas: Canvas, bounds: Bounds) -> set[Key]:
+    r0, r1, c0, c1 = canvas.window(bounds)
+    t = canvas.tile_px
+    return {(r, c) for r in range(r0 // t, -(-r1 // t)) for c in range(c0 // t, -(-c1 // t))}
+
+
+class _Job:
+    """One layer while it is drawn."""
+
+    def __init__(self, layer: Layer, staging: Path, run: Run) -> None:
+        self.frames, self.terrain, self.canvas, self.run = layer.frames, layer.terrain, layer.canvas, run
+        self.gains = dict(layer.gains)
+        self.place = Place(staging, self.canvas.tile_px, self.canvas.grid)
+        self.keys = None if layer.bounds is None else _tiles_within(self.canvas, layer.bounds)
+        self.shots = Shots.of([f.camera for f in self.frames], [f.weak for f in self.frames])
+        position = np.nan_to_num(self.shots.position)
+        self.ground = self.terrain.height(position[:, :2])
+        self.usable = np.ones(len(self.frames), bool)
+        self.rejected: dict[str, str] = {}
+        self.thumbnails: dict[str, Bytes] = {}
+        self.pixels = np.zeros(len(self.frames), np.int64)
+        self.windows: dict[int, list[Window]] = {}
+        self.failed: dict[int, str] = {}
+        reasons = rejections([f.camera for f in self.frames], self.ground, self.canvas.grid.gsd_m)
+        for i, reason in reasons.items():
+            self.reject(i, reason)
+        self.candidates = {k: ids for k, ids in self.seen_by().items() if self.keys is None or k in self.keys}
+
+    def reject(self, i: int, reason: str) -> None:
+        self.rejected[self.frames[i].frame.image] = reason
+        self.usable[i] = False
+
+    def seen_by(self) -> dict[Key, Ints]:
+        """For each tile the usable frames that may see it."""
+        index = np.nonzero(self.usable)[0].astype(np.int32)
+        t = self.canvas.tile_px
+        found = by_tile([self.frames[int(i)].camera for i in index], self.canvas.grid, t, self.terrain)
+        return {(r // t, c // t): index[ids] for (r, c), ids in found.items()}
+
+    def label(self) -> None:
+        """Label the tiles, or those again that lost a frame; `windows` are where each frame won."""
+        for i in sorted(self.failed):
+            self.reject(i, self.failed[i])
+            self.pixels[i] = 0
+        lost = {w.key for i in self.failed for w in self.windows[i]}
+        if self.failed or self.windows:
+            self.candidates = {k: ids for k, ids in self.candidates.items() if k in lost}
+        again = np.array(sorted(self.failed), np.int32)
+        self.failed = {}
+
+        def tasks() -> Iterator[LabelTask]:
+            for key, ids in self.candidates.items():
+                good = ids[self.usable[ids]]
+                yield LabelTask(self.place, key, good, self.shots.take(good), self.local(key), again)
+
+        windows: dict[int, list[Window]] = defaultdict(list)
+        for result in self.run(label_pass, tasks()):
+            for i, window in result:
+                windows[i].append(window)
+        self.windows = {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
+        for i, own in self.windows.items():
+            self.pixels[i] += sum(w.pixels for w in own)
+
+    def local(self, key: Key) -> Terrain:
+        return crop(self.terrain, self.canvas.tile_bounds(key))
+
+    def home(self, i: int) -> tuple[int, int, int]:
+        """Where in the serpentine over the tiles a frame is drawn."""
+        row, col = max(self.windows[i], key=lambda w: (w.pixels, w.key)).key
+        return row, col if row % 2 == 0 else -col, i
+
+    def shot(self, i: int, number: int, row: int) -> Shot:
+        """A frame's share of this layer, whose number it is among those that are drawn."""
+        frame = self.frames[i]
+        gain = np.ones(3, np.float32) * np.asarray(self.gains.get(frame.frame.image, 1.0), np.float32)
+        picture_gsd = float(frame.camera.position[2] - self.ground[i]) / frame.camera.lens.focal_px
+        factor = reduction(self.canvas.grid.gsd_m, picture_gsd)
+        return Shot(number, row, i, gain, factor, self.windows[i])
+
+    def layer_of(self, indices: list[int]) -> TaskLayer:
+        """What a task has to know to draw some frames."""
+        keys = sorted({w.key for i in indices for w in self.windows[i]})
+        return TaskLayer(self.place, self.shots.take(np.array(indices, int)), {key: self.local(key) for key in keys})
+
+    def take(self, sampled: Sampled) -> None:
+        """Note what became of a frame."""
+        if sampled.reason is not None:
+            self.failed[sampled.index] = sampled.reason
+        elif sampled.thumbnail is not None:
+            self.thumbnails[self.frames[sampled.index].frame.image] = sampled.thumbnail
+
+    def adopt(self) -> None:
+        """Move the tiles into the canvas."""
+        store = self.canvas.staging(_STAGING)
+        keys = {*store.existing(), *self.canvas.changed_since(0)} if self.keys is None else self.keys
+        self.canvas.adopt(store, sorted(keys))
+
+    def stats(self) -> RenderStats:
+        gsd = self.canvas.grid.gsd_m
+        drawn = float(self.pixels.sum()) * gsd * gsd
+        return RenderStats(self.pixels, self.seen_m2(), drawn, self.rejected, self.thumbnails)
+
+    def seen_m2(self) -> float:
+        """Ground that the usable frames see, measured on coarse cells."""
+        grid, t = self.canvas.grid, self.canvas.tile_px
+        factor = 1
+        while factor < 64 and grid.width * grid.height > factor * factor * _COARSE_CELLS:
+            factor *= 2
+        coarse = GroundGrid(
+            grid.epsg,
+            grid.west,
+            grid.north,
+            grid.gsd_m * factor,
+            max(1, (grid.width + factor // 2) // factor),  # cells whose centre lies in the grid
+            max(1, (grid.height + factor // 2) // factor),
+        )
+        mask = coverage([f.camera for f, good in zip(self.frames, self.usable) if good], coarse, self.terrain)
+        if self.keys is not None:
+            wanted = np.zeros((self.canvas.tile_rows, self.canvas.tile_cols), bool)
+            for key in self.keys:
+                wanted[key] = True
+            side = t // factor
+            mask &= wanted.repeat(side, 0).repeat(side, 1)[: coarse.height, : coarse.width]
+        return float(mask.sum()) * coarse.gsd_m**2

@@ -1,0 +1,109 @@
+"""Coarse cameras of one vehicle (paper III.C): legs, lines, positions on them, one field of view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from time import process_time
+
+import numpy as np
+
+from orthoswarm.matchers import picture_matcher
+from orthoswarm.model.camera import focal_px
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.paper.ground_scale import choose_pairs, estimate_fov
+from orthoswarm.paper.leg_lines import Line, find_legs, fit_line
+from orthoswarm.raster.picture_file import read_gray
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F, Ints, Rig
+from orthoswarm.refine.bundle.flight_records import Array, read_records
+from orthoswarm.refine.features.grey_pictures import Pictures
+
+RECEIVER_SIGMA_M = 3.0
+"""How far a receiver may be off as a whole, which no line tells."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseOptions:
+    """How coarse cameras are found.
+
+    Attributes:
+        fov_start_rad: guess that places the orthogonal centre, and what is taken where nothing can be matched.
+        matcher: name of the picture matcher; None for the best available.
+        pairs: matched pairs a vehicle, about. ratio: their distance as a share of the height.
+        work_width: wider pictures are reduced.
+    """
+
+    fov_start_rad: float = float(np.radians(80.0))
+    matcher: str | None = None
+    pairs: int = 40
+    ratio: float = 0.35
+    work_width: int = 960
+
+
+@dataclass(slots=True)
+class CoarseVehicle:
+    """One vehicle after III.C.
+
+    Attributes:
+        vehicle: id. frames: in order. leg: int32 (N,), -1 in turns. lines: of each leg.
+        rig: cameras in the local frame, lens in pixels of the stored pictures; ground at height 0.
+        sigma_m: float64 (N,), own error estimates. fov_sigma_rad: of the field of view.
+        damaged: index -> why its picture cannot be used. warnings: findings. cpu_s: CPU seconds.
+    """
+
+    vehicle: str
+    frames: list[Frame]
+    leg: Ints
+    lines: list[Line]
+    rig: Rig
+    sigma_m: Array
+    fov_sigma_rad: float
+    damaged: dict[int, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    cpu_s: float = 0.0
+
+    def members(self, leg: int) -> Ints:
+        """Indices of a leg's frames whose pictures can be used."""
+        return np.array([i for i in np.flatnonzero(self.leg == leg) if i not in self.damaged], np.int32)
+
+
+def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions) -> CoarseVehicle:
+    """Coarse cameras of one vehicle (one lens) in the local frame: III.C from legs to Eq. 4."""
+    began = process_time()
+    records = read_records(frames, LocalGrid(epsg), origin)
+    pictures = Pictures(frames, lambda f: read_gray(f.path), options.work_width)
+    leg = find_legs(records)
+    count = int(leg.max()) + 1 if len(leg) else 0
+    lines = [fit_line(records.position[leg == k, :2]) for k in range(count)]
+    position = records.position.copy()
+    sigma = np.full(len(frames), float(np.hypot(RECEIVER_SIGMA_M, RECEIVER_SIGMA_M)))
+    for k, line in enumerate(lines):
+        mine = leg == k
+        position[mine, :2] = line.project(records.position[mine, :2])
+        sigma[mine] = np.hypot(RECEIVER_SIGMA_M, line.sigma_m)
+    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
+    start = float(np.median(hints)) if hints else options.fov_start_rad
+    rotation = records.rotation()
+    tilt = np.arccos(np.clip(-rotation[:, 2, 2], -1.0, 1.0))
+    tasks = []
+    for k, line in enumerate(lines):
+        members = np.flatnonzero(leg == k)
+        along = line.along(records.position[members, :2])
+        share = max(3, round(options.pairs * len(members) / max(int((leg >= 0).sum()), 1)))
+        tasks += choose_pairs(along, position[members, 2], tilt[members], members, share, options.ratio)
+    warnings = []
+    found = None
+    if records.has_height.any():
+        matcher = picture_matcher(options.matcher)
+        found = estimate_fov(tasks, pictures.gray, rotation, pictures.size, start, matcher)
+    if found is None:
+        warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are taken")
+    fov = start if found is None else found.mean
+    fov_sigma = np.radians(10.0) if found is None else found.sigma / np.sqrt(max(found.kept, 1))
+    width, height = frames[0].width, frames[0].height
+    lens = np.zeros((1, 8))
+    lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height
+    rig = Rig(position, rotation, np.zeros(len(frames), np.int32), lens)
+    return CoarseVehicle(
+        frames[0].vehicle, list(frames), leg, lines, rig, sigma, float(fov_sigma), dict(pictures.damaged), warnings,
+        process_time() - began,
+    )  # fmt: skip

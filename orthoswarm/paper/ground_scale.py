@@ -1,0 +1,167 @@
+"""Metres per pixel from overlapping frames and the distance flown, and the field of view by Eq. 4 (paper III.C)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.matchers.matcher import Gray, Matches, PictureMatcher
+from orthoswarm.model.camera import focal_px
+from orthoswarm.refine.bundle.flight_records import Array
+
+NEAR_CENTRE = 0.3
+"""Matches count up to this share of the picture's height from the orthogonal centre."""
+FEWEST_MATCHES = 12
+FEWEST_PAIRS = 3
+_SIGMAS = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussian:
+    """A mean with outliers suppressed.
+
+    Attributes:
+        mean, sigma: of those kept. kept: how many.
+    """
+
+    mean: float
+    sigma: float
+    kept: int
+
+
+def gaussian(samples: Array, rounds: int = 20) -> Gaussian:
+    """Gaussian outlier suppression: mean and deviation of what lies within two deviations of the mean, repeated.
+
+    It starts at the median and the median deviation, since a mean of everything may be far from all of it.
+    """
+    mean = float(np.median(samples))
+    sigma = 1.4826 * float(np.median(np.abs(samples - mean)))
+    kept = samples
+    for _ in range(rounds):
+        inside = np.abs(samples - mean) <= _SIGMAS * max(sigma, 1e-12)
+        if not inside.any():
+            break
+        kept = samples[inside]
+        before = mean
+        mean, sigma = float(kept.mean()), float(kept.std())
+        if abs(mean - before) <= 1e-9 * abs(mean):
+            break
+    return Gaussian(mean, sigma, len(kept))
+
+
+def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: float, flown_m: float) -> float | None:
+    """Scale at the orthogonal centre from two frames of a leg: distance flown over the shift of the picture.
+
+    Args:
+        matches: between the two pictures.
+        centre: column and row of the orthogonal centre (straight below).
+        reach_px: matches whose middle lies farther from the centre are not used: there height and tilt distort.
+        flown_m: distance between the two frames along the leg's line.
+
+    Returns:
+        Metres per pixel; None where too few matches agree.
+    """
+    if len(matches) < FEWEST_MATCHES or flown_m <= 0:
+        return None
+    middle = 0.5 * (matches.a + matches.b)
+    near = np.hypot(*(middle - centre).T) <= reach_px
+    shift = np.hypot(*(matches.b - matches.a)[near].T)
+    shift = shift[shift > 2.0]
+    if len(shift) < FEWEST_MATCHES:
+        return None
+    found = gaussian(shift)
+    if found.kept < FEWEST_MATCHES or found.sigma > 0.2 * found.mean:
+        return None
+    return flown_m / found.mean
+
+
+def field_of_view(scale_m: float, width: int, height_m: float, tilt_rad: float = 0.0) -> float:
+    """Eq. 4: the horizontal field of view in radians.
+
+    theta = 2 arctan(L / d) with L = scale W / 2, HALF the ground width that the picture's width would cover at the
+    scale of the orthogonal centre, and d = h cos(tilt), the depth of the orthogonal centre along the optical axis.
+    As printed the equation takes the whole width, inverts the fraction of L, and divides by a slant height of the
+    picture's middle while the scale is measured at the orthogonal centre; see docs/method.md.
+    """
+    return 2.0 * float(np.arctan2(0.5 * scale_m * width, height_m * np.cos(tilt_rad)))
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleTask:
+    """Two frames of a leg to be matched.
+
+    Attributes:
+        first, second: indices. flown_m: along the line. height_m: mean height. tilt_rad: mean tilt of the camera.
+    """
+
+    first: int
+    second: int
+    flown_m: float
+    height_m: float
+    tilt_rad: float
+
+
+def choose_pairs(
+    along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int, ratio: float
+) -> list[ScaleTask]:
+    """Up to `count` pairs of a leg, evenly spread, whose distance is nearest to `ratio` times the height.
+
+    Args:
+        along: float64 (n,), distance along the line of the leg's frames, in flying order.
+        height: float64 (n,), metres.
+        tilt: float64 (n,), radians from straight down.
+        members: (n,), the frames' indices in the vehicle.
+        count: how many pairs.
+        ratio: wanted distance as a share of the height.
+    """
+    n = len(along)
+    found = []
+    for i in np.unique(np.linspace(0, n - 2, min(count, n - 1)).round().astype(int)).tolist():
+        later = np.arange(i + 1, n)
+        j = int(later[np.argmin(np.abs(np.abs(along[later] - along[i]) - ratio * height[i]))])
+        flown = float(abs(along[j] - along[i]))
+        if 0.05 * height[i] <= flown <= 1.0 * height[i]:
+            h, t = float(0.5 * (height[i] + height[j])), float(0.5 * (tilt[i] + tilt[j]))
+            found.append(ScaleTask(int(members[i]), int(members[j]), flown, h, t))
+    return found
+
+
+def orthogonal_centre(rotation: Array, focal: float, size: tuple[int, int]) -> tuple[float, float]:
+    """Column and row of the ground point straight below a camera; rotation (3, 3), focal length and size in pixels."""
+    down = rotation.T @ np.array([0.0, 0.0, -1.0])
+    u = focal * down[0] / max(float(down[2]), 0.2) + 0.5 * (size[0] - 1)
+    v = focal * down[1] / max(float(down[2]), 0.2) + 0.5 * (size[1] - 1)
+    return float(u), float(v)
+
+
+def estimate_fov(
+    tasks: list[ScaleTask],
+    gray: Callable[[int], Gray],
+    rotation: Array,
+    size: tuple[int, int],
+    start_rad: float,
+    matcher: PictureMatcher,
+) -> Gaussian | None:
+    """The field of view (radians) of a camera from pairs of frames, outliers suppressed; None if too few agree.
+
+    Args:
+        tasks: pairs.
+        gray: picture i.
+        rotation: float64 (N, 3, 3).
+        size: width and height of the pictures.
+        start_rad: a first guess, which only places the orthogonal centre.
+        matcher: for the pairs.
+    """
+    focal = focal_px(start_rad, size[0])
+    found = []
+    for task in tasks:
+        matches = matcher.match(gray(task.first), gray(task.second))
+        centres = [orthogonal_centre(rotation[i], focal, size) for i in (task.first, task.second)]
+        middle = (0.5 * (centres[0][0] + centres[1][0]), 0.5 * (centres[0][1] + centres[1][1]))
+        scale = metres_per_pixel(matches, middle, NEAR_CENTRE * size[1], task.flown_m)
+        if scale is not None:
+            found.append(field_of_view(scale, size[0], task.height_m, task.tilt_rad))
+    if len(found) < FEWEST_PAIRS:
+        return None
+    return gaussian(np.array(found))

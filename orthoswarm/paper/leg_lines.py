@@ -1,0 +1,102 @@
+"""Legs and their straight lines (paper III.C): grouping by heading and path, Eq. 2 and Eq. 3."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.legs import split_legs
+from orthoswarm.refine.bundle.block_arrays import Ints
+from orthoswarm.refine.bundle.flight_records import Array, Records
+
+HEADING_RAD = np.radians(20.0)
+SHORTEST = 3
+_ON_LINE_M = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The straight line of a leg.
+
+    Attributes:
+        point: float64 (2,), a point on it (the middle of the positions). direction: float64 (2,), unit, along flight.
+        sigma_m: standard deviation of the positions across it.
+    """
+
+    point: Array
+    direction: Array
+    sigma_m: float
+
+    def project(self, position: Array) -> Array:
+        """Eq. 3: the foot points (N, 2) of positions (N, 2) on the line."""
+        along = (position - self.point) @ self.direction
+        return np.asarray(self.point + along[:, None] * self.direction)
+
+    def along(self, position: Array) -> Array:
+        """Distance flown along the line, metres from its point, of positions (N, 2)."""
+        return np.asarray((position - self.point) @ self.direction)
+
+
+def fit_line(position: Array) -> Line:
+    """Eq. 2: the line through positions (N, 2) of a leg, by TOTAL least squares.
+
+    The paper minimises the error of y = kx + b in y, which has no solution for a leg due north (x = const) and leans
+    towards the x axis for steep ones. The line that minimises distances at right angles has neither fault and is the
+    same for legs due east.
+    """
+    middle = position.mean(axis=0)
+    _, spread, axes = np.linalg.svd(position - middle, full_matrices=False)
+    direction = axes[0] if (position[-1] - position[0]) @ axes[0] >= 0 else -axes[0]
+    across = float(spread[1]) / np.sqrt(max(len(position) - 2, 1)) if len(spread) > 1 else 0.0
+    return Line(middle, direction, across)
+
+
+def find_legs(records: Records) -> Ints:
+    """Leg of each frame, int32 (N,), -1 in turns: straight by the path flown and of one heading of the camera."""
+    path = split_legs(records.position, records.time_s if records.timed else None)
+    out = np.full(len(path), -1, np.int32)
+    number = 0
+    for k in range(int(path.max()) + 1 if len(path) else 0):
+        for run in _one_heading(np.flatnonzero(path == k).astype(np.int32), records.yaw):
+            if len(run) >= SHORTEST:
+                out[run] = number
+                number += 1
+    return _grown(out, records)
+
+
+def _grown(leg: Ints, records: Records) -> Ints:
+    """Legs extended over the frames before and after that lie on their line and look the same way.
+
+    The path alone tells a turn only a few frames away from it.
+    """
+    out = leg.copy()
+    for k in range(int(leg.max()) + 1 if len(leg) else 0):
+        members = np.flatnonzero(leg == k)
+        line = fit_line(records.position[members, :2])
+        reach = max(3.0 * line.sigma_m, _ON_LINE_M)
+        mean = np.angle(np.exp(1j * records.yaw[members]).mean())
+        for start, step in ((members[-1] + 1, 1), (members[0] - 1, -1)):
+            i = int(start)
+            last = line.along(records.position[i - step, None, :2])[0]
+            while 0 <= i < len(out) and out[i] < 0:
+                offset = records.position[i, :2] - line.project(records.position[i, None, :2])[0]
+                along = line.along(records.position[i, None, :2])[0]
+                turned = abs(wrap_rad(float(records.yaw[i] - mean))) > HEADING_RAD
+                if turned or np.hypot(*offset) > reach or (along - last) * step <= 0:
+                    break
+                out[i], last = k, along
+                i += step
+    return out
+
+
+def _one_heading(members: Ints, yaw: Array) -> list[Ints]:
+    """Runs of frames whose heading stays within HEADING_RAD of the run's mean."""
+    runs: list[list[int]] = []
+    for i in members.tolist():
+        if runs:
+            mean = np.angle(np.exp(1j * yaw[runs[-1]]).mean())
+            if abs(wrap_rad(float(yaw[i] - mean))) <= HEADING_RAD:
+                runs[-1].append(i)
+                continue
+        runs.append([i])
+    return [np.array(r, np.int32) for r in runs]

@@ -1,0 +1,193 @@
+"""Leg patches on the map (paper III.D): compositing, dense matches, consistent heights, MAGSAC homography."""
+
+from dataclasses import dataclass
+from time import perf_counter, process_time
+
+import numpy as np
+
+from orthoswarm.matchers import Matches, map_matcher
+from orthoswarm.matchers.matcher import Floats, Mask
+from orthoswarm.matchers.patch_registration import FEWEST_TILES, Registration, apply, register
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.raster.picture_file import read_gray
+from orthoswarm.refine.bundle.block_arrays import WIDTH, F, Rig
+from orthoswarm.refine.bundle.flight_records import Array
+from orthoswarm.refine.features.grey_pictures import Pictures
+from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
+
+TRUSTED_SHARE = 0.35
+_GSD_RANGE = (0.3, 1.0)
+_FARTHEST_PX = 240
+_LARGEST_PX = 3_000_000
+_HEIGHT_TOLERANCE_M = 3.0
+_LEVER = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class PatchTask:
+    """A leg to be found on the map; small enough to be sent to another machine.
+
+    Attributes:
+        vehicle: id. leg: its number. frames: the leg's frames. rig: their coarse cameras.
+    """
+
+    vehicle: str
+    leg: int
+    frames: list[Frame]
+    rig: Rig
+
+
+@dataclass(frozen=True, slots=True)
+class PatchFit:
+    """Where a leg's patch lies on the map.
+
+    Attributes:
+        vehicle, leg: which leg. homography: float64 (3, 3), ground as placed coarsely -> ground on the map, in
+            metres about `centre`; None if the leg was not found. centre: (2,), local frame.
+        share: of tiles that agree. rms_m: of their residuals per axis. gsd_m: of the patch.
+        damaged: image -> why it could not be used. cpu_s, wall_s: what the task took.
+    """
+
+    vehicle: str
+    leg: int
+    homography: Array | None
+    centre: Array
+    share: float
+    rms_m: float
+    gsd_m: float
+    damaged: dict[str, str]
+    cpu_s: float
+    wall_s: float
+
+    def move(self, ground: Array) -> Array:
+        """Corrected ground points (N, 2), local frame."""
+        assert self.homography is not None
+        return apply(self.homography, ground - self.centre) + self.centre
+
+    @property
+    def shift(self) -> Array:
+        """Correction at the leg's centre, (2,), metres."""
+        return np.asarray(self.move(self.centre[None])[0] - self.centre)
+
+
+@dataclass(frozen=True, slots=True)
+class PatchOptions:
+    """How patches are matched.
+
+    Attributes:
+        matcher: name of the map matcher; None for the best available.
+        reach_m: how far coarse cameras may be off, first try and second.
+        trusted: least share of tiles that agree.
+    """
+
+    matcher: str | None = None
+    reach_m: tuple[float, ...] = (30.0, 70.0)
+    trusted: float = TRUSTED_SHARE
+
+
+def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
+    """Find one leg on the map."""
+    began, clock = process_time(), perf_counter()
+    pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
+    centre = task.rig.position[:, :2].mean(axis=0)
+    gsd = patch_gsd(task.rig, basemap.native_gsd_m)
+    strip = strip_mosaic(task.rig, np.arange(len(task.rig)), pictures.gray, 0.0, gsd)
+    found: Registration | None = None
+    homography = None
+    if strip is not None:
+        patch, valid, west, north = strip
+        own = GroundGrid(basemap.epsg, west, north, gsd, patch.shape[1], patch.shape[0])
+        for reach_m in options.reach_m:
+            reach = min(int(np.ceil(reach_m / gsd)), _FARTHEST_PX)
+            window, known, there = map_window(basemap, origin, own, reach)
+            if not known.any():
+                break
+            consistent = HeightFilter(task.rig, own, there)
+            matcher = map_matcher(options.matcher)
+            found = register(patch, valid, window, known, reach, matcher, consistent)
+            if found is not None and found.share >= options.trusted and len(found.matches) >= FEWEST_TILES:
+                homography = in_metres(found.homography, own, there, centre)
+                break
+    return PatchFit(
+        task.vehicle, task.leg, homography, centre,
+        0.0 if found is None else found.share,
+        float("nan") if found is None else found.rms_px * gsd,
+        gsd,
+        {task.frames[i].image: why for i, why in pictures.damaged.items()},
+        process_time() - began, perf_counter() - clock,
+    )  # fmt: skip
+
+
+def patch_gsd(rig: Rig, map_gsd_m: float) -> float:
+    """Pixel of a leg's patch: that of the coarser of pictures and map, coarser still if the leg is long."""
+    own = float(np.median(rig.position[:, 2])) / float(rig.lens[0, F])
+    gsd = float(np.clip(max(own, map_gsd_m), *_GSD_RANGE))
+    spread = np.ptp(rig.position[:, :2], axis=0) + 1.5 * own * float(rig.lens[0, WIDTH])
+    return max(gsd, float(np.sqrt(spread[0] * spread[1] / _LARGEST_PX)))
+
+
+def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -> tuple[Floats, Mask, GroundGrid]:
+    """The map about a patch (see MapMatcher), and the grid on which it lies, in the local frame.
+
+    The map's windows lie on multiples of the pixel in the area's grid, the patch on those of the local frame: the two
+    may differ by part of a pixel, which the returned grid tells exactly.
+    """
+    gsd = own.gsd_m
+    west, south, east, north = own.bounds
+    margin = reach * gsd
+    bounds = (west - margin + origin[0], south - margin + origin[1], east + margin + origin[0],
+              north + margin + origin[1])  # fmt: skip
+    grid = GroundGrid.around(basemap.epsg, bounds, gsd)
+    gray, known = basemap.gray(bounds, gsd)
+    rows, cols = own.height + 2 * reach, own.width + 2 * reach
+    pad = ((0, max(0, rows - gray.shape[0])), (0, max(0, cols - gray.shape[1])))
+    gray, known = np.pad(gray, pad)[:rows, :cols], np.pad(known, pad)[:rows, :cols]
+    there = GroundGrid(basemap.epsg, grid.west - origin[0], grid.north - origin[1], gsd, cols, rows)
+    return gray, known, there
+
+
+def in_metres(pixels: Array, own: GroundGrid, there: GroundGrid, centre: Array) -> Array:
+    """A homography of patch to window pixels as one of ground metres about a centre."""
+    to_centre = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
+    from_patch = own.homography_from_ground() @ to_centre
+    to_window = there.homography_from_ground() @ to_centre
+    out = np.linalg.inv(to_window) @ pixels @ from_patch
+    return np.asarray(out / out[2, 2])
+
+
+@dataclass(frozen=True, slots=True)
+class HeightFilter:
+    """Rejects matches of inconsistent height (III.D): roofs and towers.
+
+    A point at height h over the plane is drawn farther from the nadir point of its picture by h rho / H, rho being its
+    distance from that point and H the height of the camera. What a match lacks along that direction is an apparent
+    height; those far from the usual one are dropped. Near the nadir points nothing leans, and all are kept.
+
+    Attributes:
+        rig: the leg's cameras. own: grid of the patch. there: grid of the window.
+    """
+
+    rig: Rig
+    own: GroundGrid
+    there: GroundGrid
+
+    def __call__(self, matches: Matches, homography: Array) -> Mask:
+        """Which matches to keep, bool (N,)."""
+        if not len(matches):
+            return np.zeros(0, bool)
+        ground = self.own.to_ground(matches.a)
+        lack = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
+        away = ground[:, None] - self.rig.position[None, :, :2]
+        nearest = np.argmin((away**2).sum(-1), axis=1)
+        lever = away[np.arange(len(ground)), nearest]
+        rho = np.hypot(*lever.T)
+        height = np.maximum(self.rig.position[nearest, 2], 1.0)
+        leaning = rho > _LEVER * height
+        apparent = (lack * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
+        if leaning.sum() < FEWEST_TILES:
+            return np.ones(len(matches), bool)
+        usual = float(np.median(apparent[leaning]))
+        spread = 1.4826 * float(np.median(np.abs(apparent[leaning] - usual)))
+        return np.asarray(~leaning | (np.abs(apparent - usual) <= max(_HEIGHT_TOLERANCE_M, 2.0 * spread)))

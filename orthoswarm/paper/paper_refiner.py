@@ -1,0 +1,276 @@
+"""The paper's refiner as a whole: III.C for each vehicle, III.D for each leg, then cameras for all frames.
+
+Legs are independent tasks (III.E). By Eq. 5 a run takes as long as its slowest task plus the sequential rest, given
+enough workers; `Refined.tasks_s` holds what each task took, so that this can be compared with the time measured.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from time import perf_counter, process_time
+
+import numpy as np
+
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Stage, Terrain
+from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
+from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
+from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
+from orthoswarm.refine.bundle.flight_records import Array
+from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.strategy.swarm_refiner import Run, local_origin, serial
+
+Progress = Callable[[str, int, int], None]
+_NEAREST = 3
+_CARRIED_SIGMA_M = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How the paper's refiner works: see CoarseOptions (III.C) and PatchOptions (III.D)."""
+
+    coarse: CoarseOptions = field(default_factory=CoarseOptions)
+    patches: PatchOptions = field(default_factory=PatchOptions)
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Products of a batch: the same vehicles before and after the map.
+
+    Attributes:
+        coarse, fine: one solution a vehicle. terrain: always None, the paper's ground is flat.
+        tasks_s: wall seconds of each parallel task, by step: vehicles of III.C and legs of III.D.
+        sequential_s: wall seconds of what lies between and after these steps. wall_s: of all of it.
+    """
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None = None
+    tasks_s: dict[str, list[float]] = field(default_factory=dict)
+    sequential_s: float = 0.0
+    wall_s: float = 0.0
+
+    def equation_5(self) -> dict[str, float]:
+        """Eq. 5 against the clock: slowest task of each step plus the sequential rest, and the time it really took.
+
+        They meet when there are as many free cores as tasks; the difference is what more workers could save.
+        """
+        slowest = sum(max(t, default=0.0) for t in self.tasks_s.values())
+        return {
+            "slowest_tasks_s": slowest,
+            "sequential_s": self.sequential_s,
+            "predicted_s": slowest + self.sequential_s,
+            "measured_s": self.wall_s,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class PaperState:
+    """What a vehicle leaves for its neighbours: centre and shift of each leg that was found on the map."""
+
+    found: list[tuple[Array, Array]]
+
+
+def refine_all(
+    vehicles: Mapping[str, Sequence[Frame]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    options: Options | None = None,
+    run: Run = serial,
+    progress: Progress | None = None,
+) -> Refined:
+    """Refine a batch of vehicles as the paper does.
+
+    Args:
+        vehicles: id -> frames in order of time.
+        basemap: the map on the area's grid, or None.
+        grid: the area's grid.
+        options: see Options.
+        run: how tasks are run.
+        progress: called with stage, done, all.
+
+    Raises:
+        OrthoSwarmError: if there is nothing to refine.
+    """
+    if not vehicles:
+        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
+    return _refine(split_units(vehicles), [], basemap, grid, origin, options or Options(), run, progress)
+
+
+@dataclass(frozen=True, slots=True)
+class PaperRefiner:
+    """One vehicle as soon as it completes (placement.Refiner).
+
+    Attributes:
+        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
+        options: see Options.
+    """
+
+    epsg: int
+    origin: Array
+    options: Options = field(default_factory=Options)
+
+    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place one vehicle's frames; where none of its legs is found, neighbours carry it.
+
+        Raises:
+            OrthoSwarmError: if there are no frames.
+        """
+        if not frames:
+            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+        units = split_units({frames[0].vehicle: frames})
+        held = [pair for n in neighbours for pair in _found(n)]
+        grid = LocalGrid(self.epsg)
+        return _refine(units, held, basemap, grid, self.origin, self.options, serial, None).fine[0]
+
+
+def _found(solution: Solution) -> list[tuple[Array, Array]]:
+    states = solution.state if isinstance(solution.state, list) else [solution.state]
+    return [pair for state in states if isinstance(state, PaperState) for pair in state.found]
+
+
+def _refine(
+    units: Sequence[Sequence[Frame]],
+    held: Sequence[tuple[Array, Array]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    origin: Array,
+    options: Options,
+    run: Run,
+    progress: Progress | None,
+) -> Refined:
+    clock = perf_counter()
+    first = partial(_timed_coarse, epsg=grid.epsg, origin=origin, options=options.coarse)
+    coarse, tasks_s = [], {"vehicles (III.C)": [], "legs (III.D)": []}  # type: tuple[list[CoarseVehicle], dict[str, list[float]]]
+    parallel_s = -perf_counter()
+    for n, (vehicle, seconds) in enumerate(run(first, units)):
+        coarse.append(vehicle)
+        tasks_s["vehicles (III.C)"].append(seconds)
+        if progress:
+            progress("lines and fields of view", n + 1, len(units))
+    parallel_s += perf_counter()
+    fits: list[dict[int, PatchFit]] = [{} for _ in coarse]
+    if basemap is not None:
+        tasks = [(u, _task(v, k)) for u, v in enumerate(coarse) for k in range(len(v.lines)) if len(v.members(k))]
+        second = partial(match_patch, basemap=basemap, origin=origin, options=options.patches)
+        parallel_s -= perf_counter()
+        for n, fit in enumerate(run(second, [t for _, t in tasks])):
+            fits[tasks[n][0]][fit.leg] = fit
+            tasks_s["legs (III.D)"].append(fit.wall_s)
+            if progress:
+                progress("legs on the map", n + 1, len(tasks))
+        parallel_s += perf_counter()
+    everyone = [*held, *((f.centre, f.shift) for own in fits for f in own.values() if f.homography is not None)]
+    before = [_solution(v, {}, [], origin, "coarse", False) for v in coarse]
+    after = [
+        _solution(v, own, everyone, origin, "fine" if basemap is not None else "coarse", basemap is not None)
+        for v, own in zip(coarse, fits, strict=True)
+    ]
+    fine = merge_units(after)
+    wall_s = perf_counter() - clock
+    return Refined(merge_units(before), fine, None, tasks_s, wall_s - parallel_s, wall_s)
+
+
+def _timed_coarse(
+    frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions
+) -> tuple[CoarseVehicle, float]:
+    clock = perf_counter()
+    return coarse_vehicle(frames, epsg=epsg, origin=origin, options=options), perf_counter() - clock
+
+
+def _task(vehicle: CoarseVehicle, leg: int) -> PatchTask:
+    members = vehicle.members(leg)
+    return PatchTask(vehicle.vehicle, leg, [vehicle.frames[i] for i in members], vehicle.rig.take(members))
+
+
+def _solution(
+    vehicle: CoarseVehicle,
+    fits: Mapping[int, PatchFit],
+    everyone: Sequence[tuple[Array, Array]],
+    origin: Array,
+    stage: Stage,
+    had_map: bool,
+) -> Solution:
+    """Cameras of all frames: legs found on the map by their homography, the others carried."""
+    began = process_time()
+    dropped = {vehicle.frames[i].image: why for i, why in vehicle.damaged.items()}
+    for fit in fits.values():
+        dropped |= fit.damaged
+    matched = {k: f for k, f in fits.items() if f.homography is not None}
+    shift, carried_sigma = _carried(vehicle, matched, everyone)
+    on_map = bool(matched) or shift is not None
+    placed = []
+    sigmas = vehicle.sigma_m.copy()
+    for i, frame in enumerate(vehicle.frames):
+        if frame.image in dropped:
+            continue
+        camera = vehicle.rig.camera(i, np.zeros(2))
+        found = matched.get(int(vehicle.leg[i]))
+        if found is not None:
+            pixels = pixel_grid(camera)
+            ground = camera.to_ground(pixels)
+            if np.isfinite(ground).all():
+                pose = fit_camera(camera, found.move(ground), pixels)
+                camera = pose.camera
+                line = vehicle.lines[int(vehicle.leg[i])].sigma_m  # along the line the records are as rough as across
+                sigmas[i] = np.sqrt(found.rms_m**2 + line**2 / 2 + pose.rms_m**2)
+        elif shift is not None:
+            camera = replace(camera, position=camera.position + np.array([*shift[i], 0.0]))
+            sigmas[i] = np.hypot(
+                carried_sigma, sigmas[i] if vehicle.leg[i] < 0 else vehicle.lines[vehicle.leg[i]].sigma_m
+            )
+        camera = replace(camera, position=camera.position + np.array([*origin, 0.0]))
+        placed.append(PlacedFrame(frame, camera, stage if on_map or stage == "coarse" else "coarse", float(sigmas[i])))
+    warnings = list(vehicle.warnings)
+    if had_map and not matched:
+        how = "neighbours carry it" if shift is not None else "it lies in the GPS frame"
+        warnings.append(f"no leg of this flight was found on the map; {how}")
+    state = PaperState([(f.centre, f.shift) for f in matched.values()])
+    timings = {"relative": vehicle.cpu_s, "patches": sum(f.cpu_s for f in fits.values())}
+    timings["cameras"] = process_time() - began
+    return Solution(
+        vehicle.vehicle, placed, dropped, _legs(vehicle, fits, sigmas, had_map, shift is not None),
+        float(np.degrees(vehicle.rig.camera(0, origin).lens.fov_rad)), float(np.degrees(vehicle.fov_sigma_rad)),
+        None, 0.0, (0.0, 0.0), state, warnings, timings,
+    )  # fmt: skip
+
+
+def _carried(
+    vehicle: CoarseVehicle, matched: Mapping[int, PatchFit], everyone: Sequence[tuple[Array, Array]]
+) -> tuple[Array | None, float]:
+    """Corrections (N, 2) for frames of legs that were not found, from the vehicle's own others, else from neighbours.
+
+    The second number is how far such a correction may be off, metres.
+    """
+    number = np.arange(len(vehicle.frames), dtype=float)
+    if matched:
+        own = [(float(np.flatnonzero(vehicle.leg == k).mean()), f.shift) for k, f in matched.items()]
+        shifts = np.array([s for _, s in own])
+        return carried_shift(number, own), float(max(np.hypot(*shifts.std(axis=0)), _CARRIED_SIGMA_M))
+    if everyone:
+        centre = np.array([c for c, _ in everyone])
+        shifts = np.array([s for _, s in everyone])
+        away = np.hypot(*(centre - vehicle.rig.position[:, :2].mean(axis=0)).T)
+        nearest = np.argsort(away)[:_NEAREST]
+        usual = np.median(shifts[nearest], axis=0)
+        return np.tile(usual, (len(number), 1)), RECEIVER_SIGMA_M
+    return None, RECEIVER_SIGMA_M
+
+
+def _legs(
+    vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, had_map: bool, carried: bool
+) -> list[Leg]:
+    out = []
+    for k in range(len(vehicle.lines)):
+        members = np.flatnonzero(vehicle.leg == k)
+        fit = fits.get(k)
+        found = fit is not None and fit.homography is not None
+        how = "matched" if found else "failed" if had_map and not carried else "carried"
+        confidence = fit.share if fit is not None and found else 0.0
+        out.append(
+            Leg(vehicle.vehicle, int(members[0]), int(members[-1]), how, confidence, float(np.median(sigma[members])))  # type: ignore[arg-type]
+        )
+    return out

@@ -1,0 +1,123 @@
+"""The lines that a method lays over an area, in the few directions that promise most."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.planning.lines import planned_coverage
+from orthoswarm.planning.lines.bcd import bcd_legs
+from orthoswarm.planning.lines.columns import column_legs
+from orthoswarm.planning.lines.detours import Router
+from orthoswarm.planning.lines.line_spacing import Footprint
+from orthoswarm.planning.lines.sweep_lines import Field, rank_directions, stretches
+from orthoswarm.planning.lines.tmstc import tmstc_legs
+from orthoswarm.planning.lines.visiting_order import shorten
+
+Array = NDArray[np.float64]
+Method = Literal["columns", "bcd", "tmstc"]
+
+METHODS: tuple[str, ...] = get_args(Method)
+_TRIES: dict[str, int] = {"columns": 6, "bcd": 6, "tmstc": 8}
+_TRIES_IF_FEW = 12  # few lines are cheap to lay and hard to share
+_MANY_LEGS = 400
+_DENSER = 1.25
+_HOPELESS = 1.08  # a direction dearer than the best by this is not worth mending
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to lay lines.
+
+    Attributes:
+        legs: float64 (n, 2, 2) in flying order, grid metres, gaps mended.
+        stretches: among how many vehicles the legs, without those that mend gaps, can be shared.
+    """
+
+    legs: Array
+    stretches: int
+
+
+def candidates(
+    field: Field, vehicles: int, foot: Footprint, method: Method, turn_m: float, router: Router, reach_m: float
+) -> Iterator[Candidate]:
+    """Ways to lay lines, the most promising directions first; none where the area is all within obstacles.
+
+    Args:
+        field: ground and obstacles, grid metres.
+        vehicles: where few lines are shared by many vehicles, a multiple of them shares out more evenly.
+        foot: footprint of the narrowest camera.
+        method: how to lay and order lines.
+        turn_m: what a turn costs, in metres.
+        router: measures ways around obstacles.
+        reach_m: how far pictures count beyond a leg's ends when looking for gaps.
+    """
+    angles = rank_directions(field, foot, turn_m, vehicles)
+    if method == "tmstc":  # a grid looks the same after a right angle
+        quarter = [a % (0.5 * np.pi) for a in angles]
+        angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < 0.02 for b in quarter[:k])]
+    few, least = False, np.inf
+    for number, angle in enumerate(angles):
+        if number >= (_TRIES_IF_FEW if few else _TRIES[method]):
+            return
+        legs = _lay(field, angle, foot, method, router, 1)
+        if not len(legs):
+            continue
+        count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
+        few = few or count < 4 * vehicles
+        rough = _rough_cost(legs, turn_m)
+        least = min(least, rough)
+        if not few and rough > _HOPELESS * least:
+            continue
+        yield from _finished(field, legs, count, angle, foot, method, router, reach_m)
+        if len(legs) > _MANY_LEGS:  # directions hardly differ then, and each takes its time
+            return
+        if method != "tmstc" and vehicles <= len(legs) < 4 * vehicles:
+            denser = _lay(field, angle, foot, method, router, vehicles)
+            if len(legs) < len(denser) <= _DENSER * len(legs):
+                yield from _finished(field, denser, count, angle, foot, method, router, reach_m)
+
+
+def _rough_cost(legs: Array, turn_m: float) -> float:
+    """Metres to fly a row of legs, turns counted as metres, no-fly zones between legs left out."""
+    ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()
+    return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + turn_m * len(legs))
+
+
+def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Router, multiple: int) -> Array:
+    if method == "columns":
+        return column_legs(field, angle, foot, multiple)
+    if method == "bcd":
+        return planned_coverage.prune(field, bcd_legs(field, angle, foot, router, multiple), foot)
+    return planned_coverage.prune(field, chained(tmstc_legs(field, angle, foot)), foot)
+
+
+def _finished(
+    field: Field, legs: Array, count: int, angle: float, foot: Footprint, method: Method, router: Router, reach_m: float
+) -> Iterator[Candidate]:
+    """The legs without gaps, in the method's own order, and in the order of a local search."""
+    mended = planned_coverage.mend(field, legs, foot, router, reach_m, angle)
+    yield Candidate(mended, count)
+    if method != "columns":
+        yield Candidate(shorten(mended, router), count)
+
+
+def chained(loops: list[Array]) -> Array:
+    """Closed rows of legs one after the other: the first opened at its widest gap, others near the one before.
+
+    Args:
+        loops: float64 (n, 2, 2) each.
+    """
+    if not loops:
+        return np.empty((0, 2, 2))
+    first, *rest = loops
+    gaps = np.hypot(*(first[:, 0] - np.roll(first[:, 1], 1, axis=0)).T)
+    rows = [np.roll(first, -int(np.argmax(gaps)), axis=0)]
+    while rest:
+        here = rows[-1][-1, 1]
+        near = [float(np.hypot(*(loop[:, 0] - here).T).min()) for loop in rest]
+        loop = rest.pop(int(np.argmin(near)))
+        rows.append(np.roll(loop, -int(np.argmin(np.hypot(*(loop[:, 0] - here).T))), axis=0))
+    return np.concatenate(rows)

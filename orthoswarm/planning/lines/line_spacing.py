@@ -1,0 +1,70 @@
+"""What the narrowest camera sees from the planned height, and the distances between lines and pictures from it."""
+
+from dataclasses import dataclass
+from math import isfinite, radians, tan
+
+from orthoswarm.model.errors import InputError
+
+SMALLEST_FOV_DEG, LARGEST_FOV_DEG = 10.0, 150.0
+HIGHEST_M = 10_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """Ground covered by one picture of the narrowest camera, straight down, its width across the leg.
+
+    Attributes:
+        width_m: across the leg, 2 h tan(FoV / 2).
+        height_m: along the leg, width over the aspect ratio.
+        spacing_m: largest distance between neighbouring lines, width (1 - side overlap).
+        trigger_m: distance between pictures on a leg, height (1 - forward overlap).
+    """
+
+    width_m: float
+    height_m: float
+    spacing_m: float
+    trigger_m: float
+
+    @property
+    def overshoot_m(self) -> float:
+        """How far a leg must go beyond what it shall cover, for any phase of the trigger; 0 from 50 % overlap on."""
+        return max(0.0, self.trigger_m - 0.5 * self.height_m)
+
+    @property
+    def reach_m(self) -> float:
+        """How far pictures are certain to see beyond a leg's ends, for any phase of the trigger."""
+        return max(0.0, 0.5 * self.height_m - self.trigger_m)
+
+
+def footprint(
+    altitude_m: float, fov_min_rad: float, aspect: float = 4 / 3, side: float = 0.4, forward: float = 0.8
+) -> Footprint:
+    """The footprint of theta-hat, the field of view below the smallest that any camera of the swarm has (paper III.A).
+
+    Args:
+        altitude_m: height of the legs above ground, metres.
+        fov_min_rad: theta-hat, horizontal, radians.
+        aspect: picture's width over its height.
+        side: overlap of neighbouring lines' pictures, 0 to 0.95.
+        forward: overlap of consecutive pictures, 0 to 0.95.
+
+    Raises:
+        InputError: a value outside its range.
+    """
+    if not (isfinite(altitude_m) and altitude_m > 0.0):
+        raise InputError(f"the altitude is {altitude_m:g} m; give a height above the takeoff point larger than 0")
+    if altitude_m > HIGHEST_M:
+        raise InputError(f"the altitude is {altitude_m:g} m; give metres, at most {HIGHEST_M:g}")
+    if not radians(SMALLEST_FOV_DEG) - 1e-9 <= fov_min_rad <= radians(LARGEST_FOV_DEG) + 1e-9:
+        raise InputError(
+            f"the field of view is outside {SMALLEST_FOV_DEG:g} to {LARGEST_FOV_DEG:g} degrees; "
+            "give the smallest horizontal field of view in the swarm, in degrees"
+        )
+    for name, overlap in (("side", side), ("forward", forward)):
+        if not 0.0 <= overlap <= 0.95:
+            raise InputError(f"the {name} overlap is {overlap:g}; give a share from 0 to 0.95")
+    if not 0.2 <= aspect <= 5.0:
+        raise InputError(f"the aspect ratio is {aspect:g}; give the picture's width over its height, such as 1.333")
+    width = 2.0 * altitude_m * tan(0.5 * fov_min_rad)
+    height = width / aspect
+    return Footprint(width, height, width * (1.0 - side), height * (1.0 - forward))

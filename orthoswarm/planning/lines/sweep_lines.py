@@ -1,0 +1,200 @@
+"""Lines over the ground: turned frames, legs that cover a strip, and the direction that costs least.
+
+In a turned frame lines run along +y and the sweep goes along +x. A leg covers its strip as a band with flat ends:
+it reaches from the lowest to the highest ground in the strip, so that slanted borders leave no triangles uncovered.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.planning.lines.line_spacing import Footprint
+
+Geometry = Any
+Array = NDArray[np.float64]
+
+MOST_LINES = 20_000
+_CRUMB_M2 = 0.05
+_STRETCH = 5.0
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A frame turned against the grid about a point.
+
+    Attributes:
+        angle_rad: counter-clockwise from grid east to the frame's +x axis.
+        centre: grid coordinates of its origin.
+    """
+
+    angle_rad: float
+    centre: tuple[float, float]
+
+    @cached_property
+    def _matrix(self) -> Array:
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        return np.array([[c, -s], [s, c]])
+
+    def to_frame(self, points: Array) -> Array:
+        """Frame coordinates (..., 2) of grid coordinates (..., 2)."""
+        return np.asarray((points - np.asarray(self.centre)) @ self._matrix)
+
+    def to_grid(self, points: Array) -> Array:
+        """Grid coordinates (..., 2) of frame coordinates (..., 2)."""
+        return np.asarray(points @ self._matrix.T + np.asarray(self.centre))
+
+    def turn(self, geometry: Geometry) -> Geometry:
+        """A shapely geometry in frame coordinates."""
+        return shapely.transform(geometry, self.to_frame)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Ground and obstacles in one frame.
+
+    Attributes:
+        ground: what is to be covered, shapely, metres.
+        obstacles: what no leg may cross, shapely, metres.
+    """
+
+    ground: Geometry
+    obstacles: Geometry
+
+    def turned(self, frame: Turned) -> "Field":
+        """The same in a turned frame."""
+        return Field(frame.turn(self.ground), frame.turn(self.obstacles))
+
+    def swapped(self) -> "Field":
+        """The same with x and y exchanged."""
+        return Field(shapely.transform(self.ground, _swap), shapely.transform(self.obstacles, _swap))
+
+
+def _swap(points: Array) -> Array:
+    return points[:, ::-1]
+
+
+def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footprint, merge_m: float) -> list[Array]:
+    """Legs along the middle of an upright box that cover the ground in it, from low to high y.
+
+    Where an obstacle lies on the line, the leg ends before it and another begins behind it.
+
+    Args:
+        field: ground and obstacles; lines run along y.
+        box: x0, y0, x1, y1.
+        foot: footprint; legs overshoot by what it needs and are at least a trigger distance long where there is room.
+        merge_m: gaps between ground shorter than this are flown over with the camera on.
+
+    Returns:
+        float64 (2, 2) arrays, start and end.
+    """
+    piece = shapely.clip_by_rect(field.ground, *box)
+    bounds = shapely.bounds([p for p in shapely.get_parts(piece) if p.area > _CRUMB_M2])
+    if not len(bounds):
+        return []
+    x, more = 0.5 * (box[0] + box[2]), foot.overshoot_m
+    reaches: list[list[float]] = []
+    for low, high in sorted((b[1], b[3]) for b in bounds):
+        if reaches and low - reaches[-1][1] <= merge_m:
+            reaches[-1][1] = max(reaches[-1][1], high)
+        else:
+            reaches.append([low, high])
+    legs = []
+    for low, high in reaches:
+        for free_low, free_high in _free_parts(field.obstacles, x, low - more, high + more):
+            inside = [(max(b[1] - more, free_low), min(b[3] + more, free_high)) for b in bounds]
+            seen = [(a, b) for a, b in inside if b - a > 0.01]
+            if seen:
+                ends = (min(a for a, _ in seen), max(b for _, b in seen))
+                legs.append(_at_least(field.obstacles, x, ends, foot.trigger_m))
+    return legs
+
+
+def _free_parts(obstacles: Geometry, x: float, low: float, high: float) -> list[tuple[float, float]]:
+    line = shapely.LineString([(x, low), (x, high)])
+    free = line.difference(obstacles) if not obstacles.is_empty else line
+    parts = [shapely.bounds(p) for p in shapely.get_parts(free)]
+    return [(float(b[1]), float(b[3])) for b in parts if b[3] - b[1] > 0.01]
+
+
+def _at_least(obstacles: Geometry, x: float, ends: tuple[float, float], length: float) -> Array:
+    """A leg of at least a length about its middle, if nothing stands in the way."""
+    low, high = ends
+    if high - low < length:
+        middle = 0.5 * (low + high)
+        low, high = next(
+            (
+                (a, b)
+                for a, b in _free_parts(obstacles, x, middle - 0.5 * length, middle + 0.5 * length)
+                if a <= low + 0.01 and b >= high - 0.01
+            ),
+            ends,
+        )
+    return np.array([[x, low], [x, high]])
+
+
+def line_count(width_m: float, spacing_m: float) -> int:
+    """Lines that a width needs.
+
+    Raises:
+        InputError: far more than any swarm can fly.
+    """
+    count = max(1, int(np.ceil(width_m / spacing_m - 1e-6)))
+    if count > MOST_LINES:
+        raise InputError(
+            f"the area would need {count} lines {spacing_m:.2g} m apart; fly higher, or check area and field of view"
+        )
+    return count
+
+
+def candidate_angles(ground: Geometry, spacing_m: float) -> Array:
+    """Turning angles worth trying, radians in [0, pi): of long edges, of the tightest box, and every 15 degrees."""
+    outline = ground.simplify(0.1 * spacing_m)
+    edges = [
+        np.diff(shapely.get_coordinates(r), axis=0) for p in shapely.get_parts(outline) for r in shapely.get_rings(p)
+    ]
+    steps = np.concatenate(edges)
+    length, angle = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0]) % np.pi
+    found = list(angle[np.argsort(-length, kind="stable")][:24])
+    box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(ground))
+    found.append(float(np.arctan2(*(box[1] - box[0])[::-1]) % np.pi))
+    found += list(np.radians(np.arange(0, 180, 15)))
+    # Lines run across the sweep, so a line along an edge means a sweep turned by a right angle: both are worth a try.
+    both = np.array([*found, *[(a + 0.5 * np.pi) % np.pi for a in found]])
+    kept: list[float] = []
+    for a in both:
+        if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > np.radians(1.0) for k in kept):
+            kept.append(float(a))
+    return np.array(kept)
+
+
+def direction_cost(field: Field, angle_rad: float, spacing_m: float, turn_m: float) -> tuple[float, int]:
+    """Rough metres to fly, turns counted as metres, and how many vehicles can share the lines of a sweep."""
+    ground = Turned(angle_rad, (0.0, 0.0)).turn(field.ground)
+    x0, y0, x1, y1 = ground.bounds
+    count = line_count(x1 - x0, spacing_m)
+    x = x0 + (x1 - x0) * (np.arange(count) + 0.5) / count
+    ends = np.stack([np.stack([x, np.full(count, y0 - 1)], -1), np.stack([x, np.full(count, y1 + 1)], -1)], 1)
+    cut = shapely.intersection(shapely.linestrings(ends), ground)
+    lengths = shapely.length(shapely.get_parts(cut))
+    cost = float(lengths.sum()) + len(lengths) * turn_m + count * spacing_m
+    return cost, max(count, stretches(lengths, spacing_m))
+
+
+def stretches(lengths_m: Array, spacing_m: float) -> int:
+    """Among how many vehicles legs can be shared: one takes a leg, or a stretch five spacings long of a long leg."""
+    return int(np.maximum(1, np.floor(lengths_m / (_STRETCH * spacing_m))).sum())
+
+
+def rank_directions(field: Field, foot: Footprint, turn_m: float, vehicles: int) -> list[float]:
+    """Sweep angles in radians from the cheapest on; those with too few lines for the vehicles come last."""
+    outline = Field(field.ground.simplify(0.05 * foot.spacing_m), field.obstacles)
+    ranked = []
+    for angle in candidate_angles(outline.ground, foot.spacing_m):
+        cost, lines = direction_cost(outline, float(angle), foot.spacing_m, turn_m)
+        ranked.append((lines < vehicles, cost, float(angle)))
+    return [angle for _, _, angle in sorted(ranked)]

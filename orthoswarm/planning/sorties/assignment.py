@@ -1,0 +1,239 @@
+"""Who flies what: legs shared among the vehicles of a crew, and cut into sorties."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.plan import End
+from orthoswarm.planning.lines.detours import Router
+from orthoswarm.planning.lines.line_spacing import Footprint
+from orthoswarm.planning.lines.visiting_order import shorten
+from orthoswarm.planning.sorties.deconfliction import Maker, Separation, Slot, separate
+from orthoswarm.planning.sorties.flight_path import Flight, make_flight
+from orthoswarm.planning.sorties.flight_time import Motion
+from orthoswarm.planning.sorties.workload_split import Limits, Row, cut, share, sorties
+
+Array = NDArray[np.float64]
+
+MOST_VEHICLES = 250  # MAVLink system ids
+_ITEMS_A_LEG = 4
+_SPARE_ITEMS = 40
+_FARTHEST_M = 100_000.0
+_SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
+_LONGEST_RUN_IN_M = 200.0
+_FAIR, _UNFAIR = 1.15, 1.22
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything about the flights that has a good default.
+
+    Attributes:
+        motion: speeds of the vehicles.
+        end: what a sortie does at last: return to launch, land at home, or hover at the end of its last leg.
+        starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
+            begins), one for all, or several that vehicles are given in turn.
+        endurance_s: longest flight on one battery; infinite without a limit.
+        clearance_m: distance that paths keep from no-fly zones; None keeps a metre, less where pictures are so small
+            that a metre would leave gaps.
+        separation: how far apart vehicles stay.
+        most_items: mission items that the autopilot can hold.
+        run_in_m: straight flight in line with a leg before its first picture, so that the vehicle is out of its turn.
+    """
+
+    motion: Motion = field(default_factory=Motion)
+    end: End = "rtl"
+    starts: Sequence[tuple[float, float]] = ()
+    endurance_s: float = float("inf")
+    clearance_m: float | None = None
+    separation: Separation = field(default_factory=Separation)
+    most_items: int = 650
+    run_in_m: float = 0.0
+
+    def check(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            InputError: a value that is not larger than 0 or out of reach, or a start that is no position.
+        """
+        speed = self.motion.speed_m_s
+        if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
+            raise InputError(f"the speed is {speed:g} m/s; give a number from {_SLOWEST_M_S:g} to {_FASTEST_M_S:g}")
+        positive = {
+            "endurance": (self.endurance_s / 60.0, "min"),
+            "clearance": (1.0 if self.clearance_m is None else self.clearance_m, "m"),
+            "separation": (self.separation.distance_m, "m"),
+            "height step": (self.separation.height_m, "m"),
+        }
+        for name, (value, unit) in positive.items():
+            if not value > 0.0:
+                raise InputError(f"the {name} is {value:g} {unit}; give a number larger than 0")
+        if not 0.0 <= self.run_in_m <= _LONGEST_RUN_IN_M:
+            raise InputError(f"the run-in is {self.run_in_m:g} m; give 0 to {_LONGEST_RUN_IN_M:g}")
+        for name in ("clearance", "separation", "height step"):
+            if not math.isfinite(positive[name][0]):
+                raise InputError(f"the {name} is not finite; give a number of metres")
+        for lat, lon in self.starts:
+            if not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
+                raise InputError(f"the start {lat:g},{lon:g} is no position; give latitude,longitude in degrees")
+
+
+@dataclass(frozen=True)
+class Work:
+    """What each vehicle of a crew flies.
+
+    Attributes:
+        sorties: per vehicle, its sorties' legs, float64 (n, 2, 2) each, in flying order.
+        homes: per vehicle, where it takes off, float64 (2,).
+        longest_s: time in the air of the busiest vehicle.
+        balance: longest over mean path length of the vehicles.
+    """
+
+    sorties: list[list[Array]]
+    homes: list[Array]
+    longest_s: float
+    balance: float
+
+    @property
+    def score(self) -> float:
+        """Less is better: the makespan, dearer where the work is shared unevenly."""
+        price = 2.0 * max(0.0, self.balance - _FAIR) + 6.0 * max(0.0, self.balance - _UNFAIR)
+        return self.longest_s * (1.0 + price)
+
+
+class Crew:
+    """Vehicles that take off somewhere and share legs.
+
+    Attributes:
+        vehicles: how many.
+        starts: float64 (vehicles, 2), grid metres; None where each starts at its own first leg.
+    """
+
+    def __init__(
+        self, vehicles: int, altitude_m: float, foot: Footprint, grid: LocalGrid, router: Router, options: Options
+    ) -> None:
+        if not 1 <= vehicles <= MOST_VEHICLES:
+            raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")
+        options.check()
+        self.vehicles = vehicles
+        self._altitude_m, self._foot, self._router, self._options = altitude_m, foot, router, options
+        self._returns = options.end != "hover"
+        self.starts: Array | None = None
+        if options.starts:
+            lat_lon = np.asarray(options.starts, np.float64)
+            places = grid.to_grid(lat_lon[:, 0], lat_lon[:, 1])
+            if router.inside(places).any():
+                raise InputError("a start lies in a no-fly zone; move it out")
+            self.starts = places[np.arange(vehicles) % len(places)]
+        self._limits = self._flight_limits()
+
+    def _flight_limits(self) -> Limits:
+        motion, apart = self._options.motion, self._options.separation
+        above = apart.layers * apart.height_m  # whatever layer the schedule gives
+        fixed = (self._altitude_m + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
+        if self._returns:
+            fixed += (self._altitude_m + above) / motion.descent_m_s + above / motion.climb_m_s
+        most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)))
+        return Limits(self._options.endurance_s, fixed, apart.swap_s, most_legs)
+
+    def share(self, legs: Array, reorder: bool) -> Work:
+        """Share a row of legs.
+
+        Args:
+            legs: float64 (n, 2, 2) in flying order.
+            reorder: a vehicle may fly its legs in another order if that shortens its ways.
+
+        Raises:
+            InputError: the endurance is too short.
+        """
+        if self.starts is not None:
+            far = float(np.hypot(*(self.starts - legs[0, 0]).T).max())
+            if not far < _FARTHEST_M:
+                raise InputError(f"a start is {far / 1000:.0f} km from the area; check that it is given as LAT,LON")
+        by_time = self._shared(legs, reorder, self._options.motion)
+        if by_time.balance <= _FAIR:
+            return by_time
+        # Where turns take most of the time, even times are uneven paths: try even paths, too.
+        by_length = self._shared(legs, reorder, replace(self._options.motion, acceleration_m_s2=math.inf))
+        return by_length if by_length.score < by_time.score else by_time
+
+    def _shared(self, legs: Array, reorder: bool, motion: Motion) -> Work:
+        options, router = self._options, self._router
+        row = cut(legs, router, motion, self.vehicles, self._least_leg_m)
+        pieces = share(row, self.vehicles, self.starts, self._returns, router, motion, self._limits)
+        if pieces is None:
+            raise self._too_short(row, self.starts)
+        homes, work, lengths, times = [], [], [], []
+        for vehicle, (begin, end) in enumerate(pieces):
+            mine = row.legs(begin, end)
+            home = mine[0, 0] if self.starts is None else self.starts[vehicle]
+            if reorder and self.starts is not None and self._returns:
+                mine = shorten(mine, router, home)
+            flown = self._sorties(mine, home)
+            flights = [self._flight(f, home, 0.0, 0.0) for f in flown]
+            homes.append(home)
+            work.append(flown)
+            lengths.append(sum(f.length_m for f in flights))
+            times.append(sum(f.time_s(options.motion) for f in flights) + (len(flights) - 1) * self._limits.swap_s)
+        return Work(work, homes, max(times), max(lengths) / (sum(lengths) / len(lengths)))
+
+    def schedule(self, work: Work) -> list[list[Slot]]:
+        """Layers and takeoff times of all sorties, so that vehicles stay apart."""
+        makers: list[list[Maker]] = [
+            [partial(self._flight, legs, home) for legs in flown]
+            for flown, home in zip(work.sorties, work.homes, strict=True)
+        ]
+        return separate(makers, self._options.motion, self._options.separation)
+
+    def _flight(self, legs: Array, home: Array, out_m: float, home_m: float) -> Flight:
+        run_in = self._options.run_in_m
+        return make_flight(legs, home, self._altitude_m, self._router, self._returns, out_m, home_m, run_in)
+
+    @property
+    def _least_leg_m(self) -> float:
+        return 4.0 * self._foot.trigger_m
+
+    def _sorties(self, legs: Array, home: Array) -> list[Array]:
+        """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
+        options, limits, least = self._options, self._limits, self._least_leg_m
+        top = options.separation.layers * options.separation.height_m
+        for attempt in range(12):
+            step = least
+            if np.isfinite(limits.endurance_s):
+                step = min(max(limits.endurance_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
+            total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
+            row = cut(legs, self._router, options.motion, 1, step, max(step, total / 2000.0))
+            found = sorties(row, home, self._returns, self._router, options.motion, limits)
+            if found is None:
+                raise self._too_short(row, home[None])
+            result = [row.legs(a, b) for a, b in found]
+            flights = [self._flight(f, home, top, top) for f in result]
+            longest, most = max(f.time_s(options.motion) for f in flights), max(f.items for f in flights)
+            if longest <= options.endurance_s and most <= options.most_items:
+                return result
+            # The cut knows turns and detours only roughly: cut again a little shorter, and by more where that does not
+            # move the cut.
+            fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
+            hair = 0.995 - 0.005 * (1.6**attempt - 1.0)
+            shorter = hair * limits.endurance_s * min(1.0, options.endurance_s / longest)
+            limits = replace(limits, endurance_s=shorter, most_legs=max(1, fewer))
+        raise self._too_short(row, home[None])
+
+    def _too_short(self, row: Row, starts: Array | None) -> InputError:
+        """What to say when a part of the row is out of reach: how long the flight to the farthest would be."""
+        top = self._options.separation.layers * self._options.separation.height_m
+        places = row.parts[:1, 0] if starts is None else starts
+        far = self._router.distances(places, row.parts[:, 0]) + self._router.distances(places, row.parts[:, 1])
+        start, part = np.unravel_index(np.argmax(far), far.shape)
+        home = row.parts[part, 0] if starts is None else places[start]
+        needed = self._flight(row.parts[part][None], home, top, top).time_s(self._options.motion)
+        return InputError(
+            f"the endurance of {self._options.endurance_s / 60:.1f} min is too short: the farthest line needs about "
+            f"{math.ceil(1.05 * needed / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"
+        )

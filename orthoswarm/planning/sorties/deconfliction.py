@@ -1,0 +1,251 @@
+"""Keeping vehicles apart: heights for the ways out and home, and times of takeoff.
+
+Vehicles are placed one after the other, the longest flight first. Each takes the takeoff time and the layers (heights
+of its way out and of its way home) that cost least and keep it apart from all placed before: at any moment, and a few
+seconds earlier or later, far enough away or at another height. For one pair of layers every moment at which two paths
+come close forbids a short interval of takeoff times, so the earliest time left is found in one pass. Around their own
+starts vehicles that share one are kept apart by time alone, because they stand some metres apart there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.planning.sorties.flight_path import Flight
+from orthoswarm.planning.sorties.flight_time import Motion
+
+Array = NDArray[np.float64]
+Maker = Callable[[float, float], Flight]
+
+_STEP_S = 0.5
+_GROUND_M = 2.0
+_LAYER_PRICE_S = 3.0
+_PAD = 1.5  # radius about a start within which only time keeps vehicles apart, in separation distances
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """How far apart vehicles stay.
+
+    Attributes:
+        distance_m: horizontally, or
+        height_m: vertically, the height of a layer.
+        layers: how many layers there are above the legs' height.
+        slack_s: how much earlier or later than planned a vehicle may be.
+        launch_s: time between takeoffs, and between landings, at one start.
+        swap_s: time on the ground between a vehicle's sorties.
+    """
+
+    distance_m: float = 10.0
+    height_m: float = 5.0
+    layers: int = 4
+    slack_s: float = 3.0
+    launch_s: float = 5.0
+    swap_s: float = 120.0
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What a sortie was given.
+
+    Attributes:
+        out_layer: layer of its way out, 0 is the legs' height.
+        home_layer: layer of its way home.
+        start_s: its takeoff, seconds after the swarm's start.
+        flight: its path.
+    """
+
+    out_layer: int
+    home_layer: int
+    start_s: float
+    flight: Flight
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Positions every half second in the air; `ground` samples pass on the ground before the first."""
+
+    home: Array
+    ground: int
+    places: Array
+    pad: NDArray[np.bool_]
+
+
+def _sampled(flight: Flight, motion: Motion, pad_m: float) -> _Track:
+    track = flight.track()
+    times = motion.times(track)
+    moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
+    places = np.stack([np.interp(moments, times, track[:, axis]) for axis in range(3)], axis=1)
+    flying = np.flatnonzero(places[:, 2] > _GROUND_M)
+    places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
+    return _Track(flight.home, int(flying[0]), places, np.hypot(*(places[:, :2] - flight.home).T) < pad_m)
+
+
+@kernel
+def _bins(points, low, cell, shape):  # type: ignore[no-untyped-def]
+    """Points (n, 2 or 3) sorted by raster cell: their order, and where each cell begins."""
+    where = np.empty(len(points), np.int64)
+    start = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    for i in range(len(points)):
+        where[i] = int((points[i, 0] - low[0]) / cell) * shape[1] + int((points[i, 1] - low[1]) / cell)
+        start[where[i] + 1] += 1
+    start = np.cumsum(start)
+    fill, order = start[:-1].copy(), np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        order[fill[where[i]]] = i
+        fill[where[i]] += 1
+    return order, start
+
+
+@kernel
+def _forbid(mine, begin, others, when, bins, raster, apart, marks):  # type: ignore[no-untyped-def]
+    """Mark delays (in samples) at which a track comes near others: +1 where an interval begins, -1 behind its end.
+
+    raster: low x, low y, cell, columns, rows; apart: distance, height, slack in samples.
+    """
+    order, start = bins
+    distance, height, slack = apart[0], apart[1], int(apart[2])
+    cell, columns, rows = raster[2], int(raster[3]), int(raster[4])
+    for i in range(len(mine)):
+        x, y = int(np.floor((mine[i, 0] - raster[0]) / cell)), int(np.floor((mine[i, 1] - raster[1]) / cell))
+        for u in range(max(0, x - 1), min(columns, x + 2)):
+            for v in range(max(0, y - 1), min(rows, y + 2)):
+                for k in range(start[u * rows + v], start[u * rows + v + 1]):
+                    j = order[k]
+                    dx, dy, dz = mine[i, 0] - others[j, 0], mine[i, 1] - others[j, 1], mine[i, 2] - others[j, 2]
+                    if dx * dx + dy * dy < distance * distance and abs(dz) < height:
+                        delay = when[j] - begin[i]
+                        first, last = max(0, delay - slack), min(len(marks) - 2, delay + slack)
+                        if last >= first:
+                            marks[first] += 1
+                            marks[last + 1] -= 1
+
+
+@dataclass(frozen=True)
+class _Frozen:
+    """Samples of the placed flights, all near their starts (`pad`) or all away, in raster cells."""
+
+    pad: bool
+    points: Array
+    when: NDArray[np.int64]
+    bins: tuple[NDArray[np.int64], NDArray[np.int64]]
+    raster: Array
+
+    @classmethod
+    def of(cls, pad: bool, points: Array, when: NDArray[np.int64], cell_m: float) -> "_Frozen":
+        low, high = points[:, :2].min(0), points[:, :2].max(0)
+        cell = max(cell_m, float((high - low).max()) / 1000.0)
+        shape = ((high - low) / cell).astype(np.int64) + 1
+        return cls(pad, points, when, _bins(points, low, cell, shape), np.array([*low, cell, *shape], np.float64))
+
+    def forbid(self, points: Array, when: NDArray[np.int64], apart: Array, marks: NDArray[np.int64]) -> None:
+        _forbid(points, when, self.points, self.when, self.bins, self.raster, apart, marks)
+
+
+class _Sky:
+    """The flights placed so far."""
+
+    def __init__(self, motion: Motion, apart: Separation) -> None:
+        self._motion, self._apart = motion, apart
+        self._tracks: list[tuple[int, _Track]] = []
+        # Between samples a vehicle moves: half a step is added to the distance to keep.
+        self._reach = apart.distance_m + 0.5 * _STEP_S * motion.speed_m_s
+
+    def place(self, make: Maker, ready_s: float) -> Slot:
+        """Give a flight its layers and takeoff, not before it is ready, and remember it."""
+        ready = int(np.ceil(ready_s / _STEP_S))
+        layers = self._apart.layers + 1
+        pairs = sorted(((o, h) for o in range(layers) for h in range(layers)), key=lambda p: (sum(p), p))
+        frozen = self._frozen()
+        best: tuple[float, Slot, _Track, int] | None = None
+        soonest = 0.0
+        for out, home in pairs:
+            price = _LAYER_PRICE_S * (out + home)
+            if best is not None and price + soonest >= best[0]:
+                break
+            flight = make(out * self._apart.height_m, home * self._apart.height_m)
+            track = _sampled(flight, self._motion, _PAD * self._apart.distance_m)
+            marks = self._launches(track, ready)
+            if best is None:  # whatever the layers, takeoffs at one start come one after the other
+                soonest = _first_zero(marks) * _STEP_S
+            self._meetings(track, ready, frozen, marks)
+            delay = _first_zero(marks)
+            if best is None or price + delay * _STEP_S < best[0]:
+                slot = Slot(out, home, (ready + delay) * _STEP_S, flight)
+                best = (price + delay * _STEP_S, slot, track, ready + delay)
+        assert best is not None
+        self._tracks.append((best[3], best[2]))
+        return best[1]
+
+    def _frozen(self) -> list[_Frozen]:
+        """The placed samples away from their starts, and those near them."""
+        if not self._tracks:
+            return []
+        points = np.concatenate([t.places for _, t in self._tracks])
+        pad = np.concatenate([t.pad for _, t in self._tracks])
+        when = np.concatenate([s + t.ground + np.arange(len(t.places)) for s, t in self._tracks])
+        kinds = ((False, ~pad), (True, pad))
+        return [_Frozen.of(near, points[w], when[w], self._reach) for near, w in kinds if w.any()]
+
+    def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
+        """Delays that takeoffs from the same start forbid, as marks; room for all others."""
+        apart = self._apart
+        slack, gap = int(np.ceil(apart.slack_s / _STEP_S)), int(np.ceil(apart.launch_s / _STEP_S))
+        end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
+        marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
+        for start, other in self._tracks:
+            if np.hypot(*(other.home - track.home)) < _PAD * apart.distance_m:
+                _mark(marks, start - ready, gap - 1)
+        return marks
+
+    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: NDArray[np.int64]) -> None:
+        """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
+        apart = self._apart
+        # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
+        limits = np.array([self._reach, apart.height_m - 0.01, np.ceil(apart.slack_s / _STEP_S)])
+        when = ready + track.ground + np.arange(len(track.places))
+        for other in frozen:
+            away = ~track.pad if other.pad else np.ones(len(when), bool)
+            other.forbid(track.places[away], when[away], limits, marks)
+        for start, placed in self._tracks:
+            if np.hypot(*(placed.home - track.home)) < _PAD * apart.distance_m:
+                landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
+                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
+
+
+def _mark(marks: NDArray[np.int64], delay: int, slack: int) -> None:
+    first, last = max(0, delay - slack), min(len(marks) - 2, delay + slack)
+    if last >= first:
+        marks[first] += 1
+        marks[last + 1] -= 1
+
+
+def _first_zero(marks: NDArray[np.int64]) -> int:
+    return int(np.argmax(np.cumsum(marks) == 0))
+
+
+def separate(sorties: Sequence[Sequence[Maker]], motion: Motion, apart: Separation) -> list[list[Slot]]:
+    """Layers and takeoff times for all sorties of all vehicles.
+
+    Args:
+        sorties: per vehicle and sortie, what makes its flight with the way out, and the way home, so many metres
+            higher than the legs.
+        motion: says where a vehicle is when.
+        apart: the distances to keep.
+
+    Returns:
+        The same structure with layers, start and flight.
+    """
+    sky = _Sky(motion, apart)
+    result: list[list[Slot]] = [[] for _ in sorties]
+    ready = [0.0] * len(sorties)
+    for turn in range(max(map(len, sorties))):
+        due = {v: ready[v] + row[turn](0.0, 0.0).time_s(motion) for v, row in enumerate(sorties) if turn < len(row)}
+        for vehicle in sorted(due, key=lambda v: -due[v]):  # a delay hurts least where there is time left: it goes last
+            slot = sky.place(sorties[vehicle][turn], ready[vehicle])
+            result[vehicle].append(slot)
+            ready[vehicle] = slot.start_s + slot.flight.time_s(motion) + apart.swap_s
+    return result

@@ -1,0 +1,125 @@
+"""One flight from its legs: way out, legs with the ways between, way home, in grid metres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.planning.lines.detours import Router
+from orthoswarm.planning.sorties.flight_time import Motion, length, turns
+
+Array = NDArray[np.float64]
+
+_SAME_M = 0.05
+_STRAIGHT = 0.985  # cosine of ten degrees
+
+
+@dataclass(frozen=True)
+class Flight:
+    """The path of one sortie.
+
+    Attributes:
+        home: float64 (2,), where it takes off.
+        climb_m: height to climb to at home.
+        points: float64 (n, 3), waypoints: easting, northing, height above takeoff.
+        camera: int8 (n,): 1 at a leg's first point, -1 at its last, else 0.
+        returns: the last point is above home, and the vehicle comes down there.
+    """
+
+    home: Array
+    climb_m: float
+    points: Array
+    camera: NDArray[np.int8]
+    returns: bool
+
+    def track(self) -> Array:
+        """The whole path from the ground on, (n, 3)."""
+        up = [[*self.home, 0.0], [*self.home, self.climb_m]]
+        down = [[*self.home, 0.0]] if self.returns else np.empty((0, 3))
+        return np.concatenate([up, self.points, down])
+
+    def time_s(self, motion: Motion) -> float:
+        """Seconds from takeoff to the end."""
+        return float(motion.times(self.track())[-1])
+
+    @property
+    def length_m(self) -> float:
+        """Horizontal metres flown."""
+        return length(self.track())
+
+    @property
+    def turns(self) -> int:
+        """Changes of direction by more than ten degrees."""
+        return turns(self.track())
+
+    @property
+    def items(self) -> int:
+        """Mission items that it needs: waypoints, camera commands, home, takeoff, speed and the end."""
+        return len(self.points) + int(np.count_nonzero(self.camera)) + 4
+
+
+def make_flight(
+    legs: Array,
+    home: Array,
+    altitude_m: float,
+    router: Router,
+    returns: bool,
+    out_m: float = 0.0,
+    home_m: float = 0.0,
+    run_in_m: float = 0.0,
+) -> Flight:
+    """The flight over a row of legs.
+
+    Args:
+        legs: float64 (n, 2, 2) in flying order.
+        home: float64 (2,).
+        altitude_m: height of the legs and of the ways between them.
+        router: finds ways around obstacles.
+        returns: fly back above home at the end.
+        out_m: how much higher the way out is.
+        home_m: how much higher the way home is.
+        run_in_m: length of a straight, in line with the leg, before its first picture; left out where an obstacle or
+            the start lies in the way, and where the vehicle comes straight on.
+    """
+    points: list[Array] = []
+    camera: list[int] = []
+
+    def add(path: Array, height: float, mark: int = 0) -> None:
+        for point in path:
+            points.append(np.array([*point, height]))
+            camera.append(mark)
+
+    far = float(np.hypot(*(legs[0, 0] - home))) > _SAME_M
+    climb = altitude_m + (out_m if far else 0.0)
+    if far:
+        entry = _entry(legs[0], home, router, run_in_m)
+        add(router.path(home, entry[0])[1:-1], climb)
+        if out_m > 0.0:
+            add(entry[:1], climb)
+        add(entry[:-1], altitude_m)
+    for k, (start, end) in enumerate(legs):
+        if k:
+            entry = _entry(legs[k], legs[k - 1, 1], router, run_in_m)
+            add(router.path(legs[k - 1, 1], entry[0])[1:-1], altitude_m)
+            add(entry[:-1], altitude_m)
+        add(start[None], altitude_m, 1)
+        add(end[None], altitude_m, -1)
+    if returns:
+        if home_m > 0.0:
+            add(legs[-1:, 1], altitude_m + home_m)
+        add(router.path(legs[-1, 1], home)[1:], altitude_m + home_m)
+    return Flight(home, climb, np.array(points), np.array(camera, np.int8), returns)
+
+
+def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:
+    """Where a leg is entered, coming from a point: its first point, behind that of a run-in if there is one."""
+    start = leg[:1]
+    if run_in_m <= 0.0:
+        return start
+    along = (leg[1] - leg[0]) / np.hypot(*(leg[1] - leg[0]))
+    way = leg[0] - before
+    comes_straight = float(way @ along) >= _STRAIGHT * float(np.hypot(*way))
+    ahead = start - run_in_m * along
+    if comes_straight or router.inside(ahead)[0] or router.blocked(ahead, start)[0]:
+        return start
+    return np.concatenate([ahead, start])

@@ -1,0 +1,142 @@
+"""The pre-disaster map: windows of a GeoTIFF, COG, MBTiles file or folder of XYZ tiles on the area's grid.
+
+Nothing is read but the windows that are asked for. Whatever the file holds (grey, colour, palette, 16 bit, floats,
+alpha, nodata, a rotated or foreign grid) leaves here as 8-bit values and a mask of where they mean something.
+"""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.raster.gdal_map import RasterMap, luma
+from orthoswarm.raster.map_check import common, sample_windows
+from orthoswarm.raster.tile_folder import TileFolder
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Bounds = tuple[float, float, float, float]
+
+
+class _Source(Protocol):
+    """Where pixels come from: a raster file or a folder of tiles."""
+
+    native_gsd_m: float
+    bounds: Bounds
+
+    def gsds(self) -> list[float]:
+        """A pixel size for each of the resolutions that are stored, metres."""
+
+    def require_whole(self, bounds: Bounds) -> None:
+        """Raise UnreadableMapError if the file is shorter than what it says to hold within bounds."""
+
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+        """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
+
+
+class Basemap:
+    """A pre-disaster map as the core sees it (`placement.MapWindow`); may be pickled and shared among threads.
+
+    Attributes:
+        path: the file or folder.
+        epsg: the area's grid, in which windows are asked for and returned.
+    """
+
+    def __init__(self, path: Path, epsg: int, near: Bounds | None) -> None:
+        self.path = path
+        self.epsg = epsg
+        self._near = near
+
+    @cached_property
+    def _source(self) -> _Source:
+        """The open map; a copy in another process opens its own at its first use, where an error can be said."""
+        kind = TileFolder if self.path.is_dir() else RasterMap
+        return kind(self.path, self.epsg, self._near)
+
+    @classmethod
+    def open(cls, path: str | Path, epsg: int, near: Bounds | None = None) -> "Basemap":
+        """Open a map for an area.
+
+        Args:
+            path: GeoTIFF, COG, MBTiles or anything else that GDAL reads, or a folder z/x/y.png|jpg|webp.
+            epsg: EPSG code of the area's grid (metres).
+            near: west, south, east, north of the area in that grid; the map must touch it.
+
+        Raises:
+            InputError: if the map cannot be read, has no coordinate system or lies elsewhere.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise InputError(f"the basemap {path} does not exist; check the path")
+        basemap = cls(path, epsg, near)
+        basemap.require_overlap(near or basemap.bounds)
+        return basemap
+
+    @property
+    def bounds(self) -> Bounds:
+        """West, south, east, north of the map in the area's grid; of a huge map, of the part near the area."""
+        return self._source.bounds
+
+    @property
+    def native_gsd_m(self) -> float:
+        """Size of the map's own pixel on the ground of the area, metres."""
+        return self._source.native_gsd_m
+
+    def require_overlap(self, near: Bounds) -> None:
+        """Raise InputError, saying how far away the map is, unless it touches the bounds."""
+        west, south, east, north = self.bounds
+        dx = max(west - near[2], near[0] - east, 0.0)
+        dy = max(south - near[3], near[1] - north, 0.0)
+        if dx or dy:
+            away = float(np.hypot(dx, dy))
+            size = f"{away / 1000:,.1f} km" if away >= 1000 else f"{away:.0f} m"
+            raise InputError(
+                f"the basemap {self.path.name} does not overlap the flight, it is {size} away; give a map of this area"
+            )
+
+    def require_readable(self, near: Bounds) -> None:
+        """Raise UnreadableMapError if a map that was opened is cut short or damaged where it is needed.
+
+        Args:
+            near: west, south, east, north of the area in its grid, metres. Only what the map has of it counts.
+        """
+        bounds = common(near, self.bounds)
+        if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+            return
+        self._source.require_whole(bounds)
+        for gsd in self._source.gsds():
+            for window in sample_windows(bounds, gsd):
+                self.gray(window, gsd)
+
+    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], Mask]:
+        """Grey values and validity of a window.
+
+        Args:
+            bounds: west, south, east, north in the area's grid, metres.
+            gsd_m: pixel size of the answer; coarser than the map averages, finer interpolates.
+
+        Returns:
+            Values float32 (rows, columns) from 0 to 255 (0 where invalid) and validity bool (rows, columns), on the
+            grid GroundGrid.around(epsg, bounds, gsd_m).
+        """
+        data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=True)
+        gray = luma(data)[0].astype(np.float32)
+        gray[~valid] = 0.0
+        return gray, valid
+
+    def rgb(self, bounds: Bounds, gsd_m: float) -> tuple[Bytes, Mask]:
+        """Colours uint8 (rows, columns, 3) and validity of a window; the grid is that of `gray`."""
+        data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=False)
+        out = np.array(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0), order="C")  # never a view
+        out[~valid] = 0
+        return out, valid
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self.path, "epsg": self.epsg, "near": self._near}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["path"], state["epsg"], state["near"])  # type: ignore[misc]

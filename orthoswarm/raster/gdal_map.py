@@ -1,0 +1,352 @@
+"""A map in a file that GDAL reads: windows of it on the area's grid, as 8-bit values and where they mean something."""
+
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.raster.map_check import UnreadableMapError, ends_early
+from orthoswarm.raster.resampling import resample
+
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Bounds = tuple[float, float, float, float]
+
+# GDAL keeps 5 % of the machine's memory in blocks otherwise, in every process; it reads this at its first block.
+os.environ.setdefault("GDAL_CACHEMAX", "64")
+
+_FLAT_PX = 15
+_READ_AT_ONCE = 8_000_000
+_STRETCH_PERCENT = (0.5, 99.5)
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """How stored values become 8 bit: per band, low to 0 and high to 255."""
+
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+
+    def apply(self, data: NDArray[Any]) -> Bytes:
+        low, scale = self.low[:, None, None], (255.0 / (self.high - self.low))[:, None, None]
+        return np.clip(np.nan_to_num((data.astype(np.float32) - low) * scale) + 0.5, 0, 255).astype(np.uint8)
+
+
+class RasterMap:
+    """A file that GDAL reads. Handles belong to one thread of one process; each opens its own.
+
+    Attributes:
+        native_gsd_m: size of the map's own pixel on the ground of the area, metres.
+        bounds: west, south, east, north in the area's grid; of a huge map, of the part near the area.
+    """
+
+    def __init__(self, path: Path, epsg: int, near: Bounds | None) -> None:
+        import rasterio
+        from rasterio.errors import RasterioError
+
+        self._error = RasterioError
+        self._path = path
+        self._epsg = epsg
+        self._handles = threading.local()
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
+            source = self._open()
+        self._crs = _crs_of(source, path)
+        self._factors = [int(f) for f in source.overviews(1)] if source.count else []
+        self._bands, self._alpha, self._palette = _band_roles(source)
+        self.native_gsd_m, self.bounds = _placement(source, self._crs, path, epsg, near)
+        self._opaque = self._alpha is None and not any("nodata" in [f.name for f in m] for m in source.mask_flag_enums)
+        self._opaque &= not any("per_dataset" in [f.name for f in m] for m in source.mask_flag_enums)
+        t = source.transform
+        self._affine = _affine_of(source)
+        self._aligned = t.b == 0 and t.d == 0 and t.a > 0 > t.e and self._crs.to_epsg() == epsg
+        eight_bit = all(source.dtypes[b - 1] == "uint8" for b in self._bands)
+        with self._reading():
+            self._stretch = None if eight_bit or self._palette is not None else self._limits(epsg)
+
+    def _open(self, level: int | None = None) -> Any:
+        import rasterio
+        from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
+
+        handles: dict[Any, Any] = self._handles.__dict__
+        key = (os.getpid(), level)
+        if key not in handles:
+            options: dict[str, Any] = {} if level is None else {"OVERVIEW_LEVEL": level}
+            if self._path.suffix.lower() == ".mbtiles":
+                # Bounds that cut a pixel move the whole map by up to half of one: GDAL takes them as the corner, and
+                # whole pixels from there.
+                options["USE_BOUNDS"] = "NO"
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said as an error, in plain words
+                    handles[key] = rasterio.open(self._path, **options)
+            except (RasterioIOError, OSError):
+                raise UnreadableMapError(
+                    f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"
+                ) from None
+        return handles[key]
+
+    def gsds(self) -> list[float]:
+        """A pixel size for each stored resolution, metres."""
+        return [self.native_gsd_m, *(2.0 * f * self.native_gsd_m for f in self._factors)]
+
+    def require_whole(self, bounds: Bounds) -> None:
+        """Raise UnreadableMapError if the file is too short for its blocks within bounds (in the area's grid)."""
+        from rasterio.warp import transform_bounds
+
+        source = self._open()
+        west, south, east, north = transform_bounds(f"EPSG:{self._epsg}", self._crs, *bounds, densify_pts=5)
+        corners = np.array([_apply(~self._affine, x, y) for x in (west, east) for y in (south, north)])
+        (c0, r0), (c1, r1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
+        rows, cols = np.clip([r0, r1], 0, source.height), np.clip([c0, c1], 0, source.width)
+        if ends_early(source, self._path, (int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1]))):
+            raise UnreadableMapError(f"the basemap {self._path.name} is cut short; copy or export it again")
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """What goes wrong within is said in plain words."""
+        try:
+            yield
+        except (self._error, OSError) as error:
+            raise UnreadableMapError(
+                f"the basemap {self._path.name} is damaged ({_short(error)}); copy or export it again"
+            ) from None
+
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+        """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
+        with self._reading():
+            if self._palette is not None:
+                return self._read_palette(grid)
+            if self._aligned:
+                parts = [self._read_aligned(part, gray) for part in self._bands_of(grid)]
+                return parts[0] if len(parts) == 1 else _below_each_other(parts)
+            data, valid = self._warp(grid)
+        if self._opaque:
+            valid &= ~_blank(data)
+        return self._eight_bit(data), valid
+
+    def _eight_bit(self, data: NDArray[Any]) -> Bytes:
+        return self._stretch.apply(data) if self._stretch is not None else np.asarray(data, np.uint8)
+
+    def _level(self, grid: GroundGrid) -> int | None:
+        """The overview to read from: made by anyone in any way, so a factor of two is left to our own averaging."""
+        ratio = grid.gsd_m / self.native_gsd_m
+        usable = [i for i, f in enumerate(self._factors) if f <= ratio / 2]
+        return usable[-1] if usable else None
+
+    def _bands_of(self, grid: GroundGrid) -> list[GroundGrid]:
+        """A grid in bands of rows for which not too many pixels are read at once: maps need not have overviews."""
+        t = self._open(self._level(grid)).transform
+        read = grid.width * (grid.gsd_m / t.a) * (grid.gsd_m / -t.e)
+        rows = max(1, int(_READ_AT_ONCE / max(read, 1.0)))
+        return [
+            replace(grid, north=grid.north - top * grid.gsd_m, height=min(rows, grid.height - top))
+            for top in range(0, grid.height, rows)
+        ]
+
+    def _read_aligned(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+        """A window of a raster that lies on the area's own grid, north up: several times cheaper than warping."""
+        from rasterio.windows import Window
+
+        source = self._open(self._level(grid))
+        t = source.transform
+        west, south, east, north = grid.bounds
+        margin = 4 + int(max(0.0, grid.gsd_m / t.a - 4.0))
+        c0, c1 = int((west - t.c) / t.a) - margin, int((east - t.c) / t.a) + 1 + margin
+        r0, r1 = int((north - t.f) / t.e) - margin, int((south - t.f) / t.e) + 1 + margin
+        c0, c1 = max(c0, 0), min(c1, source.width)
+        r0, r1 = max(r0, 0), min(r1, source.height)
+        if c0 >= c1 or r0 >= r1:
+            bands = 1 if gray else len(self._bands)
+            return np.zeros((bands, grid.height, grid.width), np.uint8), np.zeros((grid.height, grid.width), bool)
+        window = Window(c0, r0, c1 - c0, r1 - r0)
+        data = source.read(self._bands, window=window)
+        valid = ~_blank(data) if self._opaque else source.dataset_mask(window=window) > 127
+        if data.dtype.kind == "f":
+            valid &= np.isfinite(data).all(axis=0)
+        data = self._eight_bit(data)
+        if gray:
+            data = luma(data)
+        scale = (grid.gsd_m / t.a, grid.gsd_m / -t.e)
+        first = ((west - t.c) / t.a - c0, (north - t.f) / t.e - r0)
+        return resample(data, valid, first, scale, (grid.width, grid.height))
+
+    def _warp(self, grid: GroundGrid, nearest: bool = False) -> tuple[NDArray[Any], Mask]:
+        """The bands and the validity of a window, resampled: averaged where it is coarser than the map."""
+        from rasterio.enums import Resampling
+        from rasterio.vrt import WarpedVRT
+
+        ratio = grid.gsd_m / self.native_gsd_m
+        source = self._open(self._level(grid))
+        how = Resampling.nearest if nearest else Resampling.average if ratio >= 2 else Resampling.cubic
+        options: dict[str, Any] = {
+            "src_crs": self._crs,
+            "crs": f"EPSG:{grid.epsg}",
+            "transform": grid.affine(),
+            "width": grid.width,
+            "height": grid.height,
+            "resampling": how,
+            "tolerance": 0.01,
+            "add_alpha": self._alpha is None,
+            "warp_mem_limit": 32,
+        }
+        with WarpedVRT(source, **options) as vrt:
+            bands = vrt.read([*self._bands, self._alpha or vrt.count])
+        full = 255 if self._alpha is None else _alpha_range(source.dtypes[self._alpha - 1])
+        valid = bands[-1] > 0.5 * full
+        data = bands[:-1]
+        if data.dtype.kind == "f":
+            valid &= np.isfinite(data).all(axis=0)
+        return data, valid
+
+    def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Mask]:
+        """Palette numbers cannot be averaged: take them three times finer, look colours up, then average those."""
+        import cv2
+
+        west, _, _, north = grid.bounds
+        fine = GroundGrid(grid.epsg, west, north, grid.gsd_m / 3, 3 * grid.width, 3 * grid.height)
+        index, valid = self._warp(fine, nearest=True)
+        assert self._palette is not None
+        size = (grid.width, grid.height)
+        colours = cv2.resize(self._palette[index[0]], size, interpolation=cv2.INTER_AREA)
+        share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        return np.ascontiguousarray(colours.transpose(2, 0, 1)), share > 0.5
+
+    def _limits(self, epsg: int) -> _Stretch:
+        """Percentiles of the map near the area, from about half a million pixels."""
+        west, south, east, north = self.bounds
+        side = max(self.native_gsd_m, float(np.sqrt((east - west) * (north - south) / 5e5)))
+        data, valid = self._warp(GroundGrid.around(epsg, self.bounds, side))
+        low, high = np.zeros(len(data), np.float32), np.ones(len(data), np.float32)
+        for i, band in enumerate(data):
+            values = band[valid]
+            if values.size:
+                low[i], high[i] = np.percentile(values.astype(np.float64), _STRETCH_PERCENT)
+            if not high[i] > low[i]:
+                high[i] = low[i] + 1.0
+        return _Stretch(low, high)
+
+
+def _below_each_other(parts: list[tuple[Bytes, Mask]]) -> tuple[Bytes, Mask]:
+    return np.concatenate([data for data, _ in parts], axis=1), np.concatenate([valid for _, valid in parts])
+
+
+def luma(data: Bytes) -> Bytes:
+    """Grey uint8 (1, rows, columns) of one or three bands."""
+    import cv2
+
+    if len(data) == 1:
+        return data
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(data.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY))[None]
+
+
+def _crs_of(source: Any, path: Path) -> Any:
+    """The raster's CRS, from its ground control points where it has no transform."""
+    crs = source.crs or source.gcps[1]
+    if source.crs and source.transform.is_identity and not source.gcps[0] and not source.rpcs:
+        crs = None
+    if not crs:
+        raise InputError(
+            f"the basemap {path.name} has no coordinate system (CRS); georeference it, for example with QGIS, or give "
+            "another map"
+        )
+    return crs
+
+
+def _band_roles(source: Any) -> tuple[list[int], int | None, Bytes | None]:
+    """Band numbers of the picture (one or three), of the alpha, and the palette as uint8 (256, 3)."""
+    from rasterio.enums import ColorInterp
+
+    roles = list(source.colorinterp)
+    alpha = roles.index(ColorInterp.alpha) + 1 if ColorInterp.alpha in roles else None
+    if ColorInterp.palette in roles:
+        palette = np.zeros((256, 3), np.uint8)
+        for value, colour in source.colormap(roles.index(ColorInterp.palette) + 1).items():
+            if value < 256:
+                palette[value] = colour[:3]
+        return [roles.index(ColorInterp.palette) + 1], alpha, palette
+    colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    if all(c in roles for c in colours):
+        return [roles.index(c) + 1 for c in colours], alpha, None
+    plain = [i + 1 for i in range(source.count) if i + 1 != alpha]
+    return (plain[:3] if len(plain) >= 3 else plain[:1]), alpha, None
+
+
+def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None) -> tuple[float, Bounds]:
+    """Pixel size on the ground and bounds in the area's grid; of a huge map, of the part around the area."""
+    from rasterio.errors import CRSError, RasterioError
+    from rasterio.warp import transform, transform_bounds
+
+    target = f"EPSG:{epsg}"
+    affine = _affine_of(source)
+    corners = np.array([_apply(affine, *p) for p in _ring(source.width, source.height)])
+    own = (corners[:, 0].min(), corners[:, 1].min(), corners[:, 0].max(), corners[:, 1].max())
+    try:
+        if near is not None:
+            margin = max(5000.0, 2 * (near[2] - near[0]), 2 * (near[3] - near[1]))
+            wide = (near[0] - margin, near[1] - margin, near[2] + margin, near[3] + margin)
+            there = transform_bounds(target, crs, *wide, densify_pts=5)
+            cut = (max(own[0], there[0]), max(own[1], there[1]), min(own[2], there[2]), min(own[3], there[3]))
+            if cut[0] < cut[2] and cut[1] < cut[3]:
+                own = cut
+        bounds = tuple(float(v) for v in transform_bounds(crs, target, *own, densify_pts=21))
+        middle = _apply(~affine, 0.5 * (own[0] + own[2]), 0.5 * (own[1] + own[3]))
+        steps = [_apply(affine, middle[0] + dx, middle[1] + dy) for dx, dy in ((0, 0), (1, 0), (0, 1))]
+        x, y = (np.array(v) for v in transform(crs, target, *zip(*steps, strict=True)))
+    except (CRSError, RasterioError) as error:
+        raise InputError(
+            f"the basemap {path.name} cannot be brought to the area's grid ({_short(error)}); check its CRS"
+        ) from None
+    size = np.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
+    if not (np.isfinite(bounds).all() and np.isfinite(size) and size > 0):
+        raise InputError(f"the basemap {path.name} lies outside the area's grid; give a map of this area")
+    return float(size), (bounds[0], bounds[1], bounds[2], bounds[3])
+
+
+def _affine_of(source: Any) -> Any:
+    """From pixels to the raster's CRS; fitted to its ground control points where it has no transform."""
+    from rasterio.transform import from_gcps
+
+    return source.transform if source.crs else from_gcps(source.gcps[0])
+
+
+def _apply(affine: Any, x: float, y: float) -> tuple[float, float]:
+    return affine.a * x + affine.b * y + affine.c, affine.d * x + affine.e * y + affine.f
+
+
+def _ring(width: int, height: int) -> list[tuple[float, float]]:
+    """Points on the raster's border, in pixels."""
+    steps = np.linspace(0.0, 1.0, 5)
+    ring = [(s * width, t * height) for s in steps for t in (0.0, 1.0)]
+    return ring + [(t * width, s * height) for s in steps for t in (0.0, 1.0)]
+
+
+def _alpha_range(dtype: str) -> float:
+    return float(np.iinfo(dtype).max) if np.dtype(dtype).kind in "iu" else 1.0
+
+
+def _blank(values: NDArray[Any]) -> Mask:
+    """Where a map without a mask is plain black or plain white over a patch: a collar, which only has false edges."""
+    import cv2
+
+    box = np.ones((_FLAT_PX, _FLAT_PX), np.uint8)
+    wider = np.ones((_FLAT_PX + 4, _FLAT_PX + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
+    out = np.zeros(values.shape[1:], bool)
+    for value in (0, 255) if values.dtype == np.uint8 else (0,):
+        flat = (values == value).all(axis=0)
+        if flat.sum() >= _FLAT_PX**2:
+            core = cv2.erode(flat.astype(np.uint8), box, borderValue=1)
+            out |= cv2.dilate(core, wider, borderValue=0).astype(bool)
+    return out
+
+
+def _short(error: Exception) -> str:
+    return str(error).splitlines()[0][:120]

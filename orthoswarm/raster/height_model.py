@@ -1,0 +1,288 @@
+"""An outside height model: a GeoTIFF of any CRS as terrain of the area, relative to the takeoff level."""
+
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.placement import Terrain
+
+Array = NDArray[np.float64]
+
+_METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
+           "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 0.3048006096012192,
+           "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
+_MOST_NODES = 4_000_000
+_FINEST_M = 2.0
+
+MOST_BURIED = 0.05
+"""Part of the cameras that a DEM may bury: a few recorded heights can be wrong."""
+LEAST_COVER = 0.02
+"""A DEM with heights on less of the area than this is of another place."""
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class KnownGround:
+    """Heights of a DEM in a window.
+
+    Attributes:
+        terrain: heights over the model's zero; smoothly filled where the DEM has none.
+        known: bool (rows, columns), nodes where it has.
+    """
+
+    terrain: Terrain
+    known: NDArray[np.bool_]
+
+    def knows(self, east_north: Array) -> NDArray[np.bool_]:
+        """Whether the DEM has heights all around positions (M, 2)."""
+        t = self.terrain
+        c, r = (east_north[..., 0] - t.west) / t.step_m, (east_north[..., 1] - t.south) / t.step_m
+        rows, columns = self.known.shape
+        inside = (c >= 0) & (r >= 0) & (c <= columns - 1) & (r <= rows - 1)
+        share = Terrain(t.west, t.south, t.step_m, self.known.astype(np.float32)).height(east_north)
+        return np.asarray(inside & (share > 0.999))
+
+
+@dataclass(frozen=True, slots=True)
+class HeightModel:
+    """A DEM that was looked at: where it lies and what counts as zero. Heights are read where and when they are needed.
+
+    It is small, so that a task for another process can carry it; the file must lie at the same path there.
+
+    Attributes:
+        path: the file. epsg: CRS of the area.
+        zero_m: height in the DEM's own datum that counts as 0: the ground in the middle below the cameras.
+        cover: share of the area on which it has heights.
+    """
+
+    path: Path
+    epsg: int
+    zero_m: float
+    cover: float
+
+    @classmethod
+    def open(cls, path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> "HeightModel":
+        """Look at a DEM before the work begins.
+
+        Args:
+            path: a GeoTIFF (or anything that GDAL reads) with a CRS. epsg: CRS of the area.
+            bounds: west, south, east, north of the area.
+            cameras: (N, 3) east, north and height above takeoff; NaN for an unknown height.
+
+        Raises:
+            InputError: if it cannot be read, has no CRS, no heights on the area, or buries cameras.
+        """
+        ground = _window(path, epsg, bounds, _MOST_NODES)
+        cover = float(ground.known.mean())
+        if cover < LEAST_COVER:
+            raise InputError(_no_cover(path, epsg, bounds, cover))
+        at = np.asarray(cameras, float).reshape(-1, 3)
+        at = at[ground.knows(at[:, :2])]
+        below = ground.terrain.height(at[:, :2]) if len(at) else ground.terrain.z[ground.known].astype(np.float64)
+        zero = float(np.median(below))
+        if len(at):
+            _refuse_buried(path, below - zero, at[:, 2])
+        return cls(Path(path).absolute(), epsg, zero, cover)
+
+    def window(self, bounds: Bounds, most_nodes: int = 250_000) -> KnownGround:
+        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many."""
+        return _window_over(self, bounds, most_nodes)
+
+
+@lru_cache(maxsize=6)
+def _window_over(model: HeightModel, bounds: Bounds, most_nodes: int) -> KnownGround:
+    ground = _window(model.path, model.epsg, bounds, most_nodes)
+    t = ground.terrain
+    return KnownGround(Terrain(t.west, t.south, t.step_m, t.z - np.float32(model.zero_m)), ground.known)
+
+
+def _window(path: Path, epsg: int, bounds: Bounds, most_nodes: int) -> KnownGround:
+    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+    z, left, low, step = _on_area(Path(path), epsg, bounds, None, max(_FINEST_M, float(np.sqrt(area / most_nodes))))
+    known = np.isfinite(z)
+    z = _filled(z, known) if known.any() else np.zeros(z.shape)
+    return KnownGround(Terrain(left, low, step, z.astype(np.float32)), known)
+
+
+def read_dem(
+    path: Path,
+    epsg: int,
+    bounds: Bounds,
+    *,
+    takeoff: ArrayLike | None = None,
+    level_m: float | None = None,
+    step_m: float | None = None,
+    least_cover: float = 0.5,
+) -> Terrain:
+    """Ground heights of a DEM on a regular grid of nodes in the area's CRS.
+
+    Heights become relative to the takeoff level, as the cameras' are: the DEM's height under `takeoff` (the median
+    where several positions are given: the cameras' own are a good choice) is zero. Whether the DEM's heights are
+    orthometric or ellipsoidal therefore does not matter. Gaps are filled smoothly from their borders.
+
+    Args:
+        path: a GeoTIFF (or anything that GDAL reads) with a CRS; its nodata, scale, offset and unit are honoured.
+        epsg: CRS of the area.
+        bounds: west, south, east, north of the area in that CRS.
+        takeoff: (2,) or (N, 2) positions in that CRS whose median ground height is the datum; None: the area's
+            median height.
+        level_m: absolute height of the takeoff level in the DEM's own datum (metres), instead of `takeoff`.
+        step_m: distance of nodes; None takes the DEM's own pixel, at least 2 m, and at most 4 million nodes.
+        least_cover: least share of the area on which the DEM must have heights.
+
+    Raises:
+        InputError: if the file cannot be read, has no CRS, or does not cover the area.
+    """
+    west, south, east, north = bounds
+    if not (east > west and north > south):
+        raise InputError("the area of the flight is empty, so no heights can be read; check the positions")
+    z, left, low, step = _on_area(Path(path), epsg, bounds, step_m)
+    known = np.isfinite(z)
+    if known.mean() < least_cover:
+        raise InputError(_no_cover(path, epsg, bounds, float(known.mean())))
+    z = _filled(z, known)
+    absolute = Terrain(left, low, step, z.astype(np.float32))
+    if level_m is None:
+        under = z if takeoff is None else absolute.height(np.asarray(takeoff, float).reshape(-1, 2))
+        level_m = float(np.median(under))
+    return Terrain(left, low, step, (z - level_m).astype(np.float32))
+
+
+def _no_cover(path: Path, epsg: int, bounds: Bounds, cover: float) -> str:
+    west, south, east, north = bounds
+    return (
+        f"{Path(path).name} has heights for only {100 * cover:.0f} % of the area of the flight "
+        f"(EPSG:{epsg}, east {west:.0f} to {east:.0f}, north {south:.0f} to {north:.0f}); give a DEM that covers it"
+    )
+
+
+def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
+    """Refuse ground (N,) above cameras (N,), both over takeoff; NaN where a camera's height is not known."""
+    told = np.isfinite(cameras)
+    if told.any() and float((ground > cameras)[told].mean()) > MOST_BURIED:
+        raise InputError(
+            f"by {Path(path).name} the ground lies above {float((ground > cameras)[told].mean()):.0%} of the cameras "
+            f"(its heights below the flight span {ground.max() - ground.min():.0f} m); check that it is this area's "
+            "and in metres"
+        )
+
+
+def check_dem(path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> None:
+    """Look at a DEM before the work begins.
+
+    Args:
+        path, epsg, bounds: see `read_dem`.
+        cameras: (N, 3) east, north and height above takeoff of those that recorded one (none is allowed).
+
+    Raises:
+        InputError: as `read_dem`, or if the ground would lie above cameras (heights in another unit, for instance).
+    """
+    at = np.asarray(cameras, float).reshape(-1, 3)
+    terrain = read_dem(path, epsg, bounds, takeoff=at[:, :2] if len(at) else None)
+    if not len(at):
+        return
+    _refuse_buried(path, terrain.height(at[:, :2]), at[:, 2])
+
+
+def _on_area(
+    path: Path, epsg: int, bounds: Bounds, step_m: float | None, finest_m: float = _FINEST_M
+) -> tuple[Array, float, float, float]:
+    """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.vrt import WarpedVRT
+
+    name = path.name
+    if not path.exists():
+        raise InputError(f"the DEM {path} does not exist; check --dem")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            dataset = rasterio.open(path)
+    except RasterioError:
+        raise InputError(f"{name} is no readable height model; give a GeoTIFF with heights by --dem") from None
+    with dataset:
+        if dataset.crs is None:
+            raise InputError(f"{name} has no CRS; assign one (gdal_edit.py -a_srs EPSG:...) and try again")
+        if dataset.count > 1 and dataset.dtypes[0] == "uint8":
+            raise InputError(f"{name} is a picture ({dataset.count} bands of 8 bit), not heights; give a DEM by --dem")
+        try:
+            west, south, east, north = bounds
+            step = step_m or _own_step(dataset, epsg, bounds, finest_m)
+            left, low = float(np.floor(west / step) * step), float(np.floor(south / step) * step)
+            columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
+            # a pixel about every node: its centre is the node
+            transform = rasterio.Affine(step, 0.0, left - 0.5 * step, 0.0, -step, low + (rows - 0.5) * step)
+            finer = _pixel_m(dataset, epsg, bounds) < 0.7 * step
+            with WarpedVRT(
+                dataset,
+                crs=f"EPSG:{epsg}",
+                transform=transform,
+                width=columns,
+                height=rows,
+                resampling=Resampling.average if finer else Resampling.bilinear,
+                src_nodata=_nodata(dataset),
+                nodata=float("nan"),
+                dtype="float64",
+                add_alpha=False,
+            ) as warped:
+                z = warped.read(1).astype(np.float64)
+        except RasterioError as error:
+            raise InputError(f"{name} cannot be read as heights ({error}); check the file") from None
+        z = z * float(dataset.scales[0] or 1.0) + float(dataset.offsets[0] or 0.0)
+        z *= _METRES.get(str(dataset.units[0] or "").strip().lower(), 1.0)
+    z[~np.isfinite(z) | (z > 12000.0) | (z < -1000.0)] = np.nan  # no ground of this planet
+    return np.ascontiguousarray(z[::-1]), left, low, step
+
+
+def _nodata(dataset: Any) -> float | None:
+    """The nodata value, also where a file does not declare its -32768, -9999 or -3.4e38."""
+    if dataset.nodata is not None:
+        return float(dataset.nodata)
+    small = dataset.read(1, out_shape=(min(dataset.height, 512), min(dataset.width, 512)))
+    lowest = float(np.nanmin(small)) if np.isfinite(small).any() else 0.0
+    return lowest if lowest < -1000.0 else None
+
+
+def _pixel_m(dataset: Any, epsg: int, bounds: Bounds) -> float:
+    """Side of the DEM's own pixel in metres, about the area's middle."""
+    from rasterio.warp import transform
+
+    x, y = 0.5 * (bounds[0] + bounds[2]), 0.5 * (bounds[1] + bounds[3])
+    (px, pe, pn), (qx, qe, qn) = transform(f"EPSG:{epsg}", dataset.crs, [x, x + 100.0, x], [y, y, y + 100.0])
+    inverse = ~dataset.transform
+    a, b, c = (np.array(inverse * p) for p in ((px, qx), (pe, qe), (pn, qn)))
+    area = abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0])
+    return 100.0 / float(np.sqrt(area)) if np.isfinite(area) and area > 0 else 1.0
+
+
+def _own_step(dataset: Any, epsg: int, bounds: Bounds, finest_m: float) -> float:
+    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+    return float(max(finest_m, round(_pixel_m(dataset, epsg, bounds), 1), np.sqrt(area / _MOST_NODES)))
+
+
+def _filled(z: Array, known: NDArray[np.bool_]) -> Array:
+    """Gaps filled from their surroundings: averages over growing neighbourhoods, the nearest known scale first."""
+    if known.all():
+        return z
+    from scipy.ndimage import uniform_filter
+
+    value, weight = np.where(known, z, 0.0), known.astype(np.float64)
+    out, done = value.copy(), known.copy()
+    size = 3
+    while not done.all():
+        w = uniform_filter(weight, size, mode="constant")
+        v = uniform_filter(value, size, mode="constant")
+        ready = ~done & (w > 0.5 / size**2)
+        out[ready] = v[ready] / w[ready]
+        done |= ready
+        size = 2 * size + 1
+    return out

@@ -1,0 +1,59 @@
+"""The map in tiles that are read once, for windows of one pixel size that overlap a lot."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
+
+Bounds = tuple[float, float, float, float]
+
+TILE_PX = 128
+
+
+class TiledMap:
+    """A `MapWindow` that keeps what it has read at one pixel size; other sizes go to the map itself.
+
+    Memory grows with the ground that the windows cover, so one of these serves one task.
+    """
+
+    def __init__(self, basemap: MapWindow, gsd_m: float) -> None:
+        self.epsg = basemap.epsg
+        self._basemap, self._gsd_m = basemap, gsd_m
+        self._tiles: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
+
+    @property
+    def bounds(self) -> Bounds:
+        """West, south, east, north of the map in the area's grid."""
+        return self._basemap.bounds
+
+    @property
+    def native_gsd_m(self) -> float:
+        """Size of the map's own pixel."""
+        return self._basemap.native_gsd_m
+
+    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Grey values and validity of a window, as the map itself gives them."""
+        if gsd_m != self._gsd_m:
+            return self._basemap.gray(bounds, gsd_m)
+        grid = GroundGrid.around(self.epsg, bounds, gsd_m)
+        # rows count southwards from the equator's line of the lattice, columns eastwards
+        row, col = -round(grid.north / gsd_m), round(grid.west / gsd_m)
+        gray, valid = np.zeros((grid.height, grid.width), np.float32), np.zeros((grid.height, grid.width), bool)
+        for i in range(row // TILE_PX, (row + grid.height - 1) // TILE_PX + 1):
+            for j in range(col // TILE_PX, (col + grid.width - 1) // TILE_PX + 1):
+                r0, c0 = i * TILE_PX - row, j * TILE_PX - col
+                rows, cols = slice(max(r0, 0), r0 + TILE_PX), slice(max(c0, 0), c0 + TILE_PX)
+                inner = slice(max(-r0, 0), grid.height - r0), slice(max(-c0, 0), grid.width - c0)
+                tile_gray, tile_valid = self._tile(i, j)
+                gray[rows, cols], valid[rows, cols] = tile_gray[inner], tile_valid[inner]
+        return gray, valid
+
+    def _tile(self, i: int, j: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        if (i, j) not in self._tiles:
+            side = TILE_PX * self._gsd_m
+            # from the middles of the outermost pixels, so that rounding cannot add a row or a column
+            inset = 0.5 * self._gsd_m
+            bounds = (j * side + inset, -(i + 1) * side + inset, (j + 1) * side - inset, -i * side - inset)
+            self._tiles[i, j] = self._basemap.gray(bounds, self._gsd_m)
+        return self._tiles[i, j]

@@ -1,0 +1,83 @@
+"""Whether a map can be read where it is needed: found before the work begins, without reading all of it.
+
+A copy that was cut short opens like a whole one (a TIFF's directory often stands at its beginning), and blocks that
+were never written are zeros. So the places of all blocks are compared with the file's length, and some are decoded.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthoswarm.model.errors import InputError
+
+Bounds = tuple[float, float, float, float]
+"""West, south, east, north in metres."""
+
+_SIDE = 5
+_WINDOW_PX = 4.0
+
+
+class UnreadableMapError(InputError):
+    """A map's pixels cannot be read, although it was opened: damaged, cut short, or no longer there."""
+
+
+def common(a: Bounds, b: Bounds) -> Bounds:
+    """What two bounds share; upside down where that is nothing."""
+    return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
+
+
+def sample_windows(bounds: Bounds, gsd_m: float) -> list[Bounds]:
+    """Small windows of some pixels spread over bounds, few enough to be read in a fraction of a second."""
+    west, south, east, north = bounds
+    half = 0.5 * _WINDOW_PX * gsd_m
+    share = (np.arange(_SIDE) + 0.5) / _SIDE
+    return [
+        (float(x) - half, float(y) - half, float(x) + half, float(y) + half)
+        for y in north + share * (south - north)
+        for x in west + share * (east - west)
+    ]
+
+
+def ends_early(source: Any, path: Path, window: tuple[int, int, int, int]) -> bool:
+    """True if a TIFF has blocks that its file is too short for; False for other files.
+
+    Args:
+        source: the open rasterio data set. path: its file.
+        window: first row, row after the last, first column, column after the last, full resolution; inside the raster.
+    """
+    if source.driver not in ("GTiff", "COG") or not path.is_file():
+        return False
+    size = path.stat().st_size
+    inside = not any(name.lower().endswith(".ovr") for name in source.files)
+    levels = [None, *range(len(source.overviews(1)))] if inside else [None]
+    factors = [1, *source.overviews(1)]
+    bands = [1] if source.interleaving is None or source.interleaving.name == "pixel" else range(1, source.count + 1)
+    return any(
+        _last_byte(source, level, band, tuple(v // factor for v in window)) > size
+        for level, factor in zip(levels, factors, strict=False)
+        for band in bands
+    )
+
+
+def _last_byte(source: Any, level: int | None, band: int, window: tuple[int, ...]) -> int:
+    """Where the last of the blocks ends that a window of one resolution touches; 0 if it has none of its own."""
+    high, wide = _block_shape(source, level)
+    row0, row1, col0, col1 = window
+    last = 0
+    for r in range(row0 // high, max(row1 - 1, row0) // high + 1):
+        for c in range(col0 // wide, max(col1 - 1, col0) // wide + 1):
+            place = source.get_tag_item(f"BLOCK_OFFSET_{c}_{r}", "TIFF", bidx=band, ovr=level)
+            length = source.get_tag_item(f"BLOCK_SIZE_{c}_{r}", "TIFF", bidx=band, ovr=level)
+            if place and length:
+                last = max(last, int(place) + int(length))
+    return last
+
+
+def _block_shape(source: Any, level: int | None) -> tuple[int, int]:
+    if level is None:
+        return tuple(source.block_shapes[0])
+    import rasterio
+
+    with rasterio.open(source.name, OVERVIEW_LEVEL=level) as reduced:
+        return tuple(reduced.block_shapes[0])

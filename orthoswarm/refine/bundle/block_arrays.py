@@ -1,0 +1,164 @@
+"""Many cameras as plain arrays, for the compiled kernels of the refiner, and the tracks that they observe."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.model.camera import Camera, Lens
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
+"""Columns of Rig.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Cameras of one or several vehicles in a local frame (east, north, up about a common origin, metres).
+
+    Attributes:
+        position: float64 (N, 3).
+        rotation: float64 (N, 3, 3), camera to ground (columns are the camera's x, y, z axes).
+        lens_id: int32 (N,), row of `lens` for each camera.
+        lens: float64 (L, 8), columns F, K1, K2, K3, CX, CY, WIDTH, HEIGHT.
+    """
+
+    position: Array
+    rotation: Array
+    lens_id: Ints
+    lens: Array
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def take(self, index: NDArray[np.integer] | slice) -> "Rig":
+        """The rig of some of the cameras (lenses are shared)."""
+        return replace(self, position=self.position[index], rotation=self.rotation[index], lens_id=self.lens_id[index])
+
+    def camera(self, i: int, origin: Array) -> Camera:
+        """Camera i in grid coordinates; origin is (2,) or (3,), what was subtracted from them."""
+        row = self.lens[self.lens_id[i]]
+        lens = Lens(int(row[WIDTH]), int(row[HEIGHT]), *(float(row[j]) for j in (F, K1, K2, K3, CX, CY)))
+        offset = np.zeros(3)
+        offset[: len(origin)] = origin
+        return Camera(self.position[i] + offset, self.rotation[i].copy(), lens)
+
+    def project(self, camera: NDArray[np.integer], points: Array) -> Array:
+        """Pixels (M, 2), distortion included, of points (M, 3) in cameras (M,); NaN where not visible in principle."""
+        uv = np.empty((len(camera), 2))
+        _project_many(
+            self.position,
+            self.rotation,
+            self.lens_id,
+            self.lens,
+            camera.astype(np.int32),
+            np.asarray(points, float),
+            uv,
+        )
+        return uv
+
+    def to_ground(self, camera: NDArray[np.integer], uv: Array, z: Array) -> Array:
+        """Ground points (M, 2) of pixels (M, 2), distortion removed, at heights (M,); NaN above the horizon."""
+        xy = np.empty((len(camera), 2))
+        heights = np.ascontiguousarray(np.broadcast_to(np.asarray(z, float), (len(camera),)))
+        _ground_many(
+            self.position,
+            self.rotation,
+            self.lens_id,
+            self.lens,
+            camera.astype(np.int32),
+            np.asarray(uv, float),
+            heights,
+            xy,
+        )
+        return xy
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """What the cameras of a rig saw: points followed or matched through pictures.
+
+    Attributes:
+        camera: int32 (M,), index of the camera of each observation.
+        point: int32 (M,), id of the track, 0..P-1; observations need no order.
+        uv: float64 (M, 2), column and row, distorted as in the picture, pixel centres at integers.
+        sigma_px: float32 (M,), one sigma of each observation.
+    """
+
+    camera: Ints
+    point: Ints
+    uv: Array
+    sigma_px: NDArray[np.float32]
+
+    @property
+    def count(self) -> int:
+        """Number of tracks."""
+        return int(self.point.max()) + 1 if len(self.point) else 0
+
+
+@kernel
+def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
+    """Pixel (u, v) of a ground point in one camera (position (3,), rotation (3, 3), lens (8,)); NaN if behind it.
+
+    Beyond the radius where the distortion folds (1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 < 0.2) the point is not visible.
+    """
+    dx, dy, dz = x - position[0], y - position[1], z - position[2]
+    cz = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+    if cz < 1e-3:
+        return np.nan, np.nan
+    cx = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / cz
+    cy = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / cz
+    r2 = cx * cx + cy * cy
+    if 1.0 + r2 * (3.0 * lens[1] + r2 * (5.0 * lens[2] + r2 * 7.0 * lens[3])) < 0.2:
+        return np.nan, np.nan
+    s = lens[0] * (1.0 + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3])))
+    return s * cx + 0.5 * (lens[6] - 1.0) + lens[4], s * cy + 0.5 * (lens[7] - 1.0) + lens[5]
+
+
+@kernel
+def pixel_ray(rotation, lens, u, v):  # type: ignore[no-untyped-def]
+    """Ground direction (3 numbers, camera depth 1) of a pixel, distortion removed by Newton's method on the radius."""
+    xd = (u - 0.5 * (lens[6] - 1.0) - lens[4]) / lens[0]
+    yd = (v - 0.5 * (lens[7] - 1.0) - lens[5]) / lens[0]
+    rd = np.sqrt(xd * xd + yd * yd)
+    s = 1.0
+    if rd > 1e-12 and (lens[1] != 0.0 or lens[2] != 0.0 or lens[3] != 0.0):
+        r = rd
+        for _ in range(10):
+            r2 = r * r
+            g = r * (1.0 + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3]))) - rd
+            dg = 1.0 + r2 * (3.0 * lens[1] + r2 * (5.0 * lens[2] + r2 * 7.0 * lens[3]))
+            r = min(max(r - g / max(dg, 0.2), 0.0), 4.0)
+            if abs(g) < 1e-10:
+                break
+        s = r / rd
+    x, y = xd * s, yd * s
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2],
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2],
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2],
+    )
+
+
+@kernel
+def _project_many(position, rotation, lens_id, lens, camera, points, uv):  # type: ignore[no-untyped-def]
+    for m in range(len(camera)):
+        i = camera[m]
+        uv[m, 0], uv[m, 1] = project_point(
+            position[i], rotation[i], lens[lens_id[i]], points[m, 0], points[m, 1], points[m, 2]
+        )
+
+
+@kernel
+def _ground_many(position, rotation, lens_id, lens, camera, uv, z, xy):  # type: ignore[no-untyped-def]
+    for m in range(len(camera)):
+        i = camera[m]
+        dx, dy, dz = pixel_ray(rotation[i], lens[lens_id[i]], uv[m, 0], uv[m, 1])
+        if dz < -1e-9:
+            t = (z[m] - position[i, 2]) / dz
+            xy[m, 0], xy[m, 1] = position[i, 0] + t * dx, position[i, 1] + t * dy
+        else:
+            xy[m, 0], xy[m, 1] = np.nan, np.nan

@@ -1,0 +1,118 @@
+"""What one vehicle's frames recorded, as arrays in the local frame, with what is missing filled and marked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.camera import rotation_from_angles
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """Records of N frames in order of time.
+
+    Attributes:
+        position: float64 (N, 3), east, north minus the origin, height over the takeoff level (see has_height).
+        yaw, pitch, roll: float64 (N,), GRID yaw; filled from the course and straight down where unknown.
+        time_s: float64 (N,), seconds; picture number where times are unknown or not increasing.
+        has_height, has_yaw, has_tilt: bool (N,), what was recorded.
+        position_sigma: float64 (N,) horizontal, metres, as stated by the source (NaN where not).
+        timed: True if time_s are real seconds.
+    """
+
+    position: Array
+    yaw: Array
+    pitch: Array
+    roll: Array
+    time_s: Array
+    has_height: Flags
+    has_yaw: Flags
+    has_tilt: Flags
+    position_sigma: Array
+    timed: bool
+
+    def rotation(self) -> Array:
+        """Recorded attitudes, camera to ground, float64 (N, 3, 3)."""
+        return rotation_from_angles(self.yaw, self.pitch, self.roll)
+
+    def steps(self, reach: int = 3) -> Array:
+        """Flown step to each frame from the one before, median over neighbours on the same course: (N, 3)."""
+        n = len(self.position)
+        raw = np.diff(self.position, axis=0, prepend=self.position[:1])
+        out = raw.copy()
+        for i in range(1, n):
+            near = np.arange(max(1, i - reach), min(n, i + reach + 1))
+            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < np.radians(12.0)
+            chosen = near[same]
+            if len(chosen) >= 3:
+                out[i] = np.median(raw[chosen], axis=0)
+        return out
+
+    def velocity(self) -> Array:
+        """Smoothed horizontal velocity (N, 2) in m/s (metres per picture where times are unknown)."""
+        n = len(self.position)
+        a, b = np.maximum(np.arange(n) - 2, 0), np.minimum(np.arange(n) + 2, n - 1)
+        dt = np.maximum(self.time_s[b] - self.time_s[a], 1e-3)[:, None]
+        v = (self.position[b, :2] - self.position[a, :2]) / dt
+        speed = np.hypot(*v.T)
+        usual = float(np.median(speed)) if n else 0.0
+        return np.asarray(np.where((speed > 3 * usual + 1)[:, None], 0.0, v))
+
+    def with_yaw(self, yaw: Array) -> "Records":
+        """The same with other headings."""
+        return replace(self, yaw=yaw)
+
+
+def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_height_m: float = 100.0) -> Records:
+    """Records of frames (in order); heights are `usual_height_m` where unknown."""
+    lat = np.array([f.fix.lat_deg for f in frames])
+    lon = np.array([f.fix.lon_deg for f in frames])
+    xy = grid.to_grid(lat, lon) - origin[:2]
+    height = _column([f.fix.height_m for f in frames])
+    yaw = _column([f.fix.yaw_rad for f in frames]) - grid.convergence_rad(lat, lon)
+    pitch, roll = _column([f.fix.pitch_rad for f in frames]), _column([f.fix.roll_rad for f in frames])
+    has_height, has_yaw, has_tilt = np.isfinite(height), np.isfinite(yaw), np.isfinite(pitch)
+    filled = float(np.median(height[has_height])) if has_height.any() else usual_height_m
+    position = np.column_stack([xy, np.where(has_height, height, filled)])
+    time, timed = _times(frames)
+    course = _course(xy)
+    return Records(
+        position,
+        wrap_rad(np.where(has_yaw, yaw, course)),
+        np.where(has_tilt, pitch, -np.pi / 2),
+        np.where(np.isfinite(roll), roll, 0.0),
+        time,
+        has_height,
+        has_yaw,
+        has_tilt,
+        _column([f.fix.position_sigma_m for f in frames]),
+        timed,
+    )
+
+
+def _column(values: Sequence[float | None]) -> Array:
+    return np.array([np.nan if v is None else v for v in values], float)
+
+
+def _times(frames: Sequence[Frame]) -> tuple[Array, bool]:
+    time = _column([f.time_s for f in frames])
+    if len(frames) > 1 and np.isfinite(time).all() and (np.diff(time) >= 0).all() and time[-1] > time[0]:
+        return time - time[0], True
+    return np.arange(len(frames), dtype=float), False
+
+
+def _course(xy: Array) -> Array:
+    n = len(xy)
+    if n < 2:
+        return np.zeros(n)
+    a, b = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
+    d = xy[b] - xy[a]
+    return np.asarray(np.arctan2(d[:, 0], d[:, 1]))

@@ -1,0 +1,57 @@
+"""Which picture shows a point best, and which points to take: one in each cell of ground and leg."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class Sights:
+    """For each point the observation nearest its camera's nadir, and how well the point is known.
+
+    Attributes (P points): camera: int32, -1 where there is none. count: observations with weight > 0.5.
+        mean_weight: mean robust weight. off_nadir: horizontal distance camera to point, metres.
+    """
+
+    camera: Ints
+    count: Ints
+    mean_weight: Array
+    off_nadir: Array
+
+
+def sights(rig: Rig, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None) -> Sights:
+    """Summaries of the points' observations; `own` (N,) limits the choice of camera."""
+    n = len(points)
+    distance = np.hypot(*(rig.position[tracks.camera, :2] - points[tracks.point, :2]).T)
+    usable = obs_weight > 0.5
+    if own is not None:
+        usable &= own[tracks.camera]
+    order = np.lexsort((np.where(usable, distance, np.inf), tracks.point))
+    first = np.searchsorted(tracks.point[order], np.arange(n))
+    has = np.bincount(tracks.point, minlength=n) > 0
+    best = order[np.minimum(first, len(order) - 1)]
+    ok = has & usable[best]
+    total = np.bincount(tracks.point, minlength=n)
+    weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
+    count = np.bincount(tracks.point[obs_weight > 0.5], minlength=n)
+    return Sights(
+        np.where(ok, tracks.camera[best], -1).astype(np.int32),
+        count.astype(np.int32),
+        weight,
+        np.where(ok, distance[best], np.inf),
+    )
+
+
+def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> NDArray[np.int64]:
+    """The point of least cost (finite) in each ground cell of each leg: indices, sorted."""
+    use = np.flatnonzero(np.isfinite(cost))
+    key = np.column_stack([np.floor(points[use, :2] / cell_m).astype(np.int64), leg[use]])
+    order = np.lexsort((use, cost[use]))
+    _, first = np.unique(key[order], axis=0, return_index=True)
+    return np.sort(use[order[first]])

@@ -1,0 +1,180 @@
+"""First guess of scale and heading from the pictures: flow of whole pictures against the distance flown.
+
+Metres per pixel come from the distance flown, never from an altitude that may be nonsense; headings that contradict
+the flow (a yaw tag that flips) are turned.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.camera import fov_rad
+from orthoswarm.refine.bundle.flight_records import Records
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+FLOW_SIGMA = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What whole-picture flow says of one vehicle.
+
+    Attributes:
+        focal_px: focal length in working pixels. height_m: height above ground that goes with it.
+        yaw_offset: float64 (N,), to be added to the recorded yaw (radians): flips, and headings taken from the course.
+        trusted_height: False where the recorded height had to be replaced.
+        pairs: pairs of pictures that gave an answer.
+        warnings: findings in plain words.
+        spread: robust relative sigma of the pairs' answers, infinite where there are too few.
+    """
+
+    focal_px: float
+    height_m: float
+    yaw_offset: Array
+    trusted_height: bool
+    pairs: int
+    warnings: list[str]
+    spread: float = float("inf")
+
+    @property
+    def focal_sigma(self) -> float:
+        """How well the flow tells the focal length, one relative sigma (receivers drift and lag by some percent)."""
+        return float(np.hypot(FLOW_SIGMA, self.spread / np.sqrt(max(self.pairs, 1))))
+
+
+def calibrate(
+    records: Records, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
+) -> Calibration:
+    """Compare the flow of picture pairs along each leg with what the records predict.
+
+    Args:
+        records: the vehicle's records. leg: int32 (N,), -1 in turns.
+        gray: picture at working scale. size: its (width, height).
+        fov_start: assumed horizontal field of view, radians.
+    """
+    width = size[0]
+    f0 = 0.5 * width / np.tan(0.5 * fov_start)
+    h0 = float(np.median(records.position[:, 2]))
+    usable = h0 > 3.0 and bool(records.has_height.any())
+    if not usable:
+        h0 = 100.0
+    rotation = records.rotation()
+    legs = [np.flatnonzero(leg == k) for k in range(int(leg.max()) + 1)] if len(leg) else []
+    ratios: list[complex] = []
+    owners: list[int] = []
+    for k, members in enumerate(legs):
+        for a, b in _pairs(records, members, f0 / h0, size[1], max(3, 24 // max(len(legs), 1))):
+            ratio = _flow_ratio(
+                gray(a), gray(b), rotation[a], rotation[b], records.position[b] - records.position[a], f0, h0
+            )
+            if ratio is not None:
+                ratios.append(ratio)
+                owners.append(k)
+    if len(ratios) < 2:
+        return Calibration(f0, h0, np.zeros(len(leg)), usable, len(ratios), [])
+    r, owner = np.array(ratios), np.array(owners)
+    offset, warnings = _heading(records, leg, r, owner)
+    factor = np.abs(r)
+    scale = float(np.median(factor))
+    found = _with_scale(f0, h0, scale, usable, width, offset, len(r), warnings)
+    return replace(found, spread=1.4826 * float(np.median(np.abs(factor / scale - 1.0))))
+
+
+def _with_scale(
+    f0: float, h0: float, scale: float, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
+) -> Calibration:
+    """Attribute the scale to the lens where that is plausible, else to the height."""
+    focal = f0 * scale
+    if usable and np.radians(35.0) < fov_rad(focal, width) < np.radians(135.0):
+        return Calibration(focal, h0, offset, True, pairs, warnings)
+    height = h0 / scale
+    if usable:
+        warnings.append(
+            f"the recorded height of {h0:.0f} m contradicts the pictures and the path; {height:.0f} m is assumed"
+        )
+    return Calibration(f0, height, offset, False, pairs, warnings)
+
+
+def _heading(
+    records: Records, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
+) -> tuple[Array, list[str]]:
+    """Offset of the recorded yaw for each frame: whole legs that are turned round, or headings from the course."""
+    offset = np.zeros(len(leg))
+    warnings: list[str] = []
+    angle = -np.angle(ratio)  # picture flow turned against prediction = camera turned the other way
+    usual = float(np.median(np.abs(ratio)))
+    for k in range(int(leg.max()) + 1):
+        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < 0.25)]
+        last = 0.0
+        if len(mine) >= 3:
+            turn = float(np.angle(np.median(np.cos(mine)) + 1j * np.median(np.sin(mine))))
+            spread = float(np.median(np.abs(wrap_rad(mine - turn))))
+            if not records.has_yaw.any() and spread < np.radians(20.0):
+                last = turn
+            elif abs(turn) > np.radians(40.0) and spread < np.radians(8.0):
+                last = turn
+                what = "turned by 180 deg" if abs(turn) > np.radians(150.0) else f"off by {np.degrees(turn):.0f} deg"
+                first = int(np.flatnonzero(leg == k)[0])
+                warnings.append(
+                    f"the yaw tags of the leg from frame {first} on are {what}; corrected from the pictures"
+                )
+        members = np.flatnonzero(leg == k)
+        offset[members] = last
+    _fill_turns(offset, leg)
+    return offset, warnings
+
+
+def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
+    inside = np.flatnonzero(leg >= 0)
+    if len(inside):
+        outside = np.flatnonzero(leg < 0)
+        nearest = inside[np.abs(inside[None, :] - outside[:, None]).argmin(1)] if len(outside) else outside
+        offset[outside] = offset[nearest]
+
+
+def _pairs(
+    records: Records, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
+) -> list[tuple[int, int]]:
+    """Pairs along a leg whose expected flow is a fifth of the picture."""
+    if len(members) < 2:
+        return []
+    step = float(np.median(np.hypot(*np.diff(records.position[members, :2], axis=0).T)))
+    if step <= 1e-3:
+        return []
+    span = int(np.clip(round(0.2 * rows / (px_per_m * step)), 1, max(1, min(8, len(members) - 1))))
+    starts = np.unique(np.linspace(0, len(members) - 1 - span, most).astype(int))
+    return [(int(members[s]), int(members[s + span])) for s in starts if s >= 0]
+
+
+def _flow_ratio(
+    first: Gray, second: Gray, ra: Array, rb: Array, move: Array, focal: float, height: float
+) -> complex | None:
+    """Measured over predicted flow as a complex number (scale and turn); None where the pictures do not agree."""
+    shape = first.shape
+    if second.shape != shape or not np.isfinite(move).all():
+        return None
+    centre = np.array([0.0, 0.0, 1.0])
+    turned = rb.T @ ra @ centre
+    spin = focal * turned[:2] / max(turned[2], 0.2)  # flow by rotation alone
+    shift = -focal / height * (rb.T @ move)[:2]
+    factor = 0.5 if shape[1] > 400 else 1.0
+    small = [
+        cv2.resize(g, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for g in (first, second)
+    ]
+    window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
+    (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
+    if response < 0.03:
+        return None
+    flow = complex(dx / factor - spin[0], dy / factor - spin[1])
+    expected = complex(shift[0], shift[1])
+    if abs(expected) < 2.0 or abs(flow) < 1.0:
+        return None
+    ratio = flow / expected
+    return ratio if 0.1 < abs(ratio) < 10.0 else None

@@ -1,0 +1,87 @@
+"""The grey pictures of one vehicle at working scale, read when needed and kept within a memory bound."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.frame import Frame
+from orthoswarm.raster.picture_file import PictureError
+
+Gray = NDArray[np.uint8]
+
+WORK_WIDTH = 960
+SMALL_WIDTH = 160
+
+
+class Pictures:
+    """Grey pictures by index; those read last stay in memory, reduced ones always do.
+
+    Attributes:
+        scale: full-resolution pixels per working pixel. size: (width, height) at working scale.
+        damaged: index -> sentence, pictures that could not be decoded.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        read: Callable[[Frame], Gray],
+        work_width: int = WORK_WIDTH,
+        cache_mb: float = 160.0,
+    ) -> None:
+        self._frames, self._read = frames, read
+        width, height = frames[0].width, frames[0].height
+        self.scale = max(1.0, max(width, height) / work_width)
+        self.size = (round(width / self.scale), round(height / self.scale))
+        self._limit = max(8, int(cache_mb * 1e6 / max(self.size[0] * self.size[1], 1)))
+        self._cache: OrderedDict[int, Gray] = OrderedDict()
+        self._small: dict[int, Gray] = {}
+        self.damaged: dict[int, str] = {}
+
+    def gray(self, i: int) -> Gray:
+        """Picture i, uint8 (rows, columns); a grey card where it cannot be decoded (see `damaged`)."""
+        held = self._cache.get(i)
+        if held is not None:
+            self._cache.move_to_end(i)
+            return held
+        picture = self._load(i)
+        self._cache[i] = picture
+        if len(self._cache) > self._limit:
+            self._cache.popitem(last=False)
+        if i not in self._small:
+            width = min(SMALL_WIDTH, self.size[0])
+            size = (width, max(1, round(width * self.size[1] / self.size[0])))
+            self._small[i] = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return picture
+
+    def small(self, i: int) -> Gray:
+        """Picture i reduced to SMALL_WIDTH columns."""
+        if i not in self._small:
+            self.gray(i)
+        return self._small[i]
+
+    def drop(self) -> None:
+        """Let go of the working-scale pictures (the reduced ones stay)."""
+        self._cache.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
+
+    def _load(self, i: int) -> Gray:
+        try:
+            picture = self._read(self._frames[i])
+        except PictureError as error:
+            self.damaged[i] = str(error)
+            return np.full(self.size[::-1], 127, np.uint8)
+        frame = self._frames[i]
+        if picture.shape != (frame.height, frame.width):
+            self.damaged[i] = (
+                f"{frame.image} is {picture.shape[1]}x{picture.shape[0]}, not as its header says; left out"
+            )
+            return np.full(self.size[::-1], 127, np.uint8)
+        if picture.shape[::-1] == self.size:
+            return picture
+        return np.asarray(cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA), np.uint8)

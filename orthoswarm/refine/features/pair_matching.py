@@ -1,0 +1,187 @@
+"""Pairs of overlapping photos: which to try, how features are matched, and what a trustworthy match is.
+
+Candidates come from the recorded positions, not only from the order in time: legs, vehicles and sorties overlap, too.
+A pair is kept when mutual nearest neighbours agree on one similarity of the plane (loosely, because cameras tilt and
+the ground is not flat) and on one epipolar geometry (tightly).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.refine.features.sift_features import Features, root_sift
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Ints = NDArray[np.int32]
+
+MIN_INLIERS = 15
+_RATIO = 0.85
+_PLANE_SHARE = 0.03
+_EPIPOLAR_STEPS = 1.5
+_SCALES = (0.5, 2.0)
+_SECTORS = 6
+_BEST_DISTANCE = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two photos that see the same ground.
+
+    Attributes:
+        first: index of one photo; second: of the other, larger.
+        match: int32 (n, 2), rows of features in the first and in the second.
+    """
+
+    first: int
+    second: int
+    match: Ints
+
+    def __len__(self) -> int:
+        return len(self.match)
+
+
+def match_features(one: Features, two: Features) -> Ints:
+    """Rows of features of one and of another photo that are the same points, int32 (n, 2); none: (0, 2).
+
+    Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC (3 % of the width: tilt and relief
+    are no similarity), then the fundamental matrix by MAGSAC (1.5 pixels of the reduced picture). Fewer than
+    15 survivors are none.
+    """
+    none = np.zeros((0, 2), np.int32)
+    candidates = mutual_nearest(_unit(one), _unit(two))
+    if len(candidates) < MIN_INLIERS:
+        return none
+    p = one.uv[candidates[:, 0]] / np.float32(one.step_px)
+    q = two.uv[candidates[:, 1]] / np.float32(two.step_px)
+    plane = _similarity_inliers(p, q, _PLANE_SHARE * two.width / two.step_px)
+    if plane.sum() < MIN_INLIERS:
+        return none
+    candidates, p, q = candidates[plane], p[plane], q[plane]
+    epipolar = _epipolar_inliers(p, q)
+    return candidates[epipolar] if epipolar.sum() >= MIN_INLIERS else none
+
+
+def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
+    """Rows of unit descriptors (n, d) and (m, d) nearest to each other and clearly nearer than the next, (k, 2)."""
+    if len(one) < 2 or len(two) < 2:
+        return np.zeros((0, 2), np.int32)
+    dot = one @ two.T
+    rows = np.arange(len(one))
+    best = dot.argmax(axis=1)
+    mutual = dot.argmax(axis=0)[best] == rows
+    top = dot[rows, best]
+    dot[rows, best] = -1.0
+    second = dot.max(axis=1)
+    clear = (1.0 - top) < _RATIO**2 * (1.0 - second)
+    keep = mutual & clear
+    return np.stack([rows[keep], best[keep]], axis=1).astype(np.int32)
+
+
+def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+    import cv2
+
+    matrix, inliers = cv2.estimateAffinePartial2D(
+        p, q, method=cv2.RANSAC, ransacReprojThreshold=threshold, maxIters=1000, confidence=0.999, refineIters=2
+    )
+    if matrix is None:
+        return np.zeros(len(p), bool)
+    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    if not _SCALES[0] <= scale <= _SCALES[1]:
+        return np.zeros(len(p), bool)
+    return np.asarray(inliers[:, 0] > 0)
+
+
+def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.bool_]:
+    import cv2
+
+    try:
+        _, inliers = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, _EPIPOLAR_STEPS, 0.999, 1000)
+    except cv2.error:  # OpenCV 5.0 asserts where it finds no model
+        return np.zeros(len(p), bool)
+    return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
+
+
+class _Identity:
+    """A key by object identity that keeps its object alive."""
+
+    __slots__ = ("features",)
+
+    def __init__(self, features: Features) -> None:
+        self.features = features
+
+    def __hash__(self) -> int:
+        return id(self.features)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and other.features is self.features
+
+
+@lru_cache(maxsize=64)
+def _unit_of(key: _Identity) -> NDArray[np.float32]:
+    return root_sift(key.features.descriptor)
+
+
+def _unit(features: Features) -> NDArray[np.float32]:
+    return _unit_of(_Identity(features))
+
+
+def consecutive(group: NDArray[np.integer], time_s: Array, max_gap_s: float = 60.0) -> Ints:
+    """Pairs of photos that follow each other in one group (a vehicle), int32 (n, 2).
+
+    Args:
+        group: integers (N,), photos of a group in order of time.
+        time_s: float64 (N,), NaN where unknown (then order alone counts).
+        max_gap_s: a longer pause does not link.
+    """
+    last: dict[int, int] = {}
+    pairs: list[tuple[int, int]] = []
+    for k, g in enumerate(group.tolist()):
+        before = last.get(g)
+        if before is not None and not abs(time_s[k] - time_s[before]) > max_gap_s:
+            pairs.append((before, k))
+        last[g] = k
+    return np.array(pairs, np.int32).reshape(-1, 2)
+
+
+def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
+    """Pairs whose footprints may overlap, spread over all directions, int32 (n, 2), sorted, first < second.
+
+    Each photo chooses from six directions, in each from photos of its own group and of others, those first whose
+    distance is near 0.4 of the reach: nearer ones tell little about relief and tilt, farther ones share little ground.
+
+    Args:
+        centre: complex (N,), east + i north of the ground that each photo shows in its middle.
+        reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
+        group: integers (N,), leg or segment.
+        count: how many neighbours each photo may choose.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.stack([centre.real, centre.imag], axis=1)
+    tree = cKDTree(points)
+    chosen: set[tuple[int, int]] = set()
+    for i, close in enumerate(tree.query_ball_point(points, r=np.maximum(reach, 1e-6), return_sorted=True)):
+        near = np.asarray(close, np.int64)
+        near = near[near != i]
+        distance = np.abs(centre[near] - centre[i])
+        mean = 0.5 * (reach[near] + reach[i])
+        near, distance = near[distance <= mean], (distance / mean)[distance <= mean]
+        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - _BEST_DISTANCE), 3)))
+        near = near[order]
+        sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
+        for j in _round_robin(near, sector + _SECTORS * (group[near] != group[i]), count):
+            chosen.add((min(i, j), max(i, j)))
+    return np.array(sorted(chosen), np.int32).reshape(-1, 2)
+
+
+def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -> list[int]:
+    """The first of every kind, then the second, until `count`."""
+    rank = np.zeros(len(near), np.int64)
+    for k in np.unique(kind):
+        inside = np.flatnonzero(kind == k)
+        rank[inside] = np.arange(len(inside))
+    order = np.lexsort((np.arange(len(near)), rank))
+    return [int(j) for j in near[order][:count]]

@@ -1,0 +1,139 @@
+"""Tracks from pairwise matches: points of many photos joined into one, by union-find."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.refine.bundle.block_arrays import Tracks
+from orthoswarm.refine.features.pair_matching import Pair
+from orthoswarm.refine.features.sift_features import Features
+
+Ints = NDArray[np.int32]
+
+MAX_LENGTH = 20
+
+
+def build_tracks(features: Sequence[Features], pairs: Sequence[Pair], max_length: int = MAX_LENGTH) -> Tracks:
+    """Tracks of length 2 to `max_length` through all photos.
+
+    The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
+    one wrong match cannot glue two places together.
+
+    Args:
+        features: of each photo; the camera of an observation is the index here.
+        pairs: trusted matches.
+        max_length: longest track; longer ones stay in pieces.
+
+    Returns:
+        Tracks with positions in full pictures, ordered by camera, then point.
+    """
+    offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
+    photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
+    same = [f.same_point() for f in features]
+    joins: list[NDArray[np.int64]] = []
+    for pair in sorted(pairs, key=lambda p: (-len(p), p.first, p.second)):
+        a = offset[pair.first] + same[pair.first][pair.match[:, 0]]
+        b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
+        joins.append(np.stack([a, b], axis=1))
+    edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
+    root = _union(edges, photo, len(photo), max_length)
+    return _tracks(root, photo, features)
+
+
+def _tracks(root: NDArray[np.int64], photo: Ints, features: Sequence[Features]) -> Tracks:
+    _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
+    node = np.flatnonzero(count[inverse] >= 2)
+    uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
+    sigma = np.concatenate([f.sigma_px for f in features]) if len(features) else np.zeros(0, np.float32)
+    _, point = np.unique(inverse[node], return_inverse=True)
+    return Tracks(
+        camera=photo[node],
+        point=point.reshape(-1).astype(np.int32),
+        uv=uv[node].astype(np.float64),
+        sigma_px=sigma[node].astype(np.float32),
+    )
+
+
+@kernel
+def _find(parent, x):  # type: ignore[no-untyped-def]
+    while parent[x] != x:
+        parent[x] = parent[parent[x]]
+        x = parent[x]
+    return x
+
+
+@kernel
+def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
+    """Root of each node after joining along the edges in order; members of a root form a linked list."""
+    parent = np.arange(count)
+    following = np.full(count, -1)
+    tail = np.arange(count)
+    size = np.ones(count, np.int64)
+    for e in range(len(edges)):
+        a, b = _find(parent, edges[e, 0]), _find(parent, edges[e, 1])
+        if a == b or size[a] + size[b] > max_length:
+            continue
+        clash = False
+        x = a
+        while x >= 0 and not clash:
+            y = b
+            while y >= 0:
+                if photo[x] == photo[y]:
+                    clash = True
+                    break
+                y = following[y]
+            x = following[x]
+        if clash:
+            continue
+        if a > b:
+            a, b = b, a
+        parent[b] = a
+        following[tail[a]] = b
+        tail[a] = tail[b]
+        size[a] += size[b]
+    root = np.empty(count, np.int64)
+    for x in range(count):
+        root[x] = _find(parent, x)
+    return root
+
+
+def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64], per_cell: int = 3) -> Tracks:
+    """Fewer tracks that still cover every photo evenly: longest first, kept while a photo's cell has room.
+
+    Args:
+        tracks: of N photos.
+        width: (N,) columns of each photo.
+        rows: (N,) rows of each photo.
+        per_cell: observations in each of 8 x 6 cells of a photo from which on longer tracks are needed no more.
+    """
+    if not len(tracks.camera):
+        return tracks
+    length = np.bincount(tracks.point, minlength=tracks.count)
+    order = np.lexsort((tracks.camera, tracks.point, -length[tracks.point]))
+    start = np.flatnonzero(np.r_[True, np.diff(tracks.point[order]) != 0, True])
+    cx = np.clip(tracks.uv[:, 0] * 8 / np.asarray(width)[tracks.camera], 0, 7).astype(np.int64)
+    cy = np.clip(tracks.uv[:, 1] * 6 / np.asarray(rows)[tracks.camera], 0, 5).astype(np.int64)
+    cell = tracks.camera.astype(np.int64) * 48 + cy * 8 + cx
+    keep = np.zeros(len(order), np.bool_)
+    _thin(cell[order], start, per_cell, 48 * len(width), keep)
+    kept = np.sort(order[keep])
+    _, point = np.unique(tracks.point[kept], return_inverse=True)
+    return Tracks(
+        tracks.camera[kept], point.reshape(-1).astype(np.int32), tracks.uv[kept], tracks.sigma_px[kept].copy()
+    )
+
+
+@kernel
+def _thin(cell, start, room, cells, keep):  # type: ignore[no-untyped-def]
+    used = np.zeros(cells, np.int64)
+    for t in range(len(start) - 1):
+        wanted = False
+        for k in range(start[t], start[t + 1]):
+            if used[cell[k]] < room:
+                wanted = True
+        if wanted:
+            for k in range(start[t], start[t + 1]):
+                used[cell[k]] += 1
+                keep[k] = True

@@ -1,0 +1,138 @@
+"""Pictures that cannot be refined: too few of their kind, or all taken at one spot.
+
+Metres per pixel come from the distance flown; where nothing was flown the record is better than any estimate.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.placement import PlacedFrame
+
+FEWEST = 3
+_NEIGHBOURS = 5
+_EXTRA_SIGMA_M = 2.0
+_SPOT_SHARE = 0.05
+_WANDER_SHARE, _WANDER_STEPS, _WANDER_FEWEST = 0.3, 0.9, 6
+
+
+@dataclass(frozen=True, slots=True)
+class Sorted:
+    """Recorded frames by what a refiner can make of them, each in the order of the frames.
+
+    Attributes:
+        fit: those that it can refine. odd: too few of their camera and size, to be carried by the others.
+        still: those of vehicles that took all pictures at one spot, to stay as recorded.
+        warnings: what was sorted out, in plain words.
+    """
+
+    fit: list[PlacedFrame]
+    odd: list[PlacedFrame]
+    still: list[PlacedFrame]
+    warnings: list[str]
+
+
+def sort_out(recorded: Sequence[PlacedFrame]) -> Sorted:
+    """Find the frames that a refiner would fail on, or worse, be sure of (see `hovering` and `odd_ones`)."""
+    spots = hovering(recorded)
+    warnings = [
+        f"{vehicle}: all pictures were taken at one spot; they are placed as recorded" for vehicle in sorted(spots)
+    ]
+    moving = [p for p in recorded if p.frame.vehicle not in spots]
+    few = odd_ones([p.frame for p in moving])
+    odd = [p for p, alone in zip(moving, few, strict=True) if alone]
+    if odd:
+        some = len(odd) > 1
+        who, follow = (f"{len(odd)} pictures", "follow their") if some else ("1 picture", "follows its")
+        warnings.append(f"{who} of another camera or size, too few to be refined, {follow} neighbours")
+    fit = [p for p, alone in zip(moving, few, strict=True) if not alone]
+    return Sorted(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
+
+
+def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """Which frames have fewer than FEWEST of their vehicle, camera and size, where others have enough: bool (N,)."""
+    kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
+    count = Counter(kinds)
+    few = np.array([count[kind] < FEWEST for kind in kinds], bool)
+    return few if not few.all() else np.zeros(len(frames), bool)
+
+
+def hovering(recorded: Sequence[PlacedFrame]) -> set[str]:
+    """Vehicles with several pictures, in order of time, that were all taken at one spot."""
+    members: dict[str, list[PlacedFrame]] = {}
+    for p in recorded:
+        members.setdefault(p.frame.vehicle, []).append(p)
+    out = set()
+    for vehicle, own in members.items():
+        positions = np.array([p.camera.position for p in own])
+        if len(own) > FEWEST and _stands(positions):
+            out.add(vehicle)
+    return out
+
+
+def _stands(positions: NDArray[np.float64]) -> bool:
+    """Whether a path (N, 3) is one spot, or a receiver's noise about one: steps as long as the whole is wide."""
+    spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
+    height = float(np.median(positions[:, 2]))
+    if spread < _SPOT_SHARE * height:
+        return True
+    wide = float(np.sqrt(((positions[:, :2] - positions[:, :2].mean(0)) ** 2).sum(1).mean()))
+    steps = float(np.sqrt((np.diff(positions[:, :2], axis=0) ** 2).sum(1).mean()))
+    return len(positions) >= _WANDER_FEWEST and spread < _WANDER_SHARE * height and steps > _WANDER_STEPS * wide
+
+
+def carry(
+    odd: Sequence[PlacedFrame], recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]
+) -> list[PlacedFrame]:
+    """Place frames by what refinement changed in their nearest neighbours: position, attitude, focal length.
+
+    Args:
+        odd: as recorded.
+        recorded: the refined frames as recorded, with the same assumed field of view.
+        refined: frames after refinement.
+
+    Returns:
+        One for each odd frame; where nothing was refined it stays as recorded.
+    """
+    before = {p.frame.image: p for p in recorded}
+    pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
+    pairs = [pair for pair in pairs if not pair[1].weak] or pairs
+    return [_carried(one, _near(one, pairs)) for one in odd] if pairs else list(odd)
+
+
+def follow(
+    extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
+) -> list[PlacedFrame]:
+    """Move frames by what changed in their nearest neighbours when those were placed again; as sure of them as before.
+
+    Args:
+        extra: placed beside the others, but not with them.
+        before: the others as they were.
+        after: the others as they are.
+    """
+    own = {p.frame.image for p in extra}
+    moved = carry(extra, [p for p in before if p.frame.image not in own], after)
+    return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
+
+
+def _near(one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> list[tuple[PlacedFrame, PlacedFrame]]:
+    """The refined frames nearest to a frame, of its own vehicle if there are any."""
+    own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
+    away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]
+    return [own[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
+
+
+def _carried(one: PlacedFrame, near: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> PlacedFrame:
+    shift = np.median([after.camera.position - old.camera.position for old, after in near], axis=0)
+    old, after = near[0]
+    turn = after.camera.rotation @ old.camera.rotation.T
+    ratio = float(np.median([a.camera.lens.focal_px / o.camera.lens.focal_px for o, a in near]))
+    lens = replace(one.camera.lens, focal_px=one.camera.lens.focal_px * ratio)
+    camera = Camera(one.camera.position + shift, turn @ one.camera.rotation, lens)
+    sigma = float(np.hypot(max(a.sigma_m for _, a in near), _EXTRA_SIGMA_M))
+    return PlacedFrame(one.frame, camera, after.stage, sigma, weak=True)

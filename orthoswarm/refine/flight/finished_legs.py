@@ -1,0 +1,32 @@
+"""Which legs of a flight are over while the vehicle still flies: what comes later does not change them any more."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.legs import REACH, split_legs
+
+Array = NDArray[np.float64]
+
+SETTLED = 2 * REACH
+"""Frames after a leg's end from which on neither its corner nor its frames can change."""
+
+
+def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
+    """First and last frame (inclusive) of each leg that is over, in order.
+
+    Args:
+        position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres.
+        time_s: float64 (N,) or None; see split_legs.
+        over: True if no more frames are expected, so that the last leg is over, too.
+    """
+    n = len(position)
+    if n < 2:
+        return []
+    leg = split_legs(position, time_s)
+    ends = []
+    for k in range(int(leg.max()) + 1):
+        members = np.flatnonzero(leg == k)
+        last = int(members[-1])
+        if over or last + SETTLED < n:
+            ends.append((int(members[0]), last))
+    return ends

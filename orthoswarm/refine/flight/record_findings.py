@@ -1,0 +1,182 @@
+"""What the pictures found about the records, in plain words, and why a photo could not be placed."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.frame import Frame
+from orthoswarm.refine.bundle.adjustment import Adjustment
+from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
+from orthoswarm.refine.initial.heading import tag_yaw
+from orthoswarm.refine.initial.initial_orientation import Start2D
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, Records
+
+_FLIP = float(np.radians(150.0))
+_HEADING_OFFSET_DEG = 5.0
+_TILT_DEG = 2.0
+_ONE_WAY = 0.9
+"""Length of the mean of headings from which on a tilt cannot be told from a slope of the ground."""
+_SLOPE_DEG = 6.0
+_OBLIQUE_DEG = 35.0
+_HEIGHT_SHARE, _HEIGHT_SIGMAS = 0.15, 4.0
+_LAG_M = 1.0
+_LISTED = 3
+
+
+def flipped_yaw(records: Records, start: Start2D) -> Flags:
+    """Photos whose recorded yaw is turned by 180 degrees against the picture's, bool (N,)."""
+    flipped = np.zeros(len(records), bool)
+    for v, tag in enumerate(start.tags):
+        if tag.source:
+            rows = (records.vehicle == v) & start.yaw_known
+            off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
+            flipped |= rows & (np.nan_to_num(off) > _FLIP)
+    return flipped
+
+
+def findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+    """Sentences on everything in the records that the pictures contradict, but heights: those are told in the end."""
+    found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
+    found += _position_findings(frames, records, start)
+    found += _overlap_findings(records, start)
+    return found
+
+
+def unplaced_reasons(
+    frames: Sequence[Frame], records: Records, placed: Flags, damaged: Mapping[int, str]
+) -> dict[int, str]:
+    """Why photos that no other holds could not be placed by pictures."""
+    reasons = dict(damaged)
+    for k in np.flatnonzero(~placed).tolist():
+        tilt = float(np.degrees(records.pitch[k])) + 90.0
+        if k in reasons:
+            continue
+        if tilt > _OBLIQUE_DEG:
+            reasons[k] = f"{frames[k].image} looks {tilt:.0f} degrees off nadir and matches no other photo"
+        else:
+            reasons[k] = f"{frames[k].image} matches no other photo; it is placed by its tags alone"
+    return reasons
+
+
+def runs(names: Sequence[str], flags: Flags) -> str:
+    """Runs of flagged photos as text: "A to C, F"."""
+    edge = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
+    parts = [
+        names[int(a)] if a == b else f"{names[int(a)]} to {names[int(b)]}" for a, b in zip(first, last, strict=True)
+    ]
+    text = ", ".join(parts[:_LISTED])
+    return text if len(parts) <= _LISTED else f"{text} and {len(parts) - _LISTED} more runs"
+
+
+def _name(frames: Sequence[Frame], records: Records, vehicle: int) -> str:
+    return frames[int(np.argmax(records.vehicle == vehicle))].vehicle
+
+
+def _yaw_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+    names = [f.image for f in frames]
+    found = []
+    flips = flipped_yaw(records, start)
+    if flips.any():
+        found.append(f"the recorded yaw is turned by 180 degrees on {int(flips.sum())} photos ({runs(names, flips)})")
+    for v, tag in enumerate(start.tags):
+        rows = (records.vehicle == v) & start.yaw_known
+        who = _name(frames, records, v)
+        if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
+            found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
+        elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
+            found.append(f"{who}: recorded headings are {-np.degrees(tag.offset):+.0f} degrees off, put right")
+        elif tag.source == "flight_yaw" and np.isfinite(records.yaw[rows]).any():
+            found.append(f"{who}: the pictures follow the airframe's heading, not the recorded camera yaw")
+    return found
+
+
+def tilt_of(level: Array) -> Array:
+    """Angle between optical axis and nadir, float64 (N,) radians, of camera-to-level rotations (N, 3, 3)."""
+    return np.asarray(np.arccos(np.clip(level[:, 2, 2], -1.0, 1.0)))
+
+
+def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+    found = []
+    tagged = records.tag_level()
+    between = np.degrees(tilt_of(np.asarray(start.level @ np.swapaxes(tagged, 1, 2))))
+    for v in range(len(start.tags)):
+        rows = records.vehicle == v
+        sigma = np.degrees(start.tilt_sigma[records.segment[rows]].max())
+        off, seen = float(np.median(between[rows])), float(np.degrees(np.median(tilt_of(start.level[rows]))))
+        who = _name(frames, records, v)
+        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY
+        if off < max(_SLOPE_DEG if one_way else _TILT_DEG, 3.0 * sigma):
+            continue
+        tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))
+        if not np.isfinite(records.pitch[rows]).any():
+            found.append(f"{who}: the camera looks {seen:.0f} degrees off nadir; no tag says so")
+        elif abs(seen - tag) > 0.5 * off:
+            found.append(f"{who}: the camera looks {seen:.0f} degrees off nadir where tags say {tag:.0f}")
+        else:
+            found.append(f"{who}: recorded pitch and roll are {off:.0f} degrees off")
+    return found
+
+
+def height_findings(frames: Sequence[Frame], records: Records, start: Start2D, adjustment: Adjustment) -> list[str]:
+    """Sentences on recorded heights that the adjusted pictures contradict, and on heights that are not recorded.
+
+    Metres per pixel come from the way flown, so that a height is known as well as the focal length.
+
+    Args:
+        frames: N photos. records: what they recorded. start: from the pairs.
+        adjustment: of all of them, without a map.
+    """
+    found, without = [], []
+    ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
+    height = adjustment.rig.position[:, 2] - ground
+    doubt = log_focal_sigmas(adjustment)[adjustment.rig.lens_id]
+    for v in range(len(start.tags)):
+        rows = records.vehicle == v
+        who = _name(frames, records, v)
+        recorded, seen = records.height_m[rows], float(np.median(height[rows]))
+        if not start.scale_known[int(records.lens[rows][0])]:
+            continue
+        if not np.isfinite(recorded).any():
+            without.append((who, seen))
+            continue
+        said = float(np.nanmedian(recorded))
+        limit = max(_HEIGHT_SHARE, _HEIGHT_SIGMAS * float(doubt[rows][0]))
+        if said <= 2.0 or abs(np.log(max(seen, 1.0) / said)) > limit:
+            found.append(contradiction(who, said, seen))
+    if without:
+        names = ", ".join(who for who, _ in without[:_LISTED]) + (" and others" if len(without) > _LISTED else "")
+        seen = float(np.median([height for _, height in without]))
+        found.append(f"{names}: no height is recorded; {seen:.0f} m come from metres per pixel")
+    return found
+
+
+def contradiction(who: str, said_m: float, seen_m: float) -> str:
+    """The sentence on a recorded height that the pictures contradict."""
+    return f"{who}: the recorded height of {said_m:.0f} m contradicts the pictures, which say {seen_m:.0f} m"
+
+
+def _position_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+    found = []
+    off = ~start.gps_ok
+    if off.any():
+        worst = float(np.abs(start.gps_residual[off]).max())
+        names = runs([f.image for f in frames], off)
+        found.append(f"recorded positions of {int(off.sum())} photos are up to {worst:.0f} m off ({names}); replaced")
+    speed = np.abs(records.velocity())
+    for v, lag in enumerate(start.lag.tolist()):
+        rows = records.vehicle == v
+        moving = speed[rows & (speed > 0.3)]
+        if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
+            who = _name(frames, records, v)
+            found.append(f"{who}: recorded positions lag by {lag:.1f} s")
+    return found
+
+
+def _overlap_findings(records: Records, start: Start2D) -> list[str]:
+    sizes = np.bincount(start.component)
+    if len(records) < 2 or (sizes > 1).sum() <= 1:
+        return []
+    parts = int((sizes > 1).sum())
+    return [f"the photos fall into {parts} parts without overlap; each lies in the frame of its own positions"]

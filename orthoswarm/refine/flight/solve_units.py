@@ -1,0 +1,83 @@
+"""What is solved at once: one lens of one vehicle, a stretch of moderate length; and joining the parts again."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.placement import Solution
+
+LONGEST = 600
+"""Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded."""
+_SMALL_PART = 6
+
+
+def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
+    """Frames of one vehicle, camera and size each, in order; a zoom change or a turned camera starts a new lens.
+
+    Handfuls of frames with another camera string but the same size stay with the vehicle's main camera.
+    """
+    units: list[list[Frame]] = []
+    for frames in vehicles.values():
+        groups: dict[tuple[str, int, int], list[Frame]] = {}
+        for frame in frames:
+            groups.setdefault((frame.camera, frame.width, frame.height), []).append(frame)
+        for group in _absorb(groups):
+            parts = max(1, int(np.ceil(len(group) / LONGEST)))
+            units += [list(part) for part in _even(group, parts)]
+    return units
+
+
+def _absorb(groups: dict[tuple[str, int, int], list[Frame]]) -> list[list[Frame]]:
+    by_size: dict[tuple[int, int], list[tuple[str, int, int]]] = {}
+    for key in groups:
+        by_size.setdefault(key[1:], []).append(key)
+    out = []
+    for keys in by_size.values():
+        main = max(keys, key=lambda k: len(groups[k]))
+        for key in keys:
+            if key != main and len(groups[key]) < _SMALL_PART:
+                groups[main] = _in_order([*groups[main], *groups.pop(key)])
+        out += [groups[k] for k in keys if k in groups]
+    return out
+
+
+def _in_order(frames: list[Frame]) -> list[Frame]:
+    timed = all(f.time_s is not None for f in frames)
+    return sorted(frames, key=lambda f: (f.time_s or 0.0, f.image) if timed else (0.0, f.image))
+
+
+def _even(frames: list[Frame], parts: int) -> list[list[Frame]]:
+    edges = np.linspace(0, len(frames), parts + 1).round().astype(int)
+    return [frames[a:b] for a, b in pairwise(edges.tolist())]
+
+
+def merge_units(solutions: Sequence[Solution]) -> list[Solution]:
+    """One solution a vehicle: placed frames and legs of its units together, the field of view of the largest."""
+    by_vehicle: dict[str, list[Solution]] = {}
+    for solution in solutions:
+        by_vehicle.setdefault(solution.vehicle, []).append(solution)
+    return [parts[0] if len(parts) == 1 else _merged(parts) for parts in by_vehicle.values()]
+
+
+def _merged(parts: Sequence[Solution]) -> Solution:
+    main = max(parts, key=lambda s: len(s.placed))
+    legs, offset = [], 0
+    for part in parts:
+        legs += [replace(leg, first=leg.first + offset, last=leg.last + offset) for leg in part.legs]
+        offset += len(part.placed) + len(part.dropped)
+    timings: dict[str, float] = {}
+    for part in parts:
+        for name, seconds in part.timings.items():
+            timings[name] = timings.get(name, 0.0) + seconds
+    return replace(
+        main,
+        placed=[p for part in parts for p in part.placed],
+        dropped={image: reason for part in parts for image, reason in part.dropped.items()},
+        legs=legs,
+        state=[part.state for part in parts if part.state is not None],
+        warnings=list(dict.fromkeys(w for part in parts for w in part.warnings)),
+        timings=timings,
+    )

@@ -1,0 +1,119 @@
+"""A vehicle's sparse photos as a Flight, adjusted without a map, for the same later steps as a dense one."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.refine.bundle import flight_records as dense
+from orthoswarm.refine.bundle.adjustment import Adjustment
+from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, F, Tracks
+from orthoswarm.refine.features.flow_calibration import Calibration
+from orthoswarm.refine.features.grey_pictures import Pictures
+from orthoswarm.refine.flight.record_findings import height_findings
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.sparse_adjustment import believed_heights, datum, heights_above_ground, solve_sparse
+from orthoswarm.refine.flight.sparse_start import SparseStart, read_records, sparse_start
+from orthoswarm.refine.initial.pair_graph import Progress, ReadGray, Run, serial
+from orthoswarm.refine.initial.planar_similarity import Array
+from orthoswarm.refine.initial.segments import photo_legs
+
+
+def open_sparse_flight(
+    frames: Sequence[Frame],
+    grid: LocalGrid,
+    origin: Array,
+    read: ReadGray,
+    run: Run = serial,
+    progress: Progress | None = None,
+) -> Flight:
+    """Match a vehicle's photos with each other and adjust them without a map.
+
+    The counterpart of `flight.open_flight` for photos that cannot be followed, with the adjustment already solved.
+
+    Args:
+        frames: of one vehicle and one lens, in order of time.
+        grid: the area's grid.
+        origin: float64 (2,), of the local frame.
+        read: gives a photo's grey values at full size.
+        run: where features are found and matched; the result does not depend on it.
+        progress: called with stage, done, all.
+    """
+    frames = [replace(frame, camera=frames[0].camera) for frame in frames]
+    start = sparse_start(frames, read_records(frames, grid, origin), read, run, progress)
+    adjustment = solve_sparse(start)
+    believed = believed_heights(adjustment, start)
+    warnings = [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]
+    return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), adjustment, believed, warnings)
+
+
+def flight_of(
+    frames: Sequence[Frame],
+    grid: LocalGrid,
+    origin: Array,
+    read: ReadGray,
+    start: SparseStart,
+    rows: NDArray[np.int64],
+    adjustment: Adjustment,
+    believed: NDArray[np.bool_],
+    warnings: Sequence[str],
+    focal_sigma: float = 0.0,
+) -> Flight:
+    """A vehicle's flight from photos that were adjusted alone or together with others.
+
+    Args:
+        frames: of the vehicle.
+        grid: the area's grid.
+        origin: float64 (2,), of the local frame.
+        read: gives a photo's grey values at full size.
+        start: of all photos that were matched together.
+        rows: which of them are the vehicle's.
+        adjustment: of the vehicle's photos alone, in pixels of the full pictures.
+        believed: bool, of all photos, whose recorded heights were believed to the end.
+        warnings: findings to be told with this vehicle.
+        focal_sigma: of a lens that was found together with others, see `Flight`.
+    """
+    records = dense.read_records(frames, grid, origin)
+    pictures = Pictures(frames, read)
+    adjustment = reduced(adjustment, pictures.scale, pictures.size)
+    number = {int(row): k for k, row in enumerate(rows)}
+    pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
+    yaw = wrap_rad(start.plane.yaw[rows])
+    mine = list(warnings)
+    calibration = Calibration(
+        float(adjustment.rig.lens[0, F]),
+        float(np.median(heights_above_ground(adjustment))),
+        wrap_rad(yaw - records.yaw),
+        bool(believed[rows].any()),
+        start.pairs[1],
+        mine,
+    )
+    leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
+    held = start.placed[rows].astype(np.float64)
+    return Flight(
+        frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(mine), sparse=True,
+        focal_sigma=focal_sigma,
+    )  # fmt: skip
+
+
+def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
+    """The same in pixels of pictures reduced `step` times to a size (columns, rows), its weights computed anew."""
+    rig, t, p = adjustment.rig, adjustment.tracks, adjustment.priors
+    lens, lens_prior, lens_sigma = rig.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
+    lens[:, [F, CX, CY]] /= step
+    lens[:, WIDTH], lens[:, HEIGHT] = size
+    lens_prior[:, 0] -= np.log(step)
+    lens_prior[:, 4:] /= step
+    lens_sigma[:, 4:] /= step
+    tracks = Tracks(t.camera, t.point, (t.uv + 0.5) / step - 0.5, (t.sigma_px / np.float32(step)).astype(np.float32))
+    priors = replace(p, lens=lens_prior, lens_sigma=lens_sigma)
+    out = Adjustment.begin(replace(rig, lens=lens), tracks, priors, adjustment.points)
+    out.common[:] = adjustment.common
+    common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
+    common_lens[:, 4:] /= step
+    out.step(9.0, datum(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0))
+    return out

@@ -1,0 +1,230 @@
+"""The front end for sparse photos: from frames to start values, tracks and priors of the adjustment.
+
+For photos that overlap too little, or too irregularly, to be followed from one to the next: forward overlap under about
+80 %, corners, crosshatches, several sorties. What tags say is evidence; the pictures decide.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, F, Rig, Tracks
+from orthoswarm.refine.features.pair_matching import Pair
+from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
+from orthoswarm.refine.flight.record_findings import findings, flipped_yaw, unplaced_reasons
+from orthoswarm.refine.initial.initial_orientation import Start2D, start_in_plane
+from orthoswarm.refine.initial.lens_groups import by_vehicle, told_apart
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, Progress, ReadGray, Run, build_pair_graph, serial
+from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, Records
+from orthoswarm.refine.initial.relative_scale import focal_by_hint
+from orthoswarm.refine.initial.segments import split_segments
+
+_OUTLIER_SIGMA_M = 5.0
+_STATED_FLOOR_M = 0.03
+_PER_CELL = 2
+_RECORDED_HEIGHT_SIGMA_M = 0.3
+_FREE_HEIGHT_SIGMA_M = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class SparseStart:
+    """Everything that the adjustment of N photos needs, in a local frame; pixels are those of the full pictures.
+
+    Attributes:
+        rig: start values. tracks: observations of points, length 2 to 20.
+        segment: int32 (N,), attitude bias, height offset and lag are common to a segment.
+        component: int32 (N,), connected part of the pair graph, the largest is 0.
+        position_prior: float64 (N, 3), recorded positions; where the receiver is an outlier, the network's.
+        position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
+            and possible. velocity: float64 (N, 2), metres per second.
+        log_focal: float64 (L,) belief from tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
+        placed: bool (N,), False where no picture holds the photo. reasons: photo -> why it is not held.
+        damaged: photos that cannot be decoded.
+        yaw_flipped: bool (N,), the recorded yaw is turned by 180 degrees.
+        metres_per_pixel: float64 (N,). warnings: findings in plain words. plane: all that the start in 2-D found.
+        records: what the photos recorded. pairs: pairs tried and matched.
+    """
+
+    rig: Rig
+    tracks: Tracks
+    segment: Ints
+    component: Ints
+    position_prior: Array
+    position_sigma: Array
+    height_known: Flags
+    velocity: Array
+    log_focal: Array
+    log_focal_sigma: Array
+    placed: Flags
+    reasons: dict[int, str]
+    damaged: frozenset[int]
+    yaw_flipped: Flags
+    metres_per_pixel: Array
+    warnings: list[str]
+    plane: Start2D
+    records: Records
+    pairs: tuple[int, int]
+
+
+def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, share_lenses: bool = False) -> Records:
+    """What frames recorded, as arrays in the local frame.
+
+    Args:
+        frames: photos of one or several vehicles, of a vehicle in order of time.
+        grid: the area's grid.
+        origin: float64 (2,), grid coordinates of the local frame's origin.
+        share_lenses: vehicles whose cameras and picture sizes go by the same name share one lens.
+    """
+    lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
+    xy = grid.to_grid(lat, lon) - origin[:2]
+    convergence = grid.convergence_rad(lat, lon)
+    units = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
+    vehicle = _numbers(units)
+    lens = _numbers([unit[1:] for unit in units]) if share_lenses else vehicle
+    height, altitude = _column(frames, "height_m"), _column(frames, "altitude_m")
+    pitch = _column(frames, "pitch_rad")
+    time_s = np.array([np.nan if f.time_s is None else f.time_s for f in frames], float)
+    level = np.where(np.isfinite(height), height, altitude)
+    hints = [[f.fov_hint_rad for f, k in zip(frames, lens) if k == n] for n in range(int(lens.max()) + 1)]
+    return Records(
+        position=xy[:, 0] + 1j * xy[:, 1],
+        position_sigma=_column(frames, "position_sigma_m"),
+        time_s=time_s,
+        height_m=height,
+        altitude_m=altitude,
+        yaw=_column(frames, "yaw_rad") - convergence,
+        flight_yaw=_column(frames, "flight_yaw_rad") - convergence,
+        pitch=pitch,
+        roll=_column(frames, "roll_rad"),
+        lens=lens,
+        segment=split_segments(vehicle, time_s, level, pitch),
+        vehicle=vehicle,
+        width=np.array([f.width for f in frames], float),
+        rows=np.array([f.height for f in frames], float),
+        fov_hint=np.array([_median([h for h in group if h is not None]) for group in hints]),
+    )
+
+
+def sparse_start(
+    frames: Sequence[Frame],
+    records: Records,
+    read_gray: ReadGray,
+    run: Run = serial,
+    progress: Progress | None = None,
+) -> SparseStart:
+    """Match photos with each other and find start values of all of them.
+
+    Args:
+        frames: N photos, of a vehicle in order of time.
+        records: see `read_records`.
+        read_gray: gives a photo's grey values, uint8 (rows, columns), at any size (a reduced decode is welcome); may
+            raise PictureError.
+        run: where features are found and matched; the result does not depend on it.
+        progress: called with stage, done, all.
+    """
+    builder = PairGraphBuilder(frames, records, read_gray, run, progress)
+    start = build_pair_graph(builder)
+    if len(records.fov_hint) <= int(records.vehicle.max()):  # vehicles share lenses by name
+        alone = start_in_plane(by_vehicle(records), builder.pairs(), builder.features)
+        records = told_apart(records, alone)
+        if records is not builder.records:
+            start = start_in_plane(records, builder.pairs(), builder.features)
+    return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
+
+
+def assemble(
+    frames: Sequence[Frame],
+    records: Records,
+    features: Sequence[Features],
+    pairs: Sequence[Pair],
+    start: Start2D,
+    damaged: Mapping[int, str],
+    tried: int,
+) -> SparseStart:
+    """Put together what the adjustment needs.
+
+    Args:
+        frames: N photos.
+        records: what they recorded.
+        features: of each photo.
+        pairs: E matched pairs.
+        start: found from these pairs.
+        damaged: photos that could not be read, and why.
+        tried: how many pairs were tried.
+    """
+    trusted = [pair for pair, ok in zip(pairs, start.pair_ok, strict=True) if ok]
+    tracks = thin_tracks(build_tracks(features, trusted), records.width, records.rows, _PER_CELL)
+    position, sigma, known = _position_priors(records, start)
+    log_focal, log_focal_sigma = focal_by_hint(records)
+    held = np.zeros(len(frames), bool)
+    held[np.unique(tracks.camera)] = True
+    velocity = records.velocity()
+    return SparseStart(
+        rig=_rig(records, start),
+        tracks=tracks,
+        segment=records.segment,
+        component=start.component,
+        position_prior=position,
+        position_sigma=sigma,
+        height_known=known,
+        velocity=np.stack([velocity.real, velocity.imag], axis=1),
+        log_focal=log_focal,
+        log_focal_sigma=log_focal_sigma,
+        placed=held,
+        reasons=unplaced_reasons(frames, records, held, damaged),
+        damaged=frozenset(damaged),
+        yaw_flipped=flipped_yaw(records, start),
+        metres_per_pixel=start.metres,
+        warnings=findings(frames, records, start),
+        plane=start,
+        records=records,
+        pairs=(tried, len(pairs)),
+    )
+
+
+def _rig(records: Records, start: Start2D) -> Rig:
+    position = np.stack([start.position.real, start.position.imag, start.height], axis=1)
+    lens = np.zeros((len(start.focal), 8))
+    first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
+    lens[:, F], lens[:, K1] = start.focal, start.k1
+    lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
+    return Rig(position, start.rotation(), records.lens.astype(np.int32), lens)
+
+
+def _position_priors(records: Records, start: Start2D) -> tuple[Array, Array, Flags]:
+    """Recorded positions with their sigmas (N, 3) east, north, up, and where heights are recorded and possible.
+
+    A position that states its own sigma (RTK) lags by the same time on all photos; others by a time that varies.
+    """
+    position = np.stack([records.position.real, records.position.imag, start.height], axis=1)
+    known = np.isfinite(records.height_m) & np.isfinite(start.recorded_focal)[records.lens]
+    position[known, 2] = records.height_m[known]
+    velocity = records.velocity()
+    stated = np.isfinite(records.position_sigma)
+    across = np.where(stated, np.hypot(records.position_sigma, _STATED_FLOOR_M), 1.0)
+    along = np.where(stated, 0.0, LAG_SPREAD_S)
+    up = np.where(known, np.where(stated, np.maximum(across, 0.05), _RECORDED_HEIGHT_SIGMA_M), _FREE_HEIGHT_SIGMA_M)
+    sigma = np.stack([np.hypot(across, along * velocity.real), np.hypot(across, along * velocity.imag), up], axis=1)
+    off = ~start.gps_ok
+    position[off, 0], position[off, 1] = start.position.real[off], start.position.imag[off]
+    sigma[off, :2] = _OUTLIER_SIGMA_M
+    return position, sigma, known
+
+
+def _numbers(keys: Sequence[object]) -> Ints:
+    order = {key: n for n, key in enumerate(dict.fromkeys(keys))}
+    return np.array([order[key] for key in keys], np.int32)
+
+
+def _column(frames: Sequence[Frame], name: str) -> Array:
+    values = (getattr(f.fix, name) for f in frames)
+    return np.array([np.nan if v is None else float(v) for v in values])
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float("nan")

@@ -1,0 +1,1 @@
+"""Start values of the exterior orientation without a map, from pairs of photos and what was recorded."""

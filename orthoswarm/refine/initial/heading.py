@@ -1,0 +1,186 @@
+"""Headings of photos from pairs of photos: relative turns of the pictures, absolute ones from the way flown.
+
+A yaw tag that flips by 180 degrees while the picture does not, a gimbal yaw relative to the body, no yaw tag at all:
+the pictures know better. Tags are asked only for photos whose heading no picture tells.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.sparse.linalg import spsolve
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, Records
+
+_COURSE_SIGMA = float(np.radians(2.0))
+_C_SCHEDULE = (400.0, 100.0, 36.0, 9.0, 9.0)
+_CANDIDATES = 360
+_AGREE = float(np.radians(20.0))
+
+
+@dataclass(frozen=True, slots=True)
+class TagHeading:
+    """How one vehicle's recorded angles relate to the pictures' headings.
+
+    Attributes:
+        source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
+        offset: constant difference picture - tag, radians. agree: share of photos within 20 degrees.
+    """
+
+    source: str
+    offset: float
+    agree: float
+
+
+def components(graph: PairGraph, count: int) -> Ints:
+    """Connected parts of the pair graph, int32 (N,), the largest is 0; photos without a pair are parts of their own."""
+    links = coo_matrix((np.ones(len(graph)), (graph.first, graph.second)), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    size = np.bincount(label)
+    first = np.full(len(size), count)
+    np.minimum.at(first, label, np.arange(count))
+    rank = np.empty(len(size), np.int32)
+    rank[np.lexsort((first, -size))] = np.arange(len(size), dtype=np.int32)
+    return np.asarray(rank[label])
+
+
+def chain_headings(graph: PairGraph, count: int) -> Array:
+    """Headings relative to one photo of each connected part, float64 (N,), along the strongest pairs."""
+    cost = 1.0 / np.maximum(graph.count.astype(float), 1.0)
+    links = csr_matrix((cost, (graph.first, graph.second)), shape=(count, count))
+    tree = minimum_spanning_tree(links)
+    tree = tree + tree.T
+    turn = dict(zip(zip(graph.first.tolist(), graph.second.tolist()), np.angle(graph.factor).tolist()))
+    yaw = np.zeros(count)
+    seen = np.zeros(count, bool)
+    for root in range(count):
+        if seen[root]:
+            continue
+        order, before = breadth_first_order(tree, root, directed=False)
+        seen[order] = True
+        for k in order[1:].tolist():
+            p = int(before[k])
+            yaw[k] = yaw[p] + (turn[p, k] if (p, k) in turn else -turn[k, p])
+    return wrap_rad(yaw)
+
+
+def course_headings(
+    graph: PairGraph, records: Records, metres: Array, offset: Complex, offset_sigma_px: Array
+) -> tuple[Array, Array]:
+    """Absolute headings of the first photo of each pair, from the recorded way and the picture's shift.
+
+    Args:
+        graph: E pairs.
+        records: of N photos.
+        metres: float64 (N,), metres per pixel.
+        offset: complex (N,), nadir pixel of each photo.
+        offset_sigma_px: float64 (N,), how well it is known.
+
+    Returns:
+        Heading (E,) and its one sigma (E,), infinite where the way is too short to tell.
+    """
+    i, j = graph.first, graph.second
+    back = np.conj(graph.turn)
+    ratio = metres[j] / metres[i]
+    shift = (graph.centre_first - offset[i]) - ratio * back * (graph.centre_second - offset[j])
+    way = records.position[j] - records.position[i]
+    blur = np.hypot(records.gps_sigma()[i], records.gps_sigma()[j])
+    length = np.maximum(np.abs(way), 1e-9)
+    tilt = np.abs(1.0 - ratio * back) * offset_sigma_px[i] * metres[i] / length
+    sigma = np.sqrt(_COURSE_SIGMA**2 + (blur / length) ** 2 + tilt**2)
+    sigma[(sigma > 1.0) | (np.abs(shift) * metres[i] < 0.3 * length)] = np.inf
+    return wrap_rad(np.angle(shift) - np.angle(way)), sigma
+
+
+def solve_headings(
+    graph: PairGraph, component: Ints, start: Array, course: Array, course_sigma: Array
+) -> tuple[Array, Flags]:
+    """Headings of all photos, and whether the pictures told them.
+
+    Each connected part is turned as a whole to the angle that most courses support, then all headings are solved
+    together, robustly.
+
+    Args:
+        graph: E pairs.
+        component: int32 (N,).
+        start: float64 (N,), relative headings within each part.
+        course: float64 (E,), absolute headings of the first photos; course_sigma: (E,).
+        course_sigma: one sigma of them, infinite where unknown.
+    """
+    yaw = start.copy()
+    known = np.zeros(len(start), bool)
+    part_of_pair = component[graph.first]
+    useful = np.isfinite(course_sigma)
+    for part in np.unique(part_of_pair[useful]):
+        rows = np.flatnonzero(useful & (part_of_pair == part))
+        turn = circular_mode(wrap_rad(course[rows] - yaw[graph.first[rows]]), course_sigma[rows] ** -2)
+        yaw[component == part] += turn
+        known[component == part] = True
+    for c in _C_SCHEDULE:
+        yaw = yaw + _heading_step(graph, yaw, course, course_sigma, c)
+    return wrap_rad(yaw), known
+
+
+def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Array, c: float) -> Array:
+    count, pairs = len(yaw), len(graph)
+    i, j = graph.first, graph.second
+    turn_sigma = graph.turn_sigma
+    relative = wrap_rad(np.angle(graph.factor) - (yaw[j] - yaw[i])) / turn_sigma
+    finite = np.isfinite(course_sigma)
+    sigma = np.where(finite, course_sigma, 1.0)
+    absolute = np.where(finite, wrap_rad(course - yaw[i]) / sigma, 0.0)
+    w = np.concatenate([1.0 / (1.0 + relative**2 / c), finite / (1.0 + absolute**2 / c)])
+    row = np.arange(pairs)
+    pull = w[:pairs] / turn_sigma
+    differences = coo_matrix((np.r_[-pull, pull], (np.r_[row, row], np.r_[i, j])), shape=(2 * pairs, count))
+    matrix = differences + coo_matrix((w[pairs:] / sigma, (row + pairs, i)), shape=(2 * pairs, count))
+    rhs = w * np.concatenate([relative, absolute])
+    normal = (matrix.T @ matrix + 1e-3 * _identity(count)).tocsc()
+    return np.asarray(spsolve(normal, matrix.T @ rhs), dtype=np.float64).reshape(-1)
+
+
+def _identity(count: int) -> csr_matrix:
+    k = np.arange(count)
+    return csr_matrix((np.ones(count), (k, k)), shape=(count, count))
+
+
+def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
+    """The angle that the most weight supports: the densest window, then the mean of what lies near it."""
+    tried = angle[:: max(1, len(angle) // _CANDIDATES)]
+    support = (weight[None, :] * (np.abs(wrap_rad(angle[None, :] - tried[:, None])) < width)).sum(1)
+    mode = float(tried[int(support.argmax())])
+    for _ in range(5):
+        r = wrap_rad(angle - mode)
+        w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2
+        mode += float((w * r).sum() / w.sum())
+    return wrap_rad(mode)
+
+
+def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
+    """Which recorded angle of some photos of one vehicle follows the pictures' headings, up to a constant.
+
+    Args:
+        records: all records.
+        rows: photos of one vehicle whose heading the pictures told.
+        yaw: float64 (N,), the pictures' headings.
+    """
+    best = TagHeading("", 0.0, 0.0)
+    for source in ("yaw", "flight_yaw"):
+        tag = tag_yaw(records, source)[rows]
+        finite = np.isfinite(tag)
+        if finite.sum() < 3:
+            continue
+        difference = wrap_rad(yaw[rows] - tag)[finite]
+        offset = circular_mode(difference, np.ones(len(difference)))
+        agree = float((np.abs(wrap_rad(difference - offset)) < _AGREE).mean())
+        if agree > best.agree + 0.1:
+            best = TagHeading(source, offset, agree)
+    return best if best.agree >= 0.5 else TagHeading("", 0.0, best.agree)
+
+
+def tag_yaw(records: Records, source: str) -> Array:
+    """A recorded heading by name, float64 (N,), NaN where unknown."""
+    return records.flight_yaw if source == "flight_yaw" else records.yaw

@@ -1,0 +1,227 @@
+"""Start values of every photo from pairs of photos: heading, ground scale, tilt, lens, position, height.
+
+All of it takes milliseconds and needs no tag but positions. The shapes of matches tell tilt and, where the photos look
+several ways, the focal length (`shape`); level pictures are then similar figures of the ground, whose turns tell
+headings (`heading`), whose zooms tell relative heights (`scales`) and whose shifts tell positions (`network`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.refine.features.pair_matching import Pair
+from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.initial.heading import (
+    TagHeading,
+    chain_headings,
+    circular_mode,
+    components,
+    course_headings,
+    solve_headings,
+    tag_heading,
+    tag_yaw,
+)
+from orthoswarm.refine.initial.planar_network import Beliefs, solve_network
+from orthoswarm.refine.initial.planar_similarity import (
+    Array,
+    Complex,
+    Flags,
+    Ints,
+    PairGraph,
+    Records,
+    level_from_nadir,
+    rotation_of,
+)
+from orthoswarm.refine.initial.relative_scale import (
+    Heights,
+    first_of,
+    first_scale,
+    focal_by_height,
+    focal_by_hint,
+    recorded_heights,
+    relative_scales,
+)
+from orthoswarm.refine.initial.tilt_and_lens import Matches, Shape, similarities, solve_shape
+
+_ROUNDS = 2
+_HEIGHT_SIGMA = 0.12
+_TAG_TILT_SIGMA = float(np.radians(3.0))
+_FREE_TILT_SIGMA = float(np.radians(9.0))
+_TILT_FLOOR = float(np.radians(0.7))
+
+
+@dataclass(frozen=True, slots=True)
+class Start2D:
+    """The start of N photos of L lenses in S segments with E pairs.
+
+    Attributes:
+        position: complex (N,), east + i north of the network.
+        yaw: float64 (N,) grid heading. level: float64 (N, 3, 3), camera to level camera.
+        metres: float64 (N,), metres per pixel straight below. height: float64 (N,), metres above the ground.
+        focal: float64 (L,), pixels. focal_sigma: float64 (L,), relative. k1: float64 (L,).
+        tilt_sigma: float64 (S,), radians.
+        component: int32 (N,), connected parts of the pair graph, the largest is 0.
+        pair_ok: bool (E,), pairs that agree with the network. gps_ok: bool (N,), records that do.
+        gps_residual: complex (N,), recorded minus network's position, lag removed. lag: float64 (V,) seconds.
+        yaw_known: bool (N,), whether pictures told the heading. scale_known: bool (L,), the ground scale.
+        recorded_focal: float64 (L,), focal length that the recorded heights imply, NaN where they are impossible.
+        tags: for each vehicle, which recorded heading follows the pictures.
+        graph: pairs between level pictures. misfit: median misfit of pairs in pixels, before and after levelling.
+    """
+
+    position: Complex
+    yaw: Array
+    level: Array
+    metres: Array
+    height: Array
+    focal: Array
+    focal_sigma: Array
+    k1: Array
+    tilt_sigma: Array
+    component: Ints
+    pair_ok: Flags
+    gps_ok: Flags
+    gps_residual: Complex
+    lag: Array
+    yaw_known: Flags
+    scale_known: Flags
+    recorded_focal: Array
+    tags: tuple[TagHeading, ...]
+    graph: PairGraph
+    misfit: tuple[float, float]
+
+    def rotation(self) -> Array:
+        """Camera-to-ground rotations, float64 (N, 3, 3)."""
+        return rotation_of(self.yaw, self.level)
+
+    def middle(self) -> Complex:
+        """Ground point that each picture shows in its middle, complex (N,)."""
+        axis = self.level[:, :, 2]
+        ahead = (axis[:, 0] - 1j * axis[:, 1]) / np.maximum(axis[:, 2], 0.3)
+        return np.asarray(self.position + self.height * ahead * np.exp(-1j * self.yaw))
+
+
+def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[Features]) -> Start2D:
+    """Find start values of all photos.
+
+    Args:
+        records: of N photos.
+        pairs: trusted matches.
+        features: of each photo.
+    """
+    count, segments = len(records), int(records.segment.max()) + 1
+    lens_of = np.asarray(first_of(records.segment, records.lens, segments), np.int32)
+    matches = Matches.of(pairs, features)
+    believed, believed_sigma = focal_by_hint(records)
+    shape = _shape(matches, records, believed, believed_sigma)
+    graph = similarities(matches, records, shape)
+    metres, scale_known = first_scale(graph, records, lens_of, np.exp(shape.log_focal))
+    component = components(graph, count)
+    yaw = chain_headings(graph, count)
+    no_offset = np.zeros(count, np.complex128)
+    for round_ in range(_ROUNDS):
+        focal = np.exp(shape.log_focal)
+        heights = recorded_heights(records, metres * focal[lens_of])
+        by_height = focal_by_height(records, heights, metres, lens_of)
+        if round_ == 0 or _differs(by_height, focal):
+            shape = _shape(matches, records, *_combine(believed, believed_sigma, by_height))
+            graph = similarities(matches, records, shape)
+            focal = np.exp(shape.log_focal)
+        relative = relative_scales(graph, records, heights, count)
+        tilt_px = np.maximum(2.0 * shape.tilt_sigma, _TILT_FLOOR) * focal[lens_of]
+        course, sigma = course_headings(
+            graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
+        )
+        yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
+        network = solve_network(
+            graph, records, yaw, _beliefs(records, heights, relative, metres, lens_of, tilt_px, by_height, focal)
+        )
+        metres = network.metres
+    level = shape.level.copy()
+    for s in range(segments):
+        turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
+        level[records.segment == s] = turn @ level[records.segment == s]
+    vehicles = [np.flatnonzero(yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)]
+    tags = tuple(tag_heading(records, rows, yaw) for rows in vehicles)
+    each = metres[records.segment] * relative
+    return Start2D(
+        position=network.position,
+        yaw=_fill_headings(records, yaw, yaw_known, component, tags),
+        level=level,
+        metres=each,
+        height=each * focal[records.lens],
+        focal=focal,
+        focal_sigma=shape.log_focal_sigma,
+        k1=shape.k1,
+        tilt_sigma=np.minimum(shape.tilt_sigma, network.offset_sigma / focal[lens_of]),
+        component=component,
+        pair_ok=network.pair_ok,
+        gps_ok=network.gps_ok,
+        gps_residual=network.gps_residual,
+        lag=network.lag,
+        yaw_known=yaw_known,
+        scale_known=scale_known,
+        recorded_focal=focal_by_height(records, heights, metres, lens_of),
+        tags=tags,
+        graph=graph,
+        misfit=shape.misfit,
+    )
+
+
+def _shape(matches: Matches, records: Records, log_focal: Array, log_focal_sigma: Array) -> Shape:
+    tagged = np.isfinite(records.pitch)
+    segments = int(records.segment.max()) + 1
+    share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
+    tilt_sigma = np.where(share > 0.5, _TAG_TILT_SIGMA, _FREE_TILT_SIGMA)
+    return solve_shape(matches, records, records.tag_level(), log_focal, log_focal_sigma, tilt_sigma)
+
+
+def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
+    """Belief in the focal length from tags together with recorded heights (12 %: takeoff level is not ground level)."""
+    weight = np.where(np.isfinite(by_height), _HEIGHT_SIGMA**-2, 0.0)
+    total = sigma**-2 + weight
+    return (log_focal * sigma**-2 + weight * np.log(np.where(weight > 0, by_height, 1.0))) / total, total**-0.5
+
+
+def _differs(one: Array, two: Array) -> bool:
+    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > 0.03)))
+
+
+def _beliefs(
+    records: Records,
+    heights: Heights,
+    relative: Array,
+    metres: Array,
+    lens_of: Ints,
+    tilt_px: Array,
+    by_height: Array,
+    focal: Array,
+) -> Beliefs:
+    """Segments of one lens share its metres per pixel, scaled by their recorded heights where these are possible."""
+    link, link_sigma = np.ones(len(metres)), np.full(len(metres), 0.15)
+    for k in range(len(focal)):
+        rows = lens_of == k
+        if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
+            link[rows] = heights.segment[rows] / np.median(heights.segment[rows])
+            link_sigma[rows] = 0.03
+    return Beliefs(metres, relative, link, link_sigma, 0.5, tilt_px, lens_of, records.vehicle)
+
+
+def _fill_headings(records: Records, yaw: Array, known: Flags, component: Ints, tags: tuple[TagHeading, ...]) -> Array:
+    """Headings of parts that no course fixes: by the tag that follows the pictures elsewhere, else the way flown."""
+    yaw = yaw.copy()
+    velocity = records.velocity()
+    course = np.where(np.abs(velocity) > 0.3, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan)
+    guess = np.full(len(yaw), np.nan)
+    for v, tag in enumerate(tags):
+        rows = records.vehicle == v
+        source = tag.source or ("yaw" if np.isfinite(records.yaw[rows]).any() else "flight_yaw")
+        guess[rows] = tag_yaw(records, source)[rows] + tag.offset
+    guess = np.where(np.isfinite(guess), guess, course)
+    for part in np.unique(component[~known]):
+        rows = np.flatnonzero((component == part) & np.isfinite(guess))
+        if len(rows):
+            yaw[component == part] += circular_mode(wrap_rad(guess[rows] - yaw[rows]), np.ones(len(rows)))
+    return wrap_rad(yaw)

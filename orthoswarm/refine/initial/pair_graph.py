@@ -1,0 +1,169 @@
+"""The pair graph of a set of photos: features of all, matches of the pairs worth trying, start values as they come.
+
+Which pairs are worth trying depends on where the photos look, and that depends on the tilt, which only pairs tell: so
+pairs in order of time come first, then near ones, then more for photos that have few.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.frame import Frame
+from orthoswarm.raster.picture_file import PictureError
+from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
+from orthoswarm.refine.features.sift_features import FINE_PIXELS, WORKING_PIXELS, Features, detect
+from orthoswarm.refine.initial.initial_orientation import Start2D, start_in_plane
+from orthoswarm.refine.initial.planar_similarity import Ints, Records
+
+Gray = NDArray[np.uint8]
+ReadGray = Callable[[Frame], Gray]
+Progress = Callable[[str, int, int], None]
+T = TypeVar("T")
+
+REACH_SHARE = 0.68
+_WIDE_REACH_SHARE = 0.8
+_FIRST_COUNT = 3
+_COUNT = 6
+_MORE_COUNT = 12
+_ENOUGH_PAIRS = 5
+_WEAK_PAIRS = 2
+_WEAK_MATCHES = 40
+_CHUNK = 64
+
+
+class Run(Protocol):
+    """How tasks are run: one after the other, in threads, in processes; results come in the order of the items."""
+
+    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+        """Yield function(item) for each item."""
+
+
+def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+    """Run tasks one after the other in this process."""
+    return map(function, items)
+
+
+@dataclass(slots=True)
+class PairGraphBuilder:
+    """Features and matches of N photos, growing.
+
+    Attributes:
+        frames: the photos. records: what they recorded. read_gray: gives a photo's grey values at any size.
+        run: where features are found and matched; results do not depend on it.
+        progress: called with stage, done, all.
+        features: of each photo. tried: pair -> match (empty where it failed).
+        damaged: photo -> why it cannot be read.
+    """
+
+    frames: Sequence[Frame]
+    records: Records
+    read_gray: ReadGray
+    run: Run = serial
+    progress: Progress | None = None
+    features: list[Features] = field(default_factory=list)
+    tried: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
+    damaged: dict[int, str] = field(default_factory=dict)
+
+    def detect_all(self) -> None:
+        """Find the features of all photos."""
+        self.features = [Features.none(f.width, f.height) for f in self.frames]
+        self._detect(list(range(len(self.frames))), WORKING_PIXELS)
+
+    def try_pairs(self, pairs: Ints) -> None:
+        """Match pairs that were not tried yet."""
+        fresh = [(int(a), int(b)) for a, b in pairs if (int(a), int(b)) not in self.tried]
+        chunks = [fresh[k : k + _CHUNK] for k in range(0, len(fresh), _CHUNK)]
+        tasks = [(chunk, {k: self.features[k] for pair in chunk for k in pair}) for chunk in chunks]
+        done = 0
+        for chunk, matches in zip(chunks, self.run(match_chunk, tasks), strict=True):
+            self.tried.update(zip(chunk, matches, strict=True))
+            done += len(chunk)
+            self._tell("pairs", done, len(fresh))
+
+    def pairs(self) -> list[Pair]:
+        """The matched pairs in order."""
+        return [Pair(a, b, m) for (a, b), m in sorted(self.tried.items()) if len(m)]
+
+    def degree(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pairs and matches of each photo, int64 (N,) both."""
+        pairs, matches = np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), np.int64)
+        for (a, b), m in self.tried.items():
+            for k in (a, b):
+                pairs[k] += len(m) > 0
+                matches[k] += len(m)
+        return pairs, matches
+
+    def near(self, start: Start2D, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
+        """Pairs whose pictures should overlap by the start; `only` bool (N,) asks for one of them to be set."""
+        reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
+        pairs = nearby(start.middle(), reach, self.records.segment, count)
+        return pairs if only is None or not len(pairs) else pairs[only[pairs].any(1)]
+
+    def start(self) -> Start2D:
+        """Start values by the pairs found so far."""
+        return start_in_plane(self.records, self.pairs(), self.features)
+
+    def redetect(self, weak: NDArray[np.bool_]) -> None:
+        """Find features of weak photos on larger pictures and forget their pairs."""
+        self._detect(np.flatnonzero(weak).tolist(), FINE_PIXELS)
+        self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
+
+    def _detect(self, photos: list[int], pixels: int) -> None:
+        task = partial(features_of, read_gray=self.read_gray, pixels=pixels)
+        found = self.run(task, [self.frames[k] for k in photos])
+        for n, (k, result) in enumerate(zip(photos, found, strict=True)):
+            if isinstance(result, str):
+                self.damaged[k] = result
+            else:
+                self.features[k] = result
+            self._tell("features", n + 1, len(photos))
+
+    def _tell(self, stage: str, done: int, total: int) -> None:
+        if self.progress:
+            self.progress(stage, done, total)
+
+
+def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features | str:
+    """Features of a photo, or why it cannot be used."""
+    try:
+        gray = read_gray(frame)
+    except PictureError as error:
+        return str(error)
+    rows, columns = gray.shape
+    if abs(columns * frame.height - rows * frame.width) > 0.02 * columns * frame.height:
+        return f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"
+    return detect(gray, frame.width, frame.height, pixels)
+
+
+def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
+    """Matches of some pairs, given the features of their photos."""
+    pairs, features = task
+    return [match_features(features[a], features[b]) for a, b in pairs]
+
+
+def build_pair_graph(builder: PairGraphBuilder) -> Start2D:
+    """Find features, pairs and start values of all photos; the builder holds what was found."""
+    records = builder.records
+    builder.detect_all()
+    builder.try_pairs(consecutive(records.vehicle, records.time_s))
+    start = builder.start()
+    for count in (_FIRST_COUNT, _COUNT):
+        builder.try_pairs(builder.near(start, count, REACH_SHARE))
+        start = builder.start()
+    few = builder.degree()[0] < _ENOUGH_PAIRS
+    if few.any():
+        builder.try_pairs(builder.near(start, _MORE_COUNT, REACH_SHARE, few))
+        start = builder.start()
+    pairs, matches = builder.degree()
+    weak = (pairs < _WEAK_PAIRS) | (matches < _WEAK_MATCHES)
+    weak[list(builder.damaged)] = False
+    if weak.any():
+        builder.redetect(weak)
+        builder.try_pairs(builder.near(start, _MORE_COUNT, _WIDE_REACH_SHARE, weak))
+        builder.try_pairs(consecutive(records.vehicle, records.time_s))
+        start = builder.start()
+    return start

@@ -1,0 +1,236 @@
+"""The network of photos in the plane: positions, ground scale, nadir offset and lag together, one sparse robust solve.
+
+Given the headings everything is linear: P(second) - P(first) = m R (z - o) of the first minus the same of the second,
+for the middle of a pair's matches, against recorded positions. A wrong pair disagrees with the network, and so
+does a wrong position record; each is told from the other because photos have several neighbours.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import splu
+
+from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, Records
+
+LAG_SPREAD_S = 0.3
+_LAG_SIGMA_S = 0.5
+_PAIR_SIGMA_M = 0.6
+_PAIR_SHARE = 0.05
+_C_SCHEDULE = (400.0, 400.0, 36.0, 9.0, 9.0)
+_GATE = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Beliefs:
+    """What is believed of the common unknowns before the network is solved (S segments, N photos).
+
+    Attributes:
+        metres: float64 (S,), metres per pixel. relief: float64 (N,), its factor for each photo (the photo's height
+            over its segment's).
+        link: float64 (S,), metres per pixel of a segment over its lens's; link_sigma: float64 (S,), relative sigma.
+        metres_sigma: relative sigma of each lens's metres per pixel.
+        offset_sigma: float64 (S,), pixels, of the nadir's offset from 0.
+        lens: int32 (S,), lens of each segment. vehicle: int32 (N,), vehicle of each photo.
+    """
+
+    metres: Array
+    relief: Array
+    link: Array
+    link_sigma: Array
+    metres_sigma: float
+    offset_sigma: Array
+    lens: Ints
+    vehicle: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Result of the network.
+
+    Attributes:
+        position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,).
+        lag: float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,).
+        gps_residual: complex (N,), recorded position minus the network's, lag removed.
+        pair_residual: complex (E,), metres.
+    """
+
+    position: Complex
+    metres: Array
+    offset: Complex
+    offset_sigma: Array
+    lag: Array
+    pair_ok: Flags
+    gps_ok: Flags
+    gps_residual: Complex
+    pair_residual: Complex
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Where the unknowns stand: east (N), north (N), m (S), m o real (S), imaginary (S), m of lenses (L), lag (V)."""
+
+    photos: int
+    segments: int
+    lenses: int
+    vehicles: int
+
+    @property
+    def metres(self) -> int:
+        return 2 * self.photos
+
+    @property
+    def offset(self) -> int:
+        return self.metres + self.segments
+
+    @property
+    def lens(self) -> int:
+        return self.offset + 2 * self.segments
+
+    @property
+    def lag(self) -> int:
+        return self.lens + self.lenses
+
+    @property
+    def size(self) -> int:
+        return self.lag + self.vehicles
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows of a sparse system in units of one sigma, gathered block by block; a block may share one robust weight."""
+
+    size: int
+    count: int = 0
+    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = field(default_factory=list)
+    rhs: list[Array] = field(default_factory=list)
+
+    def block(self, rhs: Array, *terms: tuple[ArrayLike, ArrayLike]) -> None:
+        """Add rows: each term is (columns, values), one of each per row."""
+        row = self.count + np.arange(len(rhs))
+        for column, value in terms:
+            c, v = np.broadcast_arrays(np.asarray(column, np.int64), np.asarray(value, float))
+            self.parts.append((row, np.broadcast_to(c, row.shape), np.broadcast_to(v, row.shape)))
+        self.rhs.append(rhs)
+        self.count += len(rhs)
+
+    def finish(self) -> tuple[Any, Array]:
+        """The matrix and the right-hand side."""
+        row, column, value = (np.concatenate([p[k] for p in self.parts]) for k in range(3))
+        matrix = coo_matrix((value, (row, column)), shape=(self.count, self.size)).tocsr()
+        return matrix, np.concatenate(self.rhs)
+
+
+def solve_network(graph: PairGraph, records: Records, yaw: Array, beliefs: Beliefs) -> Network:
+    """Solve positions, scale, nadir offset and lag.
+
+    Args:
+        graph: E pairs of level pictures.
+        records: of N photos in S segments of V vehicles.
+        yaw: float64 (N,), grid headings.
+        beliefs: priors of the common unknowns.
+    """
+    at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
+    rows = _Rows(at.size)
+    pair_sigma = _pair_rows(rows, at, graph, records, np.exp(-1j * yaw), beliefs)
+    velocity = _gps_rows(rows, at, records, beliefs.vehicle)
+    _prior_rows(rows, at, beliefs)
+    matrix, rhs = rows.finish()
+    x = np.zeros(at.size)
+    x[: 2 * at.photos] = np.r_[records.position.real, records.position.imag]
+    x[at.metres : at.offset] = beliefs.metres
+    pairs, photos = len(graph), at.photos
+    for c in _C_SCHEDULE:
+        residual = (rhs - matrix @ x)[: 2 * (pairs + photos)]
+        weight = np.ones(len(rhs))
+        weight[: 2 * pairs] = np.tile(_robust(residual[: 2 * pairs], c), 2)
+        weight[2 * pairs : 2 * (pairs + photos)] = np.tile(_robust(residual[2 * pairs :], c), 2)
+        weighted = diags(weight) @ matrix
+        factor = splu((matrix.T @ weighted).tocsc())
+        x = factor.solve(weighted.T @ rhs)
+    residual = rhs - matrix @ x
+    metres = x[at.metres : at.offset]
+    q = x[at.offset : at.lens].reshape(2, -1)
+    lag = x[at.lag :]
+    return Network(
+        position=x[:photos] + 1j * x[photos : 2 * photos],
+        metres=metres,
+        offset=(q[0] + 1j * q[1]) / metres,
+        offset_sigma=_sigmas(factor, at).max(0) / metres,
+        lag=lag,
+        pair_ok=_norm(residual[: 2 * pairs]) < _GATE,
+        gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < _GATE,
+        gps_residual=records.position + lag[beliefs.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
+        pair_residual=(residual[:pairs] + 1j * residual[pairs : 2 * pairs]) * pair_sigma,
+    )
+
+
+def _norm(residual: Array) -> Array:
+    """Length of residuals stacked as all first, then all second components."""
+    return np.asarray(np.hypot(*residual.reshape(2, -1)))
+
+
+def _robust(residual: Array, c: float) -> Array:
+    """Geman-McClure weights 1 / (1 + e2 / c)^2 of stacked residuals."""
+    return np.asarray((1.0 + _norm(residual) ** 2 / c) ** -2)
+
+
+def _sigmas(factor: Any, at: _Columns) -> Array:
+    """One sigma of m o, float64 (2, S), from the factor of the normal equations."""
+    picks = np.zeros((at.size, 2 * at.segments))
+    picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
+    variance = np.einsum("ij,ij->j", picks, factor.solve(picks))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1))
+
+
+def _pair_rows(rows: _Rows, at: _Columns, graph: PairGraph, records: Records, unit: Complex, b: Beliefs) -> Array:
+    """East, then north rows of all pairs; returns their one sigma in metres (E,)."""
+    i, j = graph.first, graph.second
+    si, sj = records.segment[i], records.segment[j]
+    ui, uj = unit[i] * b.relief[i], unit[j] * b.relief[j]
+    reach = np.abs(b.metres[si] * graph.centre_first) + np.abs(b.metres[sj] * graph.centre_second)
+    sigma = np.asarray(_PAIR_SIGMA_M + _PAIR_SHARE * reach)
+    for part, axis in ((0, 1.0 + 0j), (1, -1j)):  # the real part of axis * value: east, then north
+        east = part * at.photos
+        rows.block(
+            np.zeros(len(graph)),
+            (j + east, 1.0 / sigma),
+            (i + east, -1.0 / sigma),
+            (at.metres + si, -(axis * ui * graph.centre_first).real / sigma),
+            (at.metres + sj, (axis * uj * graph.centre_second).real / sigma),
+            (at.offset + si, (axis * ui).real / sigma),
+            (at.offset + sj, -(axis * uj).real / sigma),
+            (at.offset + at.segments + si, (axis * ui * 1j).real / sigma),
+            (at.offset + at.segments + sj, -(axis * uj * 1j).real / sigma),
+        )
+    return sigma
+
+
+def _gps_rows(rows: _Rows, at: _Columns, records: Records, vehicle: Ints) -> Complex:
+    """Rows of recorded positions along and across the way flown: P - lag v = recorded; returns v (N,)."""
+    velocity = records.velocity()
+    speed = np.abs(velocity)
+    ahead = np.where(speed > 0.1, velocity / np.maximum(speed, 1e-9), 1.0)
+    across = records.gps_sigma()
+    photo = np.arange(at.photos)
+    for axis, sigma in ((ahead, np.hypot(across, LAG_SPREAD_S * speed)), (1j * ahead, across)):
+        rows.block(
+            (records.position * np.conj(axis)).real / sigma,
+            (photo, axis.real / sigma),
+            (photo + at.photos, axis.imag / sigma),
+            (at.lag + vehicle, -(velocity * np.conj(axis)).real / sigma),
+        )
+    return velocity
+
+
+def _prior_rows(rows: _Rows, at: _Columns, b: Beliefs) -> None:
+    segment, lens, vehicle = np.arange(at.segments), np.arange(at.lenses), np.arange(at.vehicles)
+    link = b.link_sigma * b.metres
+    rows.block(np.zeros(at.segments), (at.metres + segment, 1.0 / link), (at.lens + b.lens, -b.link / link))
+    for part in (0, at.segments):
+        rows.block(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
+    believed = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
+    rows.block(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * believed)))
+    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / _LAG_SIGMA_S))

@@ -1,0 +1,154 @@
+"""Photos as similar figures of the ground plane: records, pairs and level pictures as complex numbers.
+
+Ground: east + i north. Picture: z = (u - u0) - i (v - v0), pixels about the picture's centre, y up. A level photo shows
+the ground point P + m exp(-i yaw) z: P straight below, m metres per pixel, yaw clockwise from grid north.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
+from orthoswarm.refine.features.sift_features import Features
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Ints = NDArray[np.int32]
+Flags = NDArray[np.bool_]
+
+GPS_SIGMA_M = 1.5
+_STATED_FLOOR_M = 0.1
+MAX_TAG_TILT_RAD = float(np.radians(45.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """What was recorded of N photos taken with L lenses in S segments; NaN where unknown.
+
+    Photos of a vehicle stand in order of time.
+
+    Attributes:
+        position: complex (N,), east + i north in metres about some origin.
+        position_sigma: float64 (N,), stated one sigma, NaN where the receiver does not say.
+        time_s: float64 (N,). height_m: float64 (N,) above takeoff or ground. altitude_m: float64 (N,) absolute.
+        yaw: float64 (N,) grid azimuth of the picture's up direction; flight_yaw: of the airframe, radians.
+        pitch: float64 (N,), -pi/2 is nadir; roll: float64 (N,).
+        lens: int32 (N,). segment: int32 (N,), see `segments`. vehicle: int32 (N,), a vehicle with one of its lenses.
+        width: float64 (N,), columns of the picture; rows: float64 (N,).
+        fov_hint: float64 (L,), from tags, radians.
+    """
+
+    position: Complex
+    position_sigma: Array
+    time_s: Array
+    height_m: Array
+    altitude_m: Array
+    yaw: Array
+    flight_yaw: Array
+    pitch: Array
+    roll: Array
+    lens: Ints
+    segment: Ints
+    vehicle: Ints
+    width: Array
+    rows: Array
+    fov_hint: Array
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def gps_sigma(self) -> Array:
+        """One sigma of the recorded positions in metres, (N,): as stated (0.1 m at least), else 1.5."""
+        stated = np.hypot(self.position_sigma, _STATED_FLOOR_M)
+        return np.asarray(np.where(np.isfinite(stated), stated, GPS_SIGMA_M))
+
+    def velocity(self) -> Complex:
+        """Ground velocity, complex (N,) m/s, from the neighbours in the segment; 0 at turns and where unknown."""
+        v = np.zeros(len(self), np.complex128)
+        for s in np.unique(self.segment):
+            rows = np.flatnonzero(self.segment == s)
+            dt, dp = np.diff(self.time_s[rows]), np.diff(self.position[rows])
+            good = (dt > 0.05) & (dt < 60.0) & (np.abs(dp) < 40.0 * dt)
+            leap = np.where(good, dp / np.where(good, dt, 1.0), np.nan)
+            sides = np.stack([np.r_[np.nan, leap], np.r_[leap, np.nan]])
+            known = np.isfinite(sides)
+            mean = np.where(known, sides, 0.0).sum(0) / np.maximum(known.sum(0), 1)
+            turn = known.all(0) & (np.abs(sides[0] - sides[1]) > 0.5 * np.abs(np.where(known, sides, 0.0)).max(0))
+            v[rows] = np.where(turn, 0.0, mean)
+        return v
+
+    def tag_level(self) -> Array:
+        """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where they say nothing.
+
+        A tag of more than 45 degrees off nadir is not believed as a start: such a picture could not be matched anyway.
+        """
+        pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
+        roll = np.where(np.isfinite(self.roll), self.roll, 0.0)
+        level = _from_level(0.0).T @ rotation_from_angles(0.0, pitch, roll)
+        level[level[:, 2, 2] < np.cos(MAX_TAG_TILT_RAD)] = np.eye(3)
+        return np.asarray(level)
+
+
+@dataclass(frozen=True, slots=True)
+class PairGraph:
+    """Similarities between pairs of level pictures: z of the second = factor (z of the first) + constant.
+
+    Attributes:
+        first: int32 (E,), index of one photo; second: int32 (E,).
+        factor: complex (E,); its argument is yaw(second) - yaw(first), its size m(first) / m(second).
+        centre_first: complex (E,), mean of the matches in the first; centre_second: in the second.
+        count: int64 (E,) matches. spread: float64 (E,) their one sigma about the mean, pixels of the first.
+        residual: float64 (E,) median misfit in pixels of the second.
+    """
+
+    first: Ints
+    second: Ints
+    factor: Complex
+    centre_first: Complex
+    centre_second: Complex
+    count: NDArray[np.int64]
+    spread: Array
+    residual: Array
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def turn_sigma(self) -> Array:
+        """One sigma of the turn, radians (E,): a degree (relief, tilt), more for few, close or ill-fitting matches."""
+        arm = np.maximum(self.spread * np.abs(self.factor), 1.0)
+        return np.asarray(np.hypot(np.radians(1.0), 3.0 * self.residual / (arm * np.sqrt(self.count))))
+
+    @property
+    def turn(self) -> Complex:
+        """exp(i (yaw(second) - yaw(first))), complex (E,)."""
+        return np.asarray(self.factor / np.maximum(np.abs(self.factor), 1e-12))
+
+
+def _from_level(yaw: Array | float) -> Array:
+    """Rotation level camera to ground, float64 (..., 3, 3)."""
+    return rotation_from_angles(yaw, NADIR_PITCH_RAD, 0.0)
+
+
+def rotation_of(yaw: Array, level: Array) -> Array:
+    """Camera-to-ground rotations (N, 3, 3) of grid yaw (N,) and camera-to-level rotations (N, 3, 3)."""
+    return np.asarray(_from_level(yaw) @ level)
+
+
+def centred(features: Features) -> Complex:
+    """Pixels of features about the picture's centre, y up, complex (n,)."""
+    uv = features.uv.astype(np.float64)
+    return np.asarray((uv[:, 0] - 0.5 * (features.width - 1)) - 1j * (uv[:, 1] - 0.5 * (features.height - 1)))
+
+
+def level_from_nadir(offset: complex, focal: float) -> Array:
+    """The smallest rotation (3, 3) that puts the nadir, seen at pixel `offset` (y up), onto the optical axis."""
+    n = np.array([offset.real, -offset.imag, focal])
+    n /= np.linalg.norm(n)
+    axis = np.array([n[1], -n[0], 0.0])  # n x z
+    sine, cosine = float(np.hypot(n[0], n[1])), float(n[2])
+    if sine < 1e-12:
+        return np.eye(3)
+    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]]) / sine
+    return np.asarray(np.eye(3) + sine * k + (1.0 - cosine) * (k @ k))

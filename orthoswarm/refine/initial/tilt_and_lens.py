@@ -1,0 +1,341 @@
+"""Tilt, focal length and distortion from the shapes of matches alone: no positions, no tags.
+
+Level pictures of flat ground are similar figures; tilt, and radial distortion, bend them in ways that no turn, shift or
+zoom explains. The tilt of each segment and the lens are changed until the matches of all pairs fit similarities best:
+Gauss-Newton on what is left after each pair's own similarity is projected out (variable projection, Golub and Pereyra
+1973). Relief disturbs each pair, but not all of them alike.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.refine.features.pair_matching import Pair
+from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.initial.planar_similarity import (
+    Array,
+    Complex,
+    Ints,
+    PairGraph,
+    Records,
+    centred,
+    level_from_nadir,
+)
+
+_ITERATIONS = 12
+_SETTLED = 1e-3
+_MOST_MATCHES = 64
+_INFORMATION = 0.05
+"""Share of independent matches: relief moves neighbouring points together."""
+_FLOOR_SHARE = 1e-3
+"""Least misfit that is believed, as a share of the picture's width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Matches of all pairs in one array: of pair e, rows start[e] to start[e + 1].
+
+    Attributes:
+        first: int32 (E,), photo; second: int32 (E,). start: int64 (E + 1,). count: int64 (E,), all matches of a pair.
+        p: complex (M,), pixels in the first about its centre, y up; q: in the second.
+    """
+
+    first: Ints
+    second: Ints
+    start: NDArray[np.int64]
+    count: NDArray[np.int64]
+    p: Complex
+    q: Complex
+
+    @classmethod
+    def of(cls, pairs: Sequence[Pair], features: Sequence[Features]) -> "Matches":
+        """Gather the matches, at most 64 a pair."""
+        z = [centred(f) for f in features]
+        picked = [p.match[_spaced(len(p.match))] for p in pairs]
+        start = np.concatenate([[0], np.cumsum([len(m) for m in picked], dtype=np.int64)])
+        none = [np.zeros(0, np.complex128)]
+        return cls(
+            np.array([p.first for p in pairs], np.int32),
+            np.array([p.second for p in pairs], np.int32),
+            start.astype(np.int64),
+            np.array([len(p) for p in pairs], np.int64),
+            np.concatenate([z[p.first][m[:, 0]] for p, m in zip(pairs, picked)] or none),
+            np.concatenate([z[p.second][m[:, 1]] for p, m in zip(pairs, picked)] or none),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Tilt and lens found from shapes.
+
+    Attributes:
+        level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians.
+        log_focal: float64 (L,), of the focal length in pixels; log_focal_sigma: float64 (L,). k1: float64 (L,).
+        misfit: median misfit of all pairs in pixels before and after.
+    """
+
+    level: Array
+    tilt_sigma: Array
+    log_focal: Array
+    log_focal_sigma: Array
+    k1: Array
+    misfit: tuple[float, float]
+
+
+def _spaced(count: int) -> NDArray[np.intp]:
+    if count <= _MOST_MATCHES:
+        return np.arange(count)
+    return np.linspace(0, count - 1, _MOST_MATCHES).astype(np.intp)
+
+
+def solve_shape(
+    matches: Matches,
+    records: Records,
+    level: Array,
+    log_focal: Array,
+    log_focal_sigma: Array,
+    tilt_sigma: Array,
+    bend_sigma: float = 0.06,
+) -> Shape:
+    """Find tilt, focal length and first radial term that make the matches similar figures.
+
+    Args:
+        matches: of all pairs.
+        records: of N photos in S segments, L lenses.
+        level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none).
+        log_focal: float64 (L,), belief.
+        log_focal_sigma: float64 (L,), its one sigma.
+        tilt_sigma: float64 (S,), one sigma of the tilt about that of `level`, radians.
+        bend_sigma: one sigma of the radial distortion at the picture's corner, as a share of the radius.
+    """
+    segments, lenses = int(records.segment.max()) + 1, len(log_focal)
+    size = 2 * segments + 2 * lenses
+    sigma = np.concatenate(
+        [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, bend_sigma)], 1).ravel()]
+    )
+    total = np.zeros(size)
+    first_misfit = float("nan")
+    level = level.copy()
+    lens = np.stack([log_focal, np.zeros(lenses), corner_radius(records) ** 2], axis=1)
+    normal, misfit = np.zeros((size, size)), np.zeros(len(matches.first))
+    for _ in range(_ITERATIONS):
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        _accumulate(
+            matches.first,
+            matches.second,
+            matches.start,
+            matches.p,
+            matches.q,
+            level,
+            lens,
+            records.lens,
+            records.segment,
+            _FLOOR_SHARE * records.width,
+            normal,
+            gradient,
+            misfit,
+        )
+        if np.isnan(first_misfit) and len(misfit):
+            first_misfit = float(np.median(misfit))
+        normal = _INFORMATION * normal + np.diag(sigma**-2)
+        step = np.linalg.solve(normal, _INFORMATION * gradient - total / sigma**2)
+        step *= min(1.0, 0.15 / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
+        total += step
+        for s in range(segments):
+            rows = records.segment == s
+            level[rows] = level_from_nadir(complex(step[2 * s], step[2 * s + 1]), 1.0) @ level[rows]
+        lens[:, :2] += step[2 * segments :].reshape(-1, 2)
+        lens[:, 1] = np.clip(lens[:, 1], -0.3, 0.3)
+        if np.abs(step).max() < _SETTLED:
+            break
+    deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
+    last_misfit = float(np.median(misfit)) if len(misfit) else float("nan")
+    return Shape(
+        level,
+        deviation[: 2 * segments].reshape(-1, 2).max(1),
+        lens[:, 0].copy(),
+        deviation[2 * segments :: 2].copy(),
+        lens[:, 1] * np.exp(2.0 * lens[:, 0]) / lens[:, 2],
+        (first_misfit, last_misfit),
+    )
+
+
+def similarities(matches: Matches, records: Records, shape: Shape) -> PairGraph:
+    """The similarity of every pair between its level, undistorted pictures."""
+    pairs = len(matches.first)
+    table = np.zeros((pairs, 5), np.complex128)
+    radius = corner_radius(records)
+    lens = np.stack([shape.log_focal, shape.k1 * radius**2 * np.exp(-2.0 * shape.log_focal), radius**2], axis=1)
+    _similarities(
+        matches.first,
+        matches.second,
+        matches.start,
+        matches.p,
+        matches.q,
+        shape.level,
+        lens,
+        records.lens,
+        _FLOOR_SHARE * records.width,
+        table,
+    )
+    return PairGraph(
+        matches.first,
+        matches.second,
+        table[:, 0].copy(),
+        table[:, 1].copy(),
+        table[:, 2].copy(),
+        matches.count,
+        table[:, 3].real.copy(),
+        table[:, 4].real.copy(),
+    )
+
+
+def corner_radius(records: Records) -> Array:
+    """Half the diagonal of each lens's picture, float64 (L,), pixels."""
+    first = [int(np.argmax(records.lens == k)) for k in range(len(records.fov_hint))]
+    return np.asarray(0.5 * np.hypot(records.width[first], records.rows[first]))
+
+
+@kernel
+def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-untyped-def]
+    """Pixel (complex, y up) of a level, undistorted camera; right and up turn it further by small angles.
+
+    The distortion is k1 in units of the picture's half diagonal (bend), not of f, so that f and bend are independent.
+    """
+    s = 1.0
+    r2 = (z.real * z.real + z.imag * z.imag) / radius2
+    for _ in range(4):
+        s = 1.0 / max(1.0 + bend * r2 * s * s, 0.3)
+    x, y = z.real * s / focal, -z.imag * s / focal
+    a = level[0, 0] * x + level[0, 1] * y + level[0, 2]
+    b = level[1, 0] * x + level[1, 1] * y + level[1, 2]
+    c = level[2, 0] * x + level[2, 1] * y + level[2, 2]
+    # the nadir at (right, up) comes to the axis: rotation by the vector (-up, -right, 0) in camera axes
+    a, b, c = a - right * c, b + up * c, c + right * a - up * b
+    c = max(c, 0.1)
+    return complex(focal * a / c, -focal * b / c)
+
+
+@kernel
+def _fit(p, q, n, floor, w):  # type: ignore[no-untyped-def]
+    """Robust similarity q = a p + b: a, mean p, mean q, scale of the misfit; weights are left in w."""
+    misfit = np.empty(n)
+    for k in range(n):
+        w[k] = 1.0
+    a, cp, cq, scale = 1.0 + 0.0j, 0.0j, 0.0j, floor
+    for _ in range(4):
+        total = 0.0
+        cp, cq = 0.0j, 0.0j
+        for k in range(n):
+            total += w[k]
+            cp += w[k] * p[k]
+            cq += w[k] * q[k]
+        cp /= total
+        cq /= total
+        top, bottom = 0.0j, 1e-9
+        for k in range(n):
+            d = p[k] - cp
+            top += w[k] * d.conjugate() * (q[k] - cq)
+            bottom += w[k] * (d.real * d.real + d.imag * d.imag)
+        a = top / bottom
+        for k in range(n):
+            misfit[k] = abs(q[k] - cq - a * (p[k] - cp))
+        scale = max(np.median(misfit), floor)
+        for k in range(n):
+            e = misfit[k] / (2.0 * scale)
+            w[k] = 1.0 / ((1.0 + e * e) * (1.0 + e * e))
+    return a, cp, cq, scale
+
+
+@kernel
+def _derivatives(z, flat, level, focal, bend, radius2, factor, g):  # type: ignore[no-untyped-def]
+    """Change of factor * flattened pixels (n,) by nadir right, nadir up, log f and bend: into g, complex (4, n)."""
+    h = 1e-5
+    for k in range(len(z)):
+        g[0, k] = factor * (_flatten(z[k], level, focal, bend, radius2, h, 0.0) - flat[k]) / h
+        g[1, k] = factor * (_flatten(z[k], level, focal, bend, radius2, 0.0, h) - flat[k]) / h
+        g[2, k] = factor * (_flatten(z[k], level, focal * (1.0 + h), bend, radius2, 0.0, 0.0) - flat[k]) / h
+        g[3, k] = factor * (_flatten(z[k], level, focal, bend + h, radius2, 0.0, 0.0) - flat[k]) / h
+
+
+@kernel
+def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
+    """Take from g (n,) the similarity of p (n,), whose weighted mean is cp, that fits it best."""
+    mean, total = 0.0j, 0.0
+    for k in range(n):
+        mean += w[k] * g[k]
+        total += w[k]
+    mean /= total
+    top, bottom = 0.0j, 1e-9
+    for k in range(n):
+        d = p[k] - cp
+        top += w[k] * d.conjugate() * (g[k] - mean)
+        bottom += w[k] * (d.real * d.real + d.imag * d.imag)
+    for k in range(n):
+        g[k] -= mean + top / bottom * (p[k] - cp)
+
+
+@kernel
+def _accumulate(first, second, start, p, q, level, lens, lens_id, segment, floor, normal, gradient, misfit):  # type: ignore[no-untyped-def]
+    """Normal equations of tilt (2 S) and lens (2 L) after each pair's similarity is projected out."""
+    segments, most = segment.max() + 1, 0
+    for e in range(len(first)):
+        most = max(most, start[e + 1] - start[e])
+    zp, zq, w = np.empty(most, np.complex128), np.empty(most, np.complex128), np.empty(most)
+    g, r = np.empty((8, most), np.complex128), np.empty(most, np.complex128)
+    column = np.empty(8, np.int64)
+    for e in range(len(first)):
+        i, j, n = first[e], second[e], start[e + 1] - start[e]
+        pe, qe = p[start[e] : start[e + 1]], q[start[e] : start[e + 1]]
+        fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
+        fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
+        for k in range(n):
+            zp[k] = _flatten(pe[k], level[i], fi, ki, ri, 0.0, 0.0)
+            zq[k] = _flatten(qe[k], level[j], fj, kj, rj, 0.0, 0.0)
+        a, cp, cq, scale = _fit(zp, zq, n, floor[j], w)
+        misfit[e] = scale
+        for k in range(n):
+            r[k] = zq[k] - cq - a * (zp[k] - cp)
+        _derivatives(pe, zp, level[i], fi, ki, ri, -a, g[:4])
+        _derivatives(qe, zq, level[j], fj, kj, rj, 1.0 + 0.0j, g[4:])
+        for side in range(2):
+            photo = i if side == 0 else j
+            column[4 * side] = 2 * segment[photo]
+            column[4 * side + 1] = 2 * segment[photo] + 1
+            column[4 * side + 2] = 2 * segments + 2 * lens_id[photo]
+            column[4 * side + 3] = 2 * segments + 2 * lens_id[photo] + 1
+        for c in range(8):
+            _project_out(g[c], zp, cp, w, n)
+        weight = 1.0 / (scale * scale)
+        for c in range(8):
+            value = 0.0
+            for k in range(n):
+                value += w[k] * (g[c, k].real * r[k].real + g[c, k].imag * r[k].imag)
+            gradient[column[c]] -= weight * value
+            for d in range(8):
+                value = 0.0
+                for k in range(n):
+                    value += w[k] * (g[c, k].real * g[d, k].real + g[c, k].imag * g[d, k].imag)
+                normal[column[c], column[d]] += weight * value
+
+
+@kernel
+def _similarities(first, second, start, p, q, level, lens, lens_id, floor, table):  # type: ignore[no-untyped-def]
+    for e in range(len(first)):
+        i, j = first[e], second[e]
+        n = start[e + 1] - start[e]
+        fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
+        fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
+        zp, zq, w = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n)
+        for k in range(n):
+            zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
+            zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
+        a, cp, cq, scale = _fit(zp, zq, n, floor[j], w)
+        spread = 0.0
+        for k in range(n):
+            spread += abs(zp[k] - cp) ** 2
+        table[e, 0], table[e, 1], table[e, 2] = a, cp, cq
+        table[e, 3], table[e, 4] = complex(np.sqrt(spread / n), 0.0), complex(scale, 0.0)

@@ -1,0 +1,321 @@
+"""Settling one vehicle on the map: ties, roofs, links, and the absolute adjustment (RECIPE.md steps 5 to 8)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.bundle.adjustment import Adjustment, Ties
+from orthoswarm.refine.bundle.block_arrays import Tracks
+from orthoswarm.refine.bundle.observation_selection import one_per_cell
+from orthoswarm.refine.features.patch_matching import gradient_field, texture_field
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.registration.coarse_registration import shift_cameras
+from orthoswarm.refine.registration.map_windows import LoadedMap
+from orthoswarm.refine.registration.tie_points import MapMatches, link_legs, match_points
+from orthoswarm.refine.surface.ground_densification import refit
+from orthoswarm.refine.surface.vehicle_ground import GroundModel
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+TIE_HALF_M, NEAR_M = 10.0, 5.0
+"""Half a patch that is compared with the map; how far it is sought once the flight lies on the map."""
+FEWEST_FOR_PULL, MOST_FOR_PULL, PULL_REACH_M = 60, 300, 1.0
+TIE_SIGMA_M = 0.35
+TIE_SIGMA_LIMITS_M = (0.1, 1.0)
+FEWEST_TO_WEIGH = 20
+LINK_SIGMA_PX = 0.7
+FEWEST_ON_LINE, LEAST_ON_LINE = 6, 0.6
+"""So many matches of a leg, and this share of them, must agree on a line of shifts."""
+ON_LINE_M, OFF_LINE_M = 0.7, 0.7
+"""How near to the line they lie; a leg that is nowhere farther off than this finds its place by itself."""
+
+
+@dataclass(slots=True)
+class Settled:
+    """What settling found, besides the cameras in the flight's adjustment.
+
+    Attributes:
+        surface: the ground. ties: the last round's. matches: the matches they come from.
+        roofs: matches of raised points and their heights, for a vote over several vehicles.
+        ground_shift: (2,) what ground points were off by when the roofs were matched.
+        links: observations added between legs.
+    """
+
+    surface: GroundModel
+    ties: Ties
+    matches: MapMatches
+    roofs: tuple[MapMatches, Array]
+    ground_shift: Array
+    links: int
+
+
+def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
+    """The map under a vehicle's pictures, with a margin for the search."""
+    rig = flight.rig()
+    height = float(np.median(rig.position[:, 2]))
+    reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(rig.lens[0, 0]) + 40.0
+    low, high = rig.position[:, :2].min(0) - reach, rig.position[:, :2].max(0) + reach
+    return LoadedMap.load(basemap, origin, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), gsd_m)
+
+
+def tie_round(
+    flight: Flight,
+    surface: GroundModel,
+    ground: LoadedMap,
+    cell_m: float,
+    reach_m: float,
+    half_m: float = TIE_HALF_M,
+    pictures: NDArray[np.bool_] | None = None,
+) -> MapMatches:
+    """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`.
+
+    Ground is compared by its texture: strong edges belong to what leans and casts shadows. pictures: bool (N,), the
+    ones to compare, None for all.
+    """
+    adj = flight.adjustment
+    seen = flight.sights(pictures)
+    height = adj.points[:, 2] - surface.height(adj.points[:, :2])
+    fewest = 2 if flight.sparse else 3
+    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
+    return _ground_matches(flight, surface, ground, chosen, seen.camera, reach_m, half_m, texture_field)
+
+
+def _ground_matches(
+    flight: Flight,
+    surface: GroundModel,
+    ground: LoadedMap,
+    chosen: NDArray[np.integer],
+    camera: NDArray[np.int32],
+    reach_m: float,
+    half_m: float,
+    field: Callable[[Floats], Floats],
+) -> MapMatches:
+    adj = flight.adjustment
+    half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
+    level = surface.height(adj.points[:, :2])
+    return match_points(adj.rig, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field)
+
+
+def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float) -> Array:
+    """How far (2,), metres, strong edges pull ties away from where texture alone puts them; zero if that is not known.
+
+    Shadows of another hour and what leans in the map displace strong edges most, but texture a little, too: by as much
+    again. (Regressed over simulated cities with exact truth: 1.0 to 1.1 times this is what is left in the ties.) So
+    taking it off extrapolates to no edges at all.
+    """
+    some = matches.take(np.arange(0, len(matches.point), max(1, -(-len(matches.point) // MOST_FOR_PULL))))
+    camera = np.full(len(flight.adjustment.points), -1, np.int32)
+    camera[some.point] = some.camera
+    edges = accepted(_ground_matches(flight, surface, ground, some.point, camera, reach_m, TIE_HALF_M, gradient_field))
+    _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
+    away = edges.shift[its] - some.shift[mine]
+    if len(away) < FEWEST_FOR_PULL:
+        return np.zeros(2)
+    away = away[np.hypot(*(away - np.median(away, axis=0)).T) < PULL_REACH_M]
+    return np.asarray(away.mean(0)) if len(away) >= FEWEST_FOR_PULL else np.zeros(2)
+
+
+def accepted(matches: MapMatches, peak: float = 0.2, ratio: float = 0.75) -> MapMatches:
+    """Matches with a clear peak."""
+    return matches.take((matches.peak > peak) & (matches.ratio < ratio))
+
+
+def mode_shift(shift: Array) -> Array:
+    """Most agreed shift (2,) of ties (Q, 2): most neighbours within 0.7 m, then reweighted."""
+    if len(shift) == 0:
+        return np.zeros(2)
+    d2 = ((shift[:, None, :] - shift[None, :, :]) ** 2).sum(-1)
+    centre = shift[int((d2 < 0.7**2).sum(1).argmax())]
+    for scale in (0.5, 0.5, 0.35, 0.25, 0.25):
+        w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
+        centre = (shift * w[:, None]).sum(0) / w.sum()
+    return np.asarray(centre)
+
+
+def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
+    """Move the cameras to where their first matches are, and give the matches as they are from there.
+
+    All cameras by the shift that most matches agree on, and a leg whose own matches lie on another line by that line:
+    where the chain of pictures broke at a corner the coarse correction of the two legs runs into one another, and an
+    adjustment would take the right matches at the beginning of a leg for wrong ones.
+    """
+    points = flight.adjustment.points[matches.point].copy()
+    correction = leg_corrections(flight.leg, matches, mode_shift(matches.shift))
+    shift_cameras(flight, correction)
+    moved = flight.adjustment.points[matches.point, :2] - points[:, :2]
+    return replace(matches, shift=matches.shift - moved)
+
+
+def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
+    """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
+    out = np.tile(common, (len(leg), 1))
+    for k in np.unique(leg[leg >= 0]):
+        members = np.flatnonzero(leg == k)
+        mine = leg[matches.camera] == k
+        if int(mine.sum()) < FEWEST_ON_LINE:
+            continue
+        t = matches.camera[mine] - members.mean()
+        line, agree = _line(t, matches.shift[mine])
+        if int(agree.sum()) < max(FEWEST_ON_LINE, LEAST_ON_LINE * len(t)):
+            continue
+        ends = np.clip(members - members.mean(), t[agree].min(), t[agree].max())
+        own = line[0] + line[1] * ends[:, None]
+        if np.hypot(*(own - common).T).max() > OFF_LINE_M:
+            out[members] = own
+    between, within = np.flatnonzero(leg < 0), np.flatnonzero(leg >= 0)
+    if len(between) and len(within):
+        out[between] = np.column_stack([np.interp(between, within, out[within, a]) for a in range(2)])
+    return out
+
+
+def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
+    a = np.column_stack([np.ones(len(t)), t])
+    line = np.array([mode_shift(shift), np.zeros(2)])
+    for scale in (4.0, 2.0, 1.0, 0.7, 0.5, 0.5):
+        off = ((shift - a @ line) ** 2).sum(1)
+        w = 1.0 / (1.0 + off / scale**2) ** 2
+        line = np.linalg.solve((a * w[:, None]).T @ a + 1e-9 * np.eye(2), (a * w[:, None]).T @ shift)
+    return line, np.asarray(np.hypot(*(shift - a @ line).T) < ON_LINE_M)
+
+
+def as_ties(matches: MapMatches, points: Array) -> Ties:
+    """Ties for the adjustment: where the map shows the ground that each point's surroundings lie on.
+
+    What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map.
+    """
+    return Ties(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
+
+
+def weighed(ties: Ties, residual: Array) -> Ties:
+    """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
+    if len(residual) < FEWEST_TO_WEIGH:
+        return ties
+    sigma = float(np.clip(1.4826 * np.median(np.abs(residual)), *TIE_SIGMA_LIMITS_M))
+    return replace(ties, sigma_m=np.full(len(ties.point), sigma))
+
+
+def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
+    """Raised points found on the map, and their heights over the ground."""
+    adj = flight.adjustment
+    seen = flight.sights()
+    height = adj.points[:, 2] - surface.height(adj.points[:, :2])
+    usable = (seen.camera >= 0) & (seen.count >= 6) & (seen.mean_weight > 0.5) & (height > 4.0) & (height < 40.0)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), 30.0)
+    half, reach = max(8, round(7.5 / ground.gsd_m)), max(8, round(11.0 / ground.gsd_m))
+    found = match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+    found = accepted(found, 0.2, 0.85)
+    return found, height[found.point]
+
+
+def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
+    """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
+    adj = flight.adjustment
+    seen = flight.sights()
+    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), cell_m)
+    candidates = np.flatnonzero(flight.leg >= 0)
+    if len(np.unique(flight.leg[candidates])) < 2:
+        return 0
+    camera, point, uv, _ = link_legs(
+        adj.rig, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
+    )
+    if len(camera):
+        extend(flight, camera, point, uv, LINK_SIGMA_PX)
+    return len(camera)
+
+
+def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float) -> None:
+    """Add observations to a flight's adjustment, keeping its state."""
+    old = flight.adjustment
+    tracks = Tracks(
+        np.concatenate([old.tracks.camera, camera]),
+        np.concatenate([old.tracks.point, point]),
+        np.concatenate([old.tracks.uv, uv]),
+        np.concatenate([old.tracks.sigma_px, np.full(len(camera), sigma_px, np.float32)]),
+    )
+    new = Adjustment.begin(old.rig, tracks, old.priors, old.points, old.free)
+    new.common[:] = old.common
+    flight.adjustment = new
+
+
+def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel) -> Settled:
+    """Two rounds of ties and links; the flight must lie within some metres of the map already.
+
+    Args:
+        flight: after the coarse registration.
+        basemap: the map. origin: (2,) of the local frame.
+        surface: ground after the relative adjustment.
+    """
+    ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
+    matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
+    matches = shifted_along(flight, matches)
+    ties = as_ties(matches, flight.adjustment.points)
+    for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
+        if k in (1, 3):
+            surface = refit(flight, surface, as_smooth=k == 3)
+    roofs = roof_round(flight, surface, ground)
+    ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
+    links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
+    flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    surface = refit(flight, surface, as_smooth=True)
+    surface, ties, matches = _second_round(flight, ground, surface, 3)
+    return Settled(surface, ties, matches, roofs, ground_shift, links)
+
+
+def resettle(
+    flight: Flight,
+    ground: LoadedMap,
+    surface: GroundModel,
+    ties: Ties,
+    pictures: NDArray[np.bool_] | None = None,
+) -> tuple[GroundModel, Ties, MapMatches]:
+    """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved).
+
+    pictures: bool (N,), the ones to compare with the map, None for all.
+    """
+    for _ in range(2):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
+    return _second_round(flight, ground, refit(flight, surface), 4, pictures)
+
+
+def _second_round(
+    flight: Flight,
+    ground: LoadedMap,
+    surface: GroundModel,
+    rounds: int,
+    pictures: NDArray[np.bool_] | None = None,
+) -> tuple[GroundModel, Ties, MapMatches]:
+    """Ties compared on the ground as it is now (fitted by the caller: the points moved, with their level, too)."""
+    matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, NEAR_M, pictures=pictures))
+    matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, NEAR_M))
+    ties = as_ties(matches, flight.adjustment.points)
+    for k in range(rounds):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
+        if k in (0, 1):
+            ties = weighed(ties, flight.adjustment.tie_residual)
+        if k == rounds - 2:
+            surface = refit(flight, surface, as_smooth=True)
+    return surface, ties, matches
+
+
+def working_gsd(flight: Flight) -> float:
+    """Pixel for comparing pictures with each other: about their own."""
+    rig = flight.rig()
+    return 1.07 * float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
+
+
+def map_gsd(flight: Flight, basemap: MapWindow) -> float:
+    """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
+    rig = flight.rig()
+    picture = float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
+    return float(np.clip(max(picture, basemap.native_gsd_m), 0.25, 2.0)) if picture < 0.4 else max(0.5, picture)

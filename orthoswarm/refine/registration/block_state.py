@@ -1,0 +1,177 @@
+"""What the refiner keeps of a vehicle between its passes, and its conversion to a Solution."""
+
+from dataclasses import dataclass, field, replace
+from time import process_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
+from orthoswarm.oldpickles import set_fields
+from orthoswarm.refine.bundle.adjustment import Ties
+from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, F, Rig
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.weak_pictures import ENOUGH, observations_per_camera
+from orthoswarm.refine.registration.tie_points import MapMatches
+from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
+
+Array = NDArray[np.float64]
+
+FEWEST_SPARSE = 12
+LEG_TIES = 3
+
+
+@dataclass(slots=True)
+class VehicleState:
+    """One vehicle between passes; everything is picklable, decoded pictures are let go.
+
+    Attributes:
+        vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
+            ground below them in the same frame.
+        surface: its ground. ties, matches: of the last round (empty without a map).
+        roofs: raised points on the map and their heights;
+            ground_shift: float64 (2,) what ground points were off by then.
+        unfound: True where there is a map and the flight was not found on it yet.
+        map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
+        dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
+        on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
+            were carry it.
+        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
+        fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
+    """
+
+    vehicle: str
+    flight: Flight
+    coarse: Rig
+    surface: GroundModel
+    ties: Ties
+    matches: MapMatches
+    roofs: tuple[MapMatches, Array]
+    dense: tuple[Array, Array]
+    on_map: bool
+    confidence: float
+    sigma_m: Array
+    coarse_sigma_m: Array
+    fov_sigma_deg: float
+    timings: dict[str, float] = field(default_factory=dict)
+    ground_shift: Array = field(default_factory=lambda: np.zeros(2))
+    had_map: bool = False
+    carried: bool = False
+    map_shift: Array = field(default_factory=lambda: np.zeros(2))
+    coarse_surface: GroundModel | None = None
+    high: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    unfound: bool = False
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
+
+
+def lies_on_map(state: VehicleState) -> bool:
+    """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
+    return state.on_map or state.carried
+
+
+def seen_from_above(state: VehicleState) -> Array:
+    """Points (K, 3) at free positions, on whatever is seen there: ground, and what stands on it."""
+    return np.concatenate([state.dense[0], state.high])
+
+
+class Stopwatch:
+    """CPU seconds by name, added up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = process_time()
+
+    def lap(self, name: str) -> None:
+        """Add the CPU time since the last lap to a name."""
+        now = process_time()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+    def add_to(self, timings: dict[str, float]) -> None:
+        """Add what was measured to others' times."""
+        for name, seconds in self.seconds.items():
+            timings[name] = timings.get(name, 0.0) + seconds
+
+
+def to_solution(
+    state: VehicleState,
+    origin: Array,
+    terrain: Terrain | None,
+    *,
+    coarse: bool = False,
+    map_lean: tuple[float, float] = (0.0, 0.0),
+) -> Solution:
+    """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
+    flight = state.flight
+    rig = state.coarse if coarse else flight.adjustment.rig
+    stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
+    rig = full_resolution(rig, flight)
+    sigma = state.coarse_sigma_m if coarse else state.sigma_m
+    weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else ENOUGH)
+    placed = [
+        PlacedFrame(frame, rig.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
+        for i, frame in enumerate(flight.frames)
+        if i not in flight.pictures.damaged
+    ]
+    dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
+    lens = flight.adjustment.rig.lens[0]
+    return Solution(
+        state.vehicle,
+        placed,
+        dropped,
+        leg_states(state),
+        float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
+        state.fov_sigma_deg,
+        terrain,
+        0.0,
+        map_lean,
+        state,
+        list(flight.warnings),
+        dict(state.timings),
+        _mean_gsd(rig, flight),
+    )
+
+
+def _mean_gsd(rig: Rig, flight: Flight) -> float:
+    """Mean height above the ground's points over the focal length (rig: full resolution), metres a pixel."""
+    points, _ = ground_points(flight.adjustment)
+    if not len(points):
+        return float("nan")
+    heights = flight.rig().position[:, 2]  # points and cameras of one state, also where the rig is that before the map
+    return float((heights.mean() - points[:, 2].mean()) / rig.lens[0, F])
+
+
+def full_resolution(rig: Rig, flight: Flight) -> Rig:
+    """A rig whose lenses are in pixels of the stored pictures instead of working pixels."""
+    frame = flight.frames[0]
+    scale = frame.width / flight.pictures.size[0]
+    lens = rig.lens.copy()
+    lens[:, [F, CX, CY]] *= scale
+    lens[:, WIDTH], lens[:, WIDTH + 1] = frame.width, frame.height
+    return replace(rig, lens=lens)
+
+
+def leg_states(state: VehicleState) -> list[Leg]:
+    """How the map held each leg.
+
+    Matched with enough agreeing ties of its own, else carried (by others, or without a map by the receiver); failed
+    where there is a map and the vehicle was not found on it.
+    """
+    flight = state.flight
+    out = []
+    for k in range(int(flight.leg.max()) + 1 if len(flight.leg) else 0):
+        members = np.flatnonzero(flight.leg == k)
+        mine = flight.leg[state.matches.camera] == k
+        residual = flight.adjustment.tie_residual
+        agree = mine & (np.hypot(*residual.T) < 1.2) if len(residual) == len(mine) else mine
+        share = float(agree.sum()) / max(int(mine.sum()), 1)
+        matched = state.on_map and int(agree.sum()) >= LEG_TIES and share > 0.4
+        how: LegState = "matched" if matched else ("failed" if state.had_map and not lies_on_map(state) else "carried")
+        sigma = float(np.median(state.sigma_m[members]))
+        out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))
+    return out

@@ -1,0 +1,170 @@
+"""Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE 4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.raster.map_cache import TiledMap
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.registration.orientation_correlation import Match, by_learning, register, stacked, strip_and_map
+
+Array = NDArray[np.float64]
+
+WINDOW = 25
+SPARSE_WINDOW = 3
+SECOND_LOOK_PICTURES = 16
+SECOND_LOOKS = 5
+REACHES_M = (60.0, 150.0)
+ACROSS_PX = 150
+"""A picture's width in pixels of the small mosaics."""
+CONSENSUS_M = 6.0
+MANY, CLEAR_RATIO = 4, 0.7
+"""Fewer windows than this agree by chance on a map of other ground (5 of 26 maps of noise, the best ratio 0.78), so one
+of them must have a clear peak (right ones have 0.3 to 0.5)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseFit:
+    """How a vehicle lies on the map after correlation.
+
+    Attributes:
+        correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
+        confidence: share of the windows that agree; where only all together were found, how far the second peak of
+            their sum is below the first.
+    """
+
+    correction: Array
+    matches: list[Match]
+    inlier: NDArray[np.bool_]
+    confidence: float
+
+
+def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """Register windows of each leg near their records, then all together, then farther off; None without consensus."""
+    rig = flight.rig()
+    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
+    tiles = TiledMap(basemap, gsd)
+    near, far = REACHES_M
+    return (
+        _fit_within(near, flight, tiles, origin, gsd)
+        or _fit_together(near, flight, tiles, origin, gsd)
+        or _fit_within(far, flight, tiles, origin, gsd)
+    )
+
+
+def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+    """One shift for the whole flight, from what all its windows say together (see `stacked`)."""
+    rig, windows = flight.rig(), _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    strips = [strip_and_map(rig, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
+    found = stacked([s for s in strips if s is not None])
+    if found is None:
+        return None
+    shift, z, ratio = found
+    match = Match(0, len(rig) - 1, (float(shift[0]), float(shift[1])), z, ratio)
+    return CoarseFit(np.tile(shift, (len(rig), 1)), [match], np.ones(1, bool), 1.0 - ratio)
+
+
+def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+    rig = flight.rig()
+    windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    matches = [
+        m
+        for index in windows
+        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m)) is not None
+    ]
+    if not matches:
+        return None
+    inlier = _consensus(matches)
+    if inlier.sum() < (1 if len(matches) == 1 else 2) or inlier.mean() < 0.34:
+        return None
+    if inlier.sum() < MANY and min(m.ratio for m, ok in zip(matches, inlier) if ok) > CLEAR_RATIO:
+        return None
+    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.mean()))
+
+
+def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 30.0) -> CoarseFit | None:
+    """Learned matching of a few strips where edges found no consensus; None if it finds none either."""
+    rig = flight.rig()
+    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    gsd = float(np.clip(width / (2 * ACROSS_PX), 0.2, 0.6))
+    windows = _windows(flight.leg, SECOND_LOOK_PICTURES)
+    basemap = TiledMap(basemap, gsd)
+    chosen = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SECOND_LOOKS).round().astype(int))]
+    matches = [
+        m
+        for index in chosen
+        if (m := register(rig, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd, by_learning))
+        is not None
+    ]
+    if len(matches) < 2:
+        return None
+    inlier = _consensus(matches)
+    if inlier.sum() < max(2, len(matches) // 2 + 1):
+        return None
+    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.sum()) / len(chosen))
+
+
+def shift_cameras(flight: Flight, correction: Array) -> None:
+    """Move cameras and points by a correction (N, 2), and the drift with them, so that the records still agree."""
+    adj = flight.adjustment
+    adj.rig.position[:, :2] += correction
+    n = len(adj.points)
+    count = np.maximum(np.bincount(adj.tracks.point, minlength=n), 1)
+    for a in range(2):
+        adj.points[:, a] += np.bincount(adj.tracks.point, correction[adj.tracks.camera, a], minlength=n) / count
+    lay = adj.layout
+    for g, (at, knots) in enumerate(zip(lay.offset, lay.knots)):
+        members = np.flatnonzero(adj.priors.group == g)
+        if knots and len(members):
+            where = lay.knot_left[members] + lay.knot_fraction[members]
+            for a in range(2):
+                columns = at + 5 + 2 * np.arange(knots) + a
+                adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
+
+
+def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
+    """Runs of about `size` pictures of one leg each; short legs are one window."""
+    out: list[NDArray[np.int64]] = []
+    for k in range(int(leg.max()) + 1 if len(leg) else 0):
+        members = np.flatnonzero(leg == k)
+        parts = max(1, round(len(members) / size))
+        out += [p for p in np.array_split(members, parts) if len(p) >= 2]
+    return out or ([np.arange(len(leg))] if len(leg) else [])
+
+
+def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
+    """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
+    t = np.array([0.5 * (m.first + m.last) for m in matches])
+    s = np.array([m.shift for m in matches])
+    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), 0.02, 1.0)
+    n = len(matches)
+    best, best_score = np.zeros(n, bool), -1.0
+    for i in range(n):
+        for j in range(i, n):
+            slope = (s[j] - s[i]) / (t[j] - t[i]) if j > i and t[j] > t[i] else np.zeros(2)
+            if np.hypot(*slope) > 0.5:
+                continue
+            error = np.hypot(*(s - s[i] - slope * (t - t[i])[:, None]).T)
+            inside = error < CONSENSUS_M
+            score = float((weight * inside * (1.0 - 0.5 * error / CONSENSUS_M)).sum())
+            if score > best_score:
+                best, best_score = inside, score
+    return best
+
+
+def _smooth(matches: Sequence[Match], inlier: NDArray[np.bool_], count: int) -> Array:
+    """Correction of each picture: medians of three neighbouring windows, linear between, constant beyond."""
+    chosen = [m for m, ok in zip(matches, inlier) if ok]
+    t = np.array([0.5 * (m.first + m.last) for m in chosen])
+    s = np.array([m.shift for m in chosen])
+    order = np.argsort(t, kind="stable")
+    t, s = t[order], s[order]
+    calm = np.array([np.median(s[max(0, i - 1) : i + 2], axis=0) if len(s) > 2 else s[i] for i in range(len(s))])
+    if len(s) > 2:
+        calm[[0, -1]] = 0.5 * (calm[[0, -1]] + s[[0, -1]])
+    i = np.arange(count, dtype=float)
+    return np.column_stack([np.interp(i, t, calm[:, a]) for a in range(2)])

@@ -1,0 +1,231 @@
+"""Pictures that come after their vehicle was refined: laid beside its refined ones, which stay as they are.
+
+First by what refinement changed in their neighbours (`carried.carry`), then by points followed into the neighbours'
+pictures and onto their ground: six numbers a picture, so a handful costs no second refinement. Measured on simulated
+flights over debris, water and haze (640x480 from 150 m): by correction alone 0.2 to 2.6 m off, by points no farther off
+than its neighbours in the midst of them, 0.1 to 0.3 m more beside them or beyond them, 0.07 s a picture.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import Camera, Lens
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
+from orthoswarm.model.recorded_pose import recorded_cameras
+from orthoswarm.refine.bundle.covariance import RADIAL
+from orthoswarm.refine.flight.carried_pictures import carry
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+NEIGHBOURS = 4
+FEWEST = 25
+LEAST_SHARE = 0.4
+PRIOR_M, PRIOR_RAD = 5.0, 0.05
+"""How far a carried camera is trusted: loosely, it only keeps what the points do not tell."""
+CORNERS_M = 0.5
+"""How far corners stand above the terrain that they are taken to lie on, all alike (measured: 0.1 to 0.5 m)."""
+_WORKING_PX, _CORNERS, _BACK_PX, _AGREE_PX = 640, 300, 0.7, 1.5
+_LEAST_PX = 0.1
+_SCALES_PX = (20.0, 8.0, 3.0, 1.5, 1.0, 1.0)
+_ROUNDS = 3
+
+
+def lay_late(
+    frames: Sequence[Frame], refined: Solution, epsg: int, read: Callable[[Frame], Gray]
+) -> tuple[list[PlacedFrame], dict[str, str]]:
+    """Place pictures of a vehicle that was refined without them.
+
+    Args:
+        frames: the late ones, of the same vehicle.
+        refined: what is there; nothing of it changes.
+        epsg: the area's grid.
+        read: gives a picture's grey values at full size.
+
+    Returns:
+        The placed frames in order of time, and image -> reason for those that cannot be placed. Those that the
+        neighbours' pictures do not hold are `weak`, placed by the neighbours' corrections alone. The sigma of the
+        others is that of the neighbours, with the resection's own, and with what corners that stand a little above the
+        terrain move a picture by that has its neighbours on one side: that much of their distance over the height.
+    """
+    late = {frame.image for frame in frames}
+    everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))
+    recorded = recorded_cameras(everyone, LocalGrid(epsg))
+    guesses = carry(
+        [p for p in recorded.placed if p.frame.image in late],
+        [p for p in recorded.placed if p.frame.image not in late],
+        refined.placed,
+    )
+    terrain = refined.terrain or Terrain.flat(refined.ground_z_m)
+    pictures: dict[str, Gray] = {}
+
+    def small(placed: PlacedFrame) -> Gray:
+        if placed.frame.image not in pictures:
+            gray = read(placed.frame)
+            pictures[placed.frame.image] = cv2.resize(
+                gray, working_size(placed.camera.lens), interpolation=cv2.INTER_AREA
+            )
+        return pictures[placed.frame.image]
+
+    holds = [p for p in refined.placed if not p.weak]
+    placed: list[PlacedFrame] = []
+    dropped = {r.image: r.reason for r in recorded.rejected if r.image in late}
+    for guess in guesses:
+        try:
+            picture = small(guess)
+        except OrthoSwarmError as error:
+            dropped[guess.frame.image] = str(error)
+            continue
+        near = _nearest(guess, holds)
+        placed.append(_fitted(guess, [sights(guess, picture, other, small(other), terrain) for other in near], near))
+    return placed, dropped
+
+
+def working_size(lens: Lens) -> tuple[int, int]:
+    """Columns and rows in which a picture is compared."""
+    scale = min(1.0, _WORKING_PX / lens.width)
+    return max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
+
+
+def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFrame]:
+    away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p in others]
+    return [others[i] for i in np.argsort(away, kind="stable")[:NEIGHBOURS]]
+
+
+def sights(one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrain: Terrain) -> tuple[Array, Array]:
+    """Points of a picture found in a refined one.
+
+    Args:
+        one: a picture near its place. gray: it, at working size. other: a refined one. known: it, at working size.
+        terrain: the ground.
+
+    Returns:
+        Pixels (M, 2) of the first picture at full size, and the ground points (M, 3) that the other one gives them.
+    """
+    z = float(terrain.height(one.camera.nadir))
+    mine, its = _reduced(one.camera.lens, gray), _reduced(other.camera.lens, known)
+    here = replace(one.camera, lens=mine).homography(z)
+    there = replace(other.camera, lens=its).homography(z)
+    move = _local(there, one.camera.nadir) @ _local(here, one.camera.nadir, inverse=False)  # my pixels -> its pixels
+    rows, cols = gray.shape
+    warp = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    turned = cv2.warpPerspective(known, move, (cols, rows), flags=warp)
+    inside = cv2.warpPerspective(np.full_like(known, 255), move, (cols, rows), flags=warp & ~3)
+    corners = cv2.goodFeaturesToTrack(gray, _CORNERS, 0.005, 8.0, mask=cv2.erode(inside, np.ones((15, 15), np.uint8)))
+    nothing = np.empty((0, 2)), np.empty((0, 3))
+    if corners is None:
+        return nothing
+    moved, ok, _ = cv2.calcOpticalFlowPyrLK(gray, turned, corners, corners.copy(), winSize=(21, 21), maxLevel=4)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(turned, gray, moved, corners.copy(), winSize=(21, 21), maxLevel=4)
+    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.hypot(*(back - corners)[:, 0].T) < _BACK_PX)
+    if not good.any():
+        return nothing
+    found = cv2.perspectiveTransform(moved[good].astype(np.float64), move)[:, 0]
+    ground = on_terrain(replace(other.camera, lens=its), found, terrain)
+    sure = np.isfinite(ground).all(1)
+    scale = one.camera.lens.width / cols
+    return ((corners[good][:, 0].astype(np.float64) + 0.5) * scale - 0.5)[sure], ground[sure]
+
+
+def _reduced(lens: Lens, gray: Gray) -> Lens:
+    """The lens of a picture that was made smaller."""
+    rows, cols = gray.shape
+    scale = cols / lens.width
+    return replace(
+        lens, width=cols, height=rows, focal_px=lens.focal_px * scale, cx=lens.cx * scale, cy=lens.cy * scale
+    )
+
+
+def _local(homography: Array, origin: Array, *, inverse: bool = True) -> Array:
+    """A homography to the ground (or its inverse) about a ground point, so that grid coordinates lose no digits."""
+    shift = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]])
+    matrix = shift @ homography
+    return np.asarray(np.linalg.inv(matrix) if inverse else matrix)
+
+
+def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
+    """Ground points (M, 3) of pixels (M, 2); NaN above the horizon."""
+    z = np.full(len(uv), float(terrain.height(camera.nadir)))
+    for _ in range(_ROUNDS):
+        xy = camera.to_ground(uv, z)
+        z = np.where(np.isfinite(xy).all(1), terrain.height(np.nan_to_num(xy)), z)
+    return np.column_stack([xy, z])
+
+
+def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Sequence[PlacedFrame]) -> PlacedFrame:
+    """The frame with its camera fitted to what its neighbours see, the guess where they do not agree."""
+    if sum(len(uv) for uv, _ in seen) < FEWEST:
+        return guess
+    uv, ground = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    camera = resected(guess.camera, uv, ground)
+    scale = max(1.0, guess.camera.lens.width / _WORKING_PX)
+    off = np.hypot(*(camera.project(ground) - uv).T) / scale
+    agree = off < _AGREE_PX
+    if agree.sum() < max(FEWEST, LEAST_SHARE * len(uv)):
+        return guess
+    source = np.repeat(np.arange(len(near)), [len(uv) for uv, _ in seen])[agree]
+    away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
+    beside = float(np.median([p.sigma_m for p in near]))
+    leaning = CORNERS_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
+    own = RADIAL * float(np.sqrt(len(near))) * centre_sigma(camera, uv[agree], ground[agree], scale)
+    return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([beside, leaning, own])))
+
+
+def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> float:
+    """One sigma of an axis of where a picture's centre lies on the ground, by the scatter of its points, metres.
+
+    Args:
+        camera: as resected. uv, ground: pixels (M, 2) and ground points (M, 3). scale: pixels of the picture in one of
+            those in which it was compared.
+    """
+    off = (camera.project(ground) - uv) / scale
+    noise = max(float(np.sqrt((off**2).mean())), _LEAST_PX)
+    moved = [_moved(camera, step) for step in _STEPS]
+    size = _STEPS.sum(1)
+    jacobian = np.stack([(c.project(ground) - uv) / scale - off for c in moved], -1).reshape(-1, 6) / size
+    prior = np.diag(1.0 / np.array([PRIOR_M] * 3 + [PRIOR_RAD] * 3) ** 2)
+    covariance = np.linalg.inv(jacobian.T @ jacobian / noise**2 + prior)
+    middle, z = np.array([camera.lens.principal_point]), float(ground[:, 2].mean())
+    centre = np.stack([(c.to_ground(middle, z) - camera.to_ground(middle, z))[0] for c in moved], -1) / size
+    return float(np.sqrt(np.trace(centre @ covariance @ centre.T) / 2))
+
+
+def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
+    """A camera's position and attitude from ground points (M, 3) at pixels (M, 2), robustly (Geman-McClure).
+
+    Gauss-Newton on six numbers, with the camera itself as a loose prior.
+    """
+    scale = max(1.0, camera.lens.width / _WORKING_PX)
+    prior = np.diag(1.0 / np.array([PRIOR_M] * 3 + [PRIOR_RAD] * 3) ** 2)
+    total = np.zeros(6)
+    now = camera
+    for c in _SCALES_PX:
+        for _ in range(_ROUNDS):
+            off = (now.project(ground) - uv) / scale
+            off = np.where(np.isfinite(off), off, 1e3)
+            weight = (c * c / (c * c + (off**2).sum(1))) ** 2
+            jacobian = np.stack(
+                [(_moved(camera, total + step).project(ground) - uv) / scale - off for step in _STEPS], -1
+            )
+            jacobian = np.nan_to_num(jacobian / _STEPS.sum(1))
+            normal = np.einsum("mki,m,mkj->ij", jacobian, weight, jacobian) + prior
+            right = np.einsum("mki,m,mk->i", jacobian, weight, off) + prior @ total
+            total = total - np.linalg.solve(normal, right)
+            now = _moved(camera, total)
+    return now
+
+
+_STEPS = np.diag([1e-3] * 3 + [1e-5] * 3)
+
+
+def _moved(camera: Camera, change: Array) -> Camera:
+    """A camera moved by metres and turned by a rotation vector in the ground's axes."""
+    turn, _ = cv2.Rodrigues(change[3:])
+    return Camera(camera.position + change[:3], turn @ camera.rotation, camera.lens)

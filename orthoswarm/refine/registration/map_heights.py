@@ -1,0 +1,99 @@
+"""Heights of the ground that only oblique views show, from where the map has it.
+
+Beyond the outermost leg the ground is seen at 40 degrees and more, from one side and by few pictures: its height is
+poorly triangulated, and what is wrong with it (or with the cameras out there) moves the orthoimage by nearly as much.
+The map tells: seen by one camera, ground that is higher than believed is drawn farther out, along the line of sight.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, Rig
+from orthoswarm.refine.features.patch_matching import texture_field
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.registration.absolute_orientation import TIE_HALF_M, accepted
+from orthoswarm.refine.registration.map_windows import LoadedMap
+from orthoswarm.refine.registration.tie_points import match_points
+from orthoswarm.refine.surface.ground_densification import cells_near, flying_height, sight_reach
+from orthoswarm.refine.surface.vehicle_ground import GroundModel
+
+Array = NDArray[np.float64]
+
+CELL_SHARE, LEAST_CELL_M = 0.06, 5.0
+"""Distance of the positions, as a share of the flying height, and at least."""
+LEAST_SLOPE = 0.35
+"""Horizontal distance over height from which on a view counts as oblique."""
+REACH_M = 6.0
+ACROSS_M = 0.6
+"""What is found must lie on the line of sight."""
+SIGMA_SHARE = 1.5
+"""How well the map tells a place, in sigmas of the ties (which are averages over a leg's views)."""
+_TRIED = 8
+
+
+def map_heights(
+    flight: Flight,
+    surface: GroundModel,
+    ground: LoadedMap,
+    others: Array,
+    tie_sigma_m: Array,
+    pictures: NDArray[np.bool_] | None = None,
+) -> tuple[Array, Array]:
+    """Ground points (K, 3) and one sigma of their heights (K,), where this flight's views are oblique.
+
+    Args:
+        flight: adjusted on the map. surface: its ground.
+        ground: the map under it.
+        others: float64 (M, 2), where other vehicles' cameras were; ground that they see better is left to them.
+        tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
+        pictures: bool (N,), the ones to compare with the map, None for all on legs.
+    """
+    rig, own = flight.rig(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
+    if not len(tie_sigma_m) or not len(own):
+        return np.zeros((0, 3)), np.zeros(0)
+    cells = _positions(flight, flying_height(flight, surface), own, others)
+    points = np.column_stack([cells, surface.terrain().height(cells)])
+    camera = _best_views(rig, points, own)
+    chosen = np.flatnonzero(camera >= 0)
+    half, reach = max(8, round(TIE_HALF_M / ground.gsd_m)), max(4, round(REACH_M / ground.gsd_m))
+    gray, level = flight.pictures.gray, points[:, 2]
+    found = accepted(match_points(rig, points, chosen, camera, gray, ground, half, reach, level, texture_field))
+    sight = points[found.point] - rig.position[found.camera]
+    out = np.hypot(sight[:, 0], sight[:, 1])
+    slope = out / np.maximum(-sight[:, 2], 1.0)
+    east, north = (sight[:, :2] / np.maximum(out, 1.0)[:, None]).T
+    along = found.shift[:, 0] * east + found.shift[:, 1] * north
+    across = found.shift[:, 1] * east - found.shift[:, 0] * north
+    good = (np.abs(across) < ACROSS_M) & (slope > LEAST_SLOPE)
+    where = points[found.point[good]].copy()
+    where[:, :2] += found.shift[good]
+    where[:, 2] -= along[good] / slope[good]
+    return where, SIGMA_SHARE * float(np.median(tie_sigma_m)) / slope[good]
+
+
+def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
+    """Centres (K, 2) of cells that own cameras see obliquely and nobody sees better."""
+    path, cell, reach = flight.rig().position[:, :2], max(CELL_SHARE * height_m, LEAST_CELL_M), sight_reach(flight)
+    cells = cells_near(path, cell, reach + cell)
+    mine, _ = cKDTree(path[own]).query(cells)
+    keep = (mine > LEAST_SLOPE * height_m) & (mine < reach)
+    if len(others):
+        keep &= mine <= cKDTree(others).query(cells)[0]
+    return np.asarray(cells[keep])
+
+
+def _best_views(rig: Rig, points: Array, cameras: NDArray[np.integer]) -> NDArray[np.int32]:
+    """For each point (K, 3) the camera nearest above it that sees it, -1 for none."""
+    best = np.full(len(points), -1, np.int32)
+    if not len(points) or not len(cameras):
+        return best
+    _, near = cKDTree(rig.position[cameras, :2]).query(points[:, :2], k=min(_TRIED, len(cameras)))
+    for rank in np.atleast_2d(near.T):
+        left = best < 0
+        camera = cameras[rank]
+        uv = rig.project(camera, points)
+        size = rig.lens[rig.lens_id[camera]][:, [WIDTH, HEIGHT]]
+        seen = np.isfinite(uv).all(1) & (uv > 0).all(1) & (uv < size - 1).all(1)
+        best[left & seen] = camera[left & seen]
+    return best

@@ -1,0 +1,126 @@
+"""A vehicle that the map does not show (blank there, or changed), laid beside neighbours that were found on it.
+
+First as a whole, its strips correlated with the neighbours' pictures as if those were the map; then point by point in
+their pictures, which are held, so that ground off the level does not matter.
+"""
+
+from copy import deepcopy
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.refine.registration.absolute_orientation import working_gsd
+from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
+from orthoswarm.refine.registration.coarse_registration import coarse_fit, shift_cameras
+from orthoswarm.refine.registration.neighbour_ties import Held, held_cameras, link_to_held, release
+from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
+
+Array = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
+
+REACH_PX = 24
+"""How far points are searched in held pictures once strips agree: relief moves them by metres across a border."""
+SCHEDULE = (1e4, 400.0, 36.0, 9.0, 9.0)
+FEWEST_LINKS = 8
+LEAST_SHARE = 0.4
+"""Of the links found, so many must agree in the end, or the vehicle stays where its receiver says."""
+_BLOCK_PX = 512
+
+
+class HeldMosaic:
+    """The pictures of held cameras as a map of the ground (placement.MapWindow), drawn where it is asked for."""
+
+    def __init__(self, held: Held, epsg: int, origin: Array) -> None:
+        self.epsg = epsg
+        self._held, self._origin = held, origin
+        rig = held.rig
+        focal = rig.lens[rig.lens_id, 0]
+        self._reach_m = rig.position[:, 2] * np.hypot(rig.lens[rig.lens_id, 6], rig.lens[rig.lens_id, 7]) / focal
+        self.native_gsd_m = float(np.median(rig.position[:, 2] / focal))
+
+    @property
+    def bounds(self) -> Bounds:
+        """West, south, east, north of what the cameras may see, in the area's grid."""
+        xy = self._held.rig.position[:, :2] + self._origin[:2]
+        low, high = (xy - self._reach_m[:, None]).min(0), (xy + self._reach_m[:, None]).max(0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Grey values (rows, columns), 0 to 255, and validity of a window."""
+        grid = GroundGrid.around(self.epsg, bounds, gsd_m)
+        gray, valid = np.zeros((grid.height, grid.width), np.float32), np.zeros((grid.height, grid.width), bool)
+        for r in range(0, grid.height, _BLOCK_PX):
+            for c in range(0, grid.width, _BLOCK_PX):
+                rows, cols = slice(r, min(r + _BLOCK_PX, grid.height)), slice(c, min(c + _BLOCK_PX, grid.width))
+                self._draw(grid, rows, cols, gray[rows, cols], valid[rows, cols])
+        return gray, valid
+
+    def _draw(
+        self, grid: GroundGrid, rows: slice, cols: slice, gray: NDArray[np.float32], valid: NDArray[np.bool_]
+    ) -> None:
+        rig, gsd = self._held.rig, grid.gsd_m
+        west = grid.west + cols.start * gsd - float(self._origin[0])
+        north = grid.north - rows.start * gsd - float(self._origin[1])
+        high, wide = gray.shape
+        x, y = rig.position[:, 0], rig.position[:, 1]
+        reach = 0.6 * self._reach_m
+        near = (
+            (x > west - reach)
+            & (x < west + wide * gsd + reach)
+            & (y < north + reach)
+            & (y > north - high * gsd - reach)
+        )
+        drawn = strip_mosaic(rig, np.flatnonzero(near), self._held.small, 0.0, gsd) if near.any() else None
+        if drawn is None:
+            return
+        seen, known, left, top = drawn
+        move = np.array([[1.0, 0.0, (left - west) / gsd], [0.0, 1.0, (north - top) / gsd]])
+        gray[:] = cv2.warpAffine(seen, move, (wide, high))
+        valid[:] = cv2.warpAffine(known.astype(np.uint8), move, (wide, high), flags=cv2.INTER_NEAREST) > 0
+
+
+def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
+    """Lay a vehicle that was not found on the map beside neighbours that lie on it.
+
+    Args:
+        item: the vehicle, and neighbours.
+        epsg: the area's grid. origin: float64 (2,) of the local frame.
+
+    Returns:
+        A state that is `carried`; the same one where the neighbours' pictures share too little with it.
+    """
+    state, others = item
+    out = deepcopy(state)
+    out.carried = True  # so that neighbours on the map are held
+    held = held_cameras(out, [other for other in others if lies_on_map(other)])
+    if held is None:
+        return state
+    flight = out.flight
+    mosaic = HeldMosaic(held, epsg, origin)
+    fit = coarse_fit(flight, mosaic, origin)
+    if fit is None:
+        return state
+    shift_cameras(flight, fit.correction)
+    held = held_cameras(out, [other for other in others if lies_on_map(other)])
+    if held is None:
+        return state
+    found = link_to_held(flight, held, working_gsd(flight), REACH_PX)
+    if found < FEWEST_LINKS:
+        return state
+    adj = flight.adjustment
+    for c in SCHEDULE:
+        adj.step(c, out.surface.belief(adj.points))
+    linked = adj.tracks.camera >= len(flight.frames)
+    agree = int((adj.obs_weight[linked] > 0.3).sum())
+    if agree < max(FEWEST_LINKS, LEAST_SHARE * found):
+        return state
+    release(flight)
+    out.confidence = agree / found
+    flight.warnings[:] = [w for w in flight.warnings if "no part of this flight was found on the map" not in w]
+    flight.warnings.append("the map does not show what this flight saw; pictures of its neighbours carry it")
+    flight.pictures.drop()
+    for other in others:
+        other.flight.pictures.drop()
+    return out

@@ -1,0 +1,168 @@
+"""The second pass of a vehicle: on the common level, tied to neighbours that are held."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.refine.bundle.adjustment import Adjustment
+from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
+from orthoswarm.refine.bundle.observation_selection import one_per_cell
+from orthoswarm.refine.bundle.priors import Priors
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
+from orthoswarm.refine.registration.tie_points import link_legs
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+CELL_M = 40.0
+HELD_SIGMA_PX = 1.5
+MOST_HELD = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Cameras of neighbours that may see a vehicle's ground, as they are: rig and how to read their pictures.
+
+    `gray` gives one at working scale, `small` a reduced one.
+    """
+
+    rig: Rig
+    vehicle: NDArray[np.int32]
+    gray: Callable[[int], Gray]
+    small: Callable[[int], Gray]
+
+
+def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | None:
+    """The neighbours' cameras near a vehicle's path (every second one is enough); None where there are none."""
+    own = state.flight.adjustment.rig.position[:, :2]
+    height = float(np.median(state.flight.adjustment.rig.position[:, 2]))
+    low, high = own.min(0) - 1.2 * height, own.max(0) + 1.2 * height
+    parts: list[tuple[VehicleState, NDArray[np.int64]]] = []
+    for other in others:
+        xy = other.flight.adjustment.rig.position[: len(other.flight.frames), :2]
+        near = np.flatnonzero(((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0))[::2]
+        fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
+        if len(near) and fits:
+            parts.append((other, near))
+    if not parts:
+        return None
+    rigs = [o.flight.adjustment.rig.take(near) for o, near in parts]
+    lens_at = np.cumsum([0] + [len(r.lens) for r in rigs])
+    rig = Rig(
+        np.concatenate([r.position for r in rigs]),
+        np.concatenate([r.rotation for r in rigs]),
+        np.concatenate([r.lens_id + lens_at[k] for k, r in enumerate(rigs)]).astype(np.int32),
+        np.concatenate([r.lens for r in rigs]),
+    )
+    vehicle = np.concatenate([np.full(len(near), k, np.int32) for k, (_, near) in enumerate(parts)])
+    where = [(o, int(i)) for o, near in parts for i in near]
+    return Held(
+        rig,
+        vehicle,
+        lambda j: where[j][0].flight.pictures.gray(where[j][1]),
+        lambda j: where[j][0].flight.pictures.small(where[j][1]),
+    )
+
+
+def link_to_held(
+    flight: Flight, held: Held, gsd_m: float, reach_px: int = 6, pictures: NDArray[np.bool_] | None = None
+) -> int:
+    """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended.
+
+    Args:
+        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
+        pictures: bool (N,), own ones to compare, None for all.
+    """
+    adj = flight.adjustment
+    n = len(adj.rig)
+    joint = _joined(adj.rig, held.rig)
+    seen = flight.sights(pictures)
+    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
+    leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + held.vehicle]).astype(np.int32)
+    cost = np.where(usable, -seen.count.astype(float), np.inf)
+    chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, CELL_M)
+    candidates = np.arange(n, len(joint))
+
+    def gray(i: int) -> Gray:
+        return flight.pictures.gray(i) if i < n else held.gray(i - n)
+
+    camera, point, uv, _ = link_legs(
+        joint, adj.points, chosen, seen.camera, leg, candidates, gray, gsd_m, most=MOST_HELD, reach=reach_px
+    )
+    if not len(camera):
+        return 0
+    tracks = Tracks(
+        np.concatenate([adj.tracks.camera, camera]),
+        np.concatenate([adj.tracks.point, point]),
+        np.concatenate([adj.tracks.uv, uv]),
+        np.concatenate([adj.tracks.sigma_px, np.full(len(camera), HELD_SIGMA_PX, np.float32)]),
+    )
+    free = np.arange(len(joint)) < n
+    new = Adjustment.begin(joint, tracks, _padded(adj.priors, len(held.rig), len(held.rig.lens)), adj.points, free)
+    shift = new.layout.lens_columns - adj.layout.lens_columns
+    new.common[: adj.layout.lens_columns] = adj.common[: adj.layout.lens_columns]
+    new.common[adj.layout.lens_columns + shift :] = adj.common[adj.layout.lens_columns :]
+    new.priors.lens[len(adj.priors.lens) :] = _lens_values(held.rig.lens)
+    flight.adjustment = new
+    return len(camera)
+
+
+def release(flight: Flight) -> None:
+    """Take held cameras out of a flight's adjustment again (their observations, too)."""
+    adj = flight.adjustment
+    n, lenses = len(flight.frames), int(adj.rig.lens_id[: len(flight.frames)].max()) + 1
+    own = adj.tracks.camera < n
+    tracks = Tracks(adj.tracks.camera[own], adj.tracks.point[own], adj.tracks.uv[own], adj.tracks.sigma_px[own])
+    rig = replace(adj.rig.take(slice(0, n)), lens=adj.rig.lens[:lenses])
+    p = adj.priors
+    priors = replace(
+        p,
+        position=p.position[:n],
+        position_sigma=p.position_sigma[:n],
+        rotation=p.rotation[:n],
+        rotation_sigma=p.rotation_sigma[:n],
+        velocity=p.velocity[:n],
+        group=p.group[:n],
+        lens=p.lens[:lenses],
+        lens_sigma=p.lens_sigma[:lenses],
+    )
+    new = Adjustment.begin(rig, tracks, priors, adj.points)
+    new.common[: 6 * lenses] = adj.common[: 6 * lenses]
+    new.common[6 * lenses :] = adj.common[adj.layout.lens_columns :]
+    weight = adj.obs_weight[own]
+    order = np.lexsort((tracks.camera, tracks.point))
+    new.obs_weight[:] = weight[order]
+    new.point_inverse[:] = adj.point_inverse
+    new.tie_residual = adj.tie_residual
+    flight.adjustment = new
+
+
+def _joined(a: Rig, b: Rig) -> Rig:
+    return Rig(
+        np.concatenate([a.position, b.position]),
+        np.concatenate([a.rotation, b.rotation]),
+        np.concatenate([a.lens_id, b.lens_id + len(a.lens)]).astype(np.int32),
+        np.concatenate([a.lens, b.lens]),
+    )
+
+
+def _lens_values(lens: Array) -> Array:
+    return np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]])
+
+
+def _padded(p: Priors, cameras: int, lenses: int) -> Priors:
+    """Priors with room for held cameras; they have no group and their lenses do not move."""
+    return replace(
+        p,
+        position=np.concatenate([p.position, np.zeros((cameras, 3))]),
+        position_sigma=np.concatenate([p.position_sigma, np.full((cameras, 3), np.inf)]),
+        rotation=np.concatenate([p.rotation, np.broadcast_to(np.eye(3), (cameras, 3, 3))]),
+        rotation_sigma=np.concatenate([p.rotation_sigma, np.full((cameras, 3), np.inf)]),
+        velocity=np.concatenate([p.velocity, np.zeros((cameras, 2))]),
+        group=np.concatenate([p.group, np.full(cameras, -1)]).astype(np.int32),
+        lens=np.concatenate([p.lens, np.zeros((lenses, 6))]),
+        lens_sigma=np.concatenate([p.lens_sigma, np.zeros((lenses, 6))]),
+    )

@@ -1,0 +1,1 @@
+"""What runs when: first and second pass of each vehicle, batches, refinement in flight."""

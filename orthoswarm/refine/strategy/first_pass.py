@@ -1,0 +1,97 @@
+"""The first pass of a batch: each vehicle by itself, or matched together with others, then onto the map."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import AdjustmentError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.sparse_joint import open_sparse_flights
+from orthoswarm.refine.initial.pair_graph import Progress
+from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
+from orthoswarm.refine.strategy.vehicle_group import Run
+from orthoswarm.refine.strategy.vehicle_passes import Options, followed, look_again, matched, placed_again, read_frame
+
+Array = NDArray[np.float64]
+
+
+def first_passes(
+    units: list[list[Frame]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    origin: Array,
+    options: Options,
+    run: Run,
+    progress: Progress | None,
+) -> tuple[list[VehicleState], dict[int, str]]:
+    """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first.
+
+    Args:
+        units: frames of one vehicle and one lens each. basemap: the map on the area's grid, or None.
+        grid: the area's grid. origin: float64 (2,) of the local frame. options: see Options. run: how tasks are run.
+        progress: called with stage, done, all.
+
+    Returns:
+        The states of all units that could be adjusted, in order; unit -> why not, of the others.
+    """
+    # The network for the second look is loaded by one process only, afterwards.
+    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
+    states: list[VehicleState | None] = []
+    for n, state in enumerate(run(task, units)):
+        states.append(state)
+        if progress:
+            progress("solo", n + 1, len(units))
+    waiting = [k for k, state in enumerate(states) if state is None]
+    lost: dict[int, str] = {}
+    if waiting:
+        watch = Stopwatch()
+        opened = _sparse_flights([units[k] for k in waiting], grid, origin, run, progress)
+        watch.lap("tracks")
+        lost = {k: flight for k, flight in zip(waiting, opened, strict=True) if isinstance(flight, str)}
+        flights = [flight for flight in opened if not isinstance(flight, str)]
+        place = partial(matched, origin=origin, basemap=basemap, options=options, learned=False)
+        for k, state in zip([k for k in waiting if k not in lost], run(place, flights), strict=True):
+            state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
+            states[k] = state
+    return _second_looks([state for state in states if state is not None], basemap, origin, run, progress), lost
+
+
+def _sparse_flights(
+    units: Sequence[list[Frame]], grid: LocalGrid, origin: Array, run: Run, progress: Progress | None
+) -> list[Flight | str]:
+    """Flights matched and adjusted together; each by itself where that fails; why, of one that fails by itself.
+
+    Photos of one vehicle that do not hold together must not cost the others theirs.
+    """
+    try:
+        return list(open_sparse_flights(units, grid, origin, read_frame, run, progress))
+    except AdjustmentError as error:
+        if len(units) == 1:
+            return [str(error)]
+    return [flight for unit in units for flight in _sparse_flights([unit], grid, origin, run, progress)]
+
+
+def _second_looks(
+    states: list[VehicleState],
+    basemap: MapWindow | None,
+    origin: Array,
+    run: Run,
+    progress: Progress | None,
+) -> list[VehicleState]:
+    """Learned matching for the flights that edges did not find, here, one after the other; then settled as usual."""
+    lost = [k for k, state in enumerate(states) if state.unfound]
+    found = []
+    for n, k in enumerate(lost):
+        found.append(None if basemap is None else look_again(states[k], basemap, origin))
+        if progress:
+            progress("second look", n + 1, len(lost))
+    items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
+    out = list(states)
+    for k, state in zip(lost, run(partial(placed_again, basemap=basemap, origin=origin), items), strict=True):
+        out[k] = state
+    return out

@@ -1,0 +1,103 @@
+"""The second pass of a vehicle: beside its neighbours, with fresh ties, its own errors, and denser ground."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.bundle.covariance import frame_sigmas, map_doubt, unexplained
+from orthoswarm.refine.flight.weak_pictures import steady_weak
+from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, resettle, working_gsd
+from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
+from orthoswarm.refine.registration.map_heights import map_heights
+from orthoswarm.refine.registration.map_windows import LoadedMap
+from orthoswarm.refine.registration.neighbour_ties import held_cameras, link_to_held, release
+from orthoswarm.refine.strategy.vehicle_passes import level_sigma_deg
+from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
+
+Array = NDArray[np.float64]
+
+COHERENT = 2.0
+"""Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
+
+
+def second_pass(
+    item: tuple[VehicleState, list[VehicleState], float],
+    *,
+    basemap: MapWindow | None,
+    origin: Array,
+) -> VehicleState:
+    """One vehicle again: common level, links into held neighbours, fresh ties; then denser ground."""
+    state, others, correction = item
+    state = deepcopy(state)  # neighbours see this vehicle as its solo pass left it, in whatever order they are run
+    watch = Stopwatch()
+    flight = state.flight
+    state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
+    # The pictures were let go since: few of those that were followed are enough, and must be decoded again.
+    pictures = None if flight.sparse else spaced_pictures(flight, state.surface)
+    held = held_cameras(state, others)
+    if held is not None:
+        link_to_held(flight, held, working_gsd(flight), pictures=pictures)
+    watch.lap("links to neighbours")
+    ground = None
+    if state.on_map and basemap is not None:
+        ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
+        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
+    else:
+        for _ in range(4):
+            flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
+    watch.lap("second adjustment")
+    _own_errors(state, others, ground)
+    release(flight)
+    if not flight.sparse:
+        steady_weak(flight, state.sigma_m)
+    watch.lap("sigma")
+    _denser_ground(state, others, ground, pictures)
+    watch.lap("denser terrain")
+    flight.pictures.drop()
+    for other in others:
+        other.flight.pictures.drop()
+    watch.add_to(state.timings)
+    return state
+
+
+def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: LoadedMap | None) -> None:
+    """The frames' sigmas and that of the field of view, with what the map's ties tell of errors beside them."""
+    flight = state.flight
+    adj = flight.adjustment
+    ties = state.ties if state.on_map else None
+    floor = 0.05
+    if ground is not None:
+        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
+    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
+    state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
+    state.sigma_m = sigma[: len(flight.frames)]
+    if not lies_on_map(state):
+        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours are no better than oneself
+    elif not state.on_map:
+        theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
+        state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
+    if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
+        off = unexplained(flight.leg, state.matches.camera, adj.tie_residual)
+        off[off < COHERENT * state.sigma_m] = 0.0
+        state.sigma_m = np.hypot(state.sigma_m, off)
+
+
+def _denser_ground(
+    state: VehicleState,
+    others: Sequence[VehicleState],
+    ground: LoadedMap | None,
+    pictures: NDArray[np.bool_] | None,
+) -> None:
+    """Ground points for drawing: between the tracks, and where only oblique views show it, from the map."""
+    flight = state.flight
+    points, sigmas, state.high = dense_points(flight, state.surface)
+    state.dense = points, sigmas
+    if ground is not None:
+        paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
+        elsewhere = np.concatenate([np.zeros((0, 2)), *paths])
+        more = map_heights(flight, state.surface, ground, elsewhere, state.ties.sigma_m, pictures)
+        state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])

@@ -1,0 +1,292 @@
+"""The default refiner: one vehicle is the unit, a batch is a loop over it (DESIGN.md section 4, RECIPE.md).
+
+Solo pass of each vehicle -> those that the map does not show beside those that it does -> second pass on a common level
+with neighbours held -> one terrain.
+The map's lean is voted over the roofs of all vehicles for the report; ties are ground, which does not lean.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import AdjustmentError, OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
+from orthoswarm.model.recorded_pose import recorded_cameras, told_of_lone_ones
+from orthoswarm.refine.flight.carried_pictures import carry, follow, sort_out
+from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map, to_solution
+from orthoswarm.refine.registration.neighbour_registration import lay_beside
+from orthoswarm.refine.strategy.first_pass import first_passes
+from orthoswarm.refine.strategy.second_pass import second_pass
+from orthoswarm.refine.strategy.vehicle_group import (
+    Run,
+    coarse_terrain,
+    common_terrain,
+    local_origin,
+    neighbours_of,
+    pooled_lean,
+    serial,
+)
+from orthoswarm.refine.strategy.vehicle_passes import Options, solo
+from orthoswarm.refine.surface.height_levels import level_network
+from orthoswarm.refine.surface.vehicle_ground import ground_points
+
+__all__ = [
+    "Options",
+    "Refined",
+    "Run",
+    "SwarmRefiner",
+    "local_origin",
+    "refine_all",
+    "serial",
+    "solo",
+    "states_of",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Products of the refinement of a batch: the same vehicles before and after the map; state is in `fine`.
+
+    Warnings are those that concern all vehicles.
+    """
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class SwarmRefiner:
+    """One vehicle as soon as it completes (placement.Refiner): solo, then again with its neighbours held.
+
+    Attributes:
+        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
+        options: see Options.
+    """
+
+    epsg: int
+    origin: Array
+    options: Options = field(default_factory=Options)
+
+    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place one vehicle's frames; neighbours (earlier results of this refiner) are held as they are.
+
+        Raises:
+            OrthoSwarmError: if nothing can be made of the frames.
+        """
+        if not frames:
+            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+        recorded = recorded_cameras(frames, LocalGrid(self.epsg))
+        kinds = sort_out(recorded.placed)
+        if kinds.fit:
+            solution = self._refined(told_of_lone_ones(kinds.fit), neighbours, basemap)
+        else:
+            solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
+        odd = carry(kinds.odd, kinds.fit, solution.placed)
+        return replace(
+            solution,
+            placed=[*solution.placed, *odd],
+            dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
+            warnings=[*solution.warnings, *kinds.warnings],
+        )
+
+    def _refined(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        parts = split_units({frames[0].vehicle: frames})
+        own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
+        others = [state for n in neighbours for state in states_of(n)]
+        return self._beside(own, others, basemap)
+
+    def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place a vehicle again beside neighbours that were not there, or not yet so good, when it was refined.
+
+        Its second pass is repeated on their common level, and what was not found on the map is laid beside those that
+        were. Pictures beside its refined ones (late ones, those of another camera) follow them.
+
+        Args:
+            solution: an earlier result of this refiner; it stays as it is. neighbours: the same of others, held.
+            basemap: the map, or None.
+
+        Returns:
+            The new one; the same one where there is nothing to solve.
+        """
+        own = deepcopy(states_of(solution))
+        others = [state for n in neighbours for state in states_of(n)]
+        if not own or not any(neighbours_of(state, others) for state in own):
+            return solution
+        told = {warning for state in own for warning in state.flight.warnings}
+        now = self._beside(own, others, basemap)
+        there = {p.frame.image for p in now.placed}
+        extra = [p for p in solution.placed if p.frame.image not in there]
+        own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]  # what was left out stays out
+        return replace(
+            now,
+            placed=[*own_frames, *follow(extra, solution.placed, now.placed)],
+            dropped=dict(solution.dropped),
+            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in told)])),
+        )
+
+    def _beside(self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None) -> Solution:
+        """The second pass of a vehicle's units, with others held as they are."""
+        own = lay_lost_beside(own, others, self.epsg, self.origin, serial)
+        everyone = [*own, *others]
+        network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
+        anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
+        done = list(own)
+        for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # what carries before what is carried
+            beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
+            item = (own[k], beside, float(network.correction_m[k]) - anchor)
+            done[k] = second_pass(item, basemap=basemap, origin=self.origin)
+        terrain = _shifted(common_terrain([*done, *others], self.options.ground(self.origin).given)[0], self.origin)
+        lean = pooled_lean(everyone)
+        return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
+
+
+def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame], had_map: bool) -> Solution:
+    """A vehicle that stays where its receiver says: nothing was flown, so nothing tells the scale of its pictures."""
+    fov = float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan")
+    sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
+    legs = [Leg(vehicle, 0, len(placed) - 1, "failed" if had_map else "carried", 0.0, sigma)] if placed else []
+    return Solution(vehicle, list(placed), {}, legs, fov, float("nan"), None)
+
+
+def states_of(solution: Solution) -> list[VehicleState]:
+    """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
+    state = solution.state
+    return [] if state is None else list(state) if isinstance(state, list) else [state]
+
+
+def refine_all(
+    vehicles: Mapping[str, Sequence[Frame]],
+    basemap: MapWindow | None,
+    grid: LocalGrid,
+    options: Options | None = None,
+    run: Run = serial,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Refined:
+    """Refine a batch of vehicles.
+
+    Args:
+        vehicles: id -> frames in order of time. basemap: the map on the area's grid, or None.
+        grid: the area's grid. options: see Options. run: how tasks are run. progress: called with stage, done, all.
+
+    Raises:
+        OrthoSwarmError: if there is nothing to refine.
+    """
+    if not vehicles:
+        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
+    options = options or Options()
+    units = split_units(vehicles)
+    states, lost = first_passes(units, basemap, grid, origin, options, run, progress)
+    if not states:
+        raise AdjustmentError(lost[0])
+    below = _shifted(coarse_terrain(states), origin)
+    coarse = [to_solution(s, origin, below, coarse=True) for s in states]
+    states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
+    _level(states)
+    given = options.ground(origin).given
+    terrain, warnings = common_terrain(states, given)
+    terrain = _shifted(terrain, origin)
+    lean = pooled_lean(states)
+    fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
+    left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
+    return Refined(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
+
+
+def _left(frames: Sequence[Frame], why: str, grid: LocalGrid, had_map: bool) -> Solution:
+    """A vehicle that could not be refined, as it was recorded; the others are worth having all the same."""
+    placed = recorded_cameras(frames, grid).placed
+    said = f"it could not be refined ({why}); it stays where its receiver says"
+    return replace(_as_recorded(frames[0].vehicle, placed, had_map), warnings=[said])
+
+
+def lay_lost_beside(
+    states: list[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
+) -> list[VehicleState]:
+    """Vehicles that were not found on the map, beside those that were; then those beside them, and so on.
+
+    Args:
+        states: vehicles to place. others: more that may carry them, as they are.
+        epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
+
+    Returns:
+        The states in order, those that could be laid beside others `carried`.
+    """
+    out = list(states)
+    lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
+    task = partial(lay_beside, epsg=epsg, origin=origin)
+    while lost:
+        anchors = [s for s in [*out, *others] if lies_on_map(s)]
+        items = [(k, neighbours_of(out[k], anchors)) for k in lost]
+        items = [(k, near) for k, near in items if near]
+        for (k, _), state in zip(items, run(task, [(out[k], near) for k, near in items]), strict=True):
+            out[k] = state
+        still = [k for k in lost if not out[k].carried]
+        if len(still) == len(lost):
+            break
+        lost = still
+    return out
+
+
+def _second_passes(
+    states: list[VehicleState],
+    basemap: MapWindow | None,
+    epsg: int,
+    origin: Array,
+    run: Run,
+    progress: Callable[[str, int, int], None] | None,
+) -> list[VehicleState]:
+    """All vehicles again, on a common level, each with its neighbours held as the solo pass left them."""
+    states = lay_lost_beside(states, [], epsg, origin, run)
+    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
+    task = partial(second_pass, basemap=basemap, origin=origin)
+    mapped = [k for k, s in enumerate(states) if s.on_map]
+    items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
+    out = list(states)
+    for done, (k, state) in enumerate(zip(mapped, run(task, items), strict=True)):
+        out[k] = state
+        if progress:
+            progress("joint", done + 1, len(states))
+    carried = [k for k, s in enumerate(states) if lies_on_map(s) and not s.on_map]
+    # Beside neighbours that are done: their pictures hold it, and it cannot be better than they are.
+    items = [(states[k], neighbours_of(states[k], out), float(network.correction_m[k])) for k in carried]
+    for done, (k, state) in enumerate(zip(carried, run(task, items), strict=True)):
+        out[k] = state
+        if progress:
+            progress("joint", len(mapped) + done + 1, len(states))
+    mapped += carried
+    # Without a map nobody is right: each vehicle is fitted to those before it, so that seams close without a dance.
+    before: list[VehicleState] = []
+    for k in sorted(set(range(len(states))) - set(mapped)):
+        (out[k],) = run(task, [(states[k], neighbours_of(states[k], before), float(network.correction_m[k]))])
+        before.append(out[k])
+        if progress:
+            progress("joint", len(mapped) + len(before), len(states))
+    return out
+
+
+def _level(states: Sequence[VehicleState]) -> None:
+    """Lift or lower whole vehicles, cameras and ground together, by what is left between their levels."""
+    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
+    for state, correction in zip(states, network.correction_m, strict=True):
+        adj = state.flight.adjustment
+        adj.rig.position[:, 2] += correction
+        adj.points[:, 2] += correction
+        state.dense[0][:, 2] += correction
+        state.high[:, 2] += correction
+
+
+def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:
+    if terrain is None:
+        return None
+    return replace(terrain, west=terrain.west + float(origin[0]), south=terrain.south + float(origin[1]))

@@ -1,0 +1,163 @@
+"""What vehicles of an area have in common: who sees whom, the lean of the map, one terrain; how tasks are run."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.refine.registration.block_state import VehicleState, seen_from_above
+from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
+from orthoswarm.refine.surface.given_dem import Given, fit_given
+from orthoswarm.refine.surface.ground_densification import dense_cell, flying_height
+from orthoswarm.refine.surface.smooth_surface import FitSettings
+from orthoswarm.refine.surface.tall_surfaces import with_broad_tops
+from orthoswarm.refine.surface.terrain import fit_terrain
+from orthoswarm.refine.surface.vehicle_ground import ground_points
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+DIFFERS_M = 0.2
+"""What is left over a height model is worth a word from here on."""
+DRAWN_NODES = 4_000_000
+"""Nodes of the ground that pictures are drawn on; tasks get the part that they need."""
+WHOLE = 0.97
+"""A height model that covers more than this of the area covers it."""
+DRAWN = FitSettings(held_out_se=1.0)
+"""The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
+DRAWN_ON_MAP = FitSettings(held_out_se=1.0, floor_sigma_m=0.15, render_flat_sd_m=0.0)
+"""Where the map told heights they hold the border, and on flat ground they take out what is wrong with the cameras
+there: nothing is taken for noise."""
+
+
+class Run(Protocol):
+    """How tasks are run: serially, in processes, on a cluster; results come in the order of the items."""
+
+    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+        """Yield function(item) for each item."""
+
+
+def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
+    """Run tasks one after the other in this process."""
+    return map(function, items)
+
+
+def local_origin(grid: LocalGrid, frames: Iterable[Frame]) -> Array:
+    """Origin (2,) of the local frame: the middle of the fixes, on a multiple of 16 m so that pixel grids agree."""
+    fixes = np.array([(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
+    return np.asarray(np.round(np.median(grid.to_grid(fixes[:, 0], fixes[:, 1]), axis=0) / 16.0) * 16.0)
+
+
+def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
+    """The other vehicles whose paths come within sight of this one's."""
+    own = state.flight.adjustment.rig.position
+    reach = 1.5 * float(np.median(own[:, 2]))
+    low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
+    out = []
+    for other in states:
+        xy = other.flight.adjustment.rig.position[:, :2]
+        if other is not state and ((xy > low) & (xy < high)).all(1).any():
+            out.append(other)
+    return out
+
+
+def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
+    """The map's lean by vote over the roofs of all vehicles that lie on it; zero where they do not agree."""
+    mapped = [s for s in states if s.on_map]
+    if not mapped:
+        return (0.0, 0.0)
+    shifts = [s.roofs[0].shift - s.ground_shift for s in mapped]
+    roofs = [s.roofs[0] for s in mapped]
+    joint = MapMatches(
+        np.concatenate([r.point for r in roofs]),
+        np.concatenate([r.camera for r in roofs]),
+        np.concatenate(shifts),
+        np.concatenate([r.peak for r in roofs]),
+        np.concatenate([r.ratio for r in roofs]),
+    )
+    return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
+
+
+def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -> tuple[Terrain | None, list[str]]:
+    """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
+
+    A given shape of the ground is brought to their level; where the points contradict it, a warning says so.
+    """
+    if not states:
+        return None, []
+    own = [ground_points(s.flight.adjustment) for s in states]
+    points = np.concatenate([p for p, _ in own] + [s.dense[0] for s in states])
+    sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
+    if len(points) < 60:
+        return states[0].surface.terrain(), []
+    path = np.concatenate([s.flight.adjustment.rig.position for s in states])
+    reach = 1.1 * float(np.median(path[:, 2]))
+    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    lift = float(np.median([s.surface.lift_m for s in states]))
+    fit, off = None, 0.0
+    how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN
+    if given is not None:
+        fit, off = fit_given(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
+    drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
+    tops = np.concatenate([seen_from_above(s) for s in states])
+    cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
+    drawn = with_broad_tops(drawn, tops, cell, DRAWN_NODES)
+    return drawn, _doubts(given, fit is None, off, states) if given is not None else []
+
+
+def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
+    """The ground before the map was used, in the local frame: everywhere that of the vehicle whose camera is nearest.
+
+    Each vehicle's ground belongs to its own cameras, on a level that no other shares yet, and the nearest camera is the
+    one that is drawn. None where no vehicle has found its ground.
+    """
+    found = [s.coarse_surface for s in states]
+    grounds = [None if surface is None or surface.fit is None else surface.terrain() for surface in found]
+    steps = [ground.step_m for ground in grounds if ground is not None]
+    if not steps:
+        return None
+    paths = [s.coarse.position for s in states]
+    path = np.concatenate(paths)
+    reach = 1.1 * float(np.median(path[:, 2]))
+    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
+    step = max(min(steps), float(np.sqrt(np.prod(high - low) / DRAWN_NODES)))
+    columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
+    nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
+    vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])
+    nearest = vehicle[cKDTree(path[:, :2]).query(nodes)[1]]
+    z = np.zeros((rows, columns), np.float32)
+    for k, ground in enumerate(grounds):
+        if ground is not None:
+            z[nearest == k] = ground.height(nodes[nearest == k])
+    return Terrain(float(low[0]), float(low[1]), step, z)
+
+
+def _doubts(given: Given, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
+    """What has to be said of a height model."""
+    name = given.model.path.name
+    if unused:
+        return [
+            f"{name} contradicts the pictures (their ground differs from it by {off_m:.1f} m in the median), so the "
+            "ground found from them is used; check the file"
+        ]
+    out = []
+    doubted = [s for s in states if s.surface.contradicted_m > 0.0]
+    if doubted:
+        who = ", ".join(sorted({s.vehicle for s in doubted}))
+        off = max(s.surface.contradicted_m for s in doubted)
+        out.append(f"{name} contradicts the pictures of {who} by {off:.1f} m in the median; check it")
+    elif off_m > DIFFERS_M:
+        out.append(
+            f"the ground differs from {name} by {off_m:.1f} m in the median: it is coarse, old or displaced; the "
+            "pictures are followed where they differ from it"
+        )
+    if given.model.cover < WHOLE:
+        share = given.model.cover
+        out.append(f"{name} has heights on {share:.0%} of the area; elsewhere the ground is found from the pictures")
+    return out

@@ -1,0 +1,344 @@
+"""The two passes of one vehicle: by itself, then on the common level beside neighbours that are held."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.errors import AdjustmentError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.legs import leads_one_way
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.raster.height_model import HeightModel
+from orthoswarm.raster.picture_file import read_gray
+from orthoswarm.refine.bundle.adjustment import Ties
+from orthoswarm.refine.bundle.block_arrays import WIDTH, F
+from orthoswarm.refine.bundle.covariance import frame_sigmas
+from orthoswarm.refine.bundle.height_consistency import contradicted, height_doubt, release_heights
+from orthoswarm.refine.bundle.snapshot import Snapshot
+from orthoswarm.refine.flight.record_findings import contradiction
+from orthoswarm.refine.flight.relative_block import (
+    FEW,
+    Flight,
+    free_strong_lens,
+    open_flight,
+    strong_lens,
+    weigh_records,
+)
+from orthoswarm.refine.flight.sparse_block import open_sparse_flight
+from orthoswarm.refine.registration.absolute_orientation import settle
+from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit, second_look, shift_cameras
+from orthoswarm.refine.registration.tie_points import MapMatches
+from orthoswarm.refine.surface.given_dem import Given
+from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
+
+Array = NDArray[np.float64]
+
+
+TAKEOFF_LEVEL_M = 2.0
+"""How well the takeoff level is known to be the level of the ground, one sigma."""
+NO_HEIGHT_SHARE = 0.03
+"""Of the focal length of followed pictures without a height: relief and tilt tell it (15 flights: 2.5 % rms)."""
+ONE_WAY_FOV_SIGMA_DEG = 5.0
+"""Of photos on one straight way: tilt, height and lens stand for each other (11 such legs of a suburb: 5.6 rms)."""
+SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
+"""Robust scales of the steps without a map, from far off; WARY is for a start that is known to be near."""
+WARY = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
+FLOW_PAIRS = 6
+RUNAWAY, RUNAWAY_SIGMAS = 0.15, 5.0
+"""A focal length that leaves what the flow of so many pairs told by this share and so many sigmas is not believed."""
+FOV_SIGMAS, FOV_MOVES_DEG = 6.0, 4.0
+"""A place on the map that moves the field of view by more than this is not believed."""
+NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
+"""Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
+DECENTRED_SHARE = 0.02
+"""What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
+NOT_FOUND = "no part of this flight was found on the map; it lies in the GPS frame"
+REST_STEPS, FREE_STEPS, FREE_ROUNDS = 3, 6, 4
+AT_REST = 0.03
+"""A focal length that still moves by this share in three steps is not at rest."""
+AGREES = 0.08
+"""Pictures that, set free, come to rest within this share of the recorded height do not contradict it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How the refiner works.
+
+    Attributes:
+        fov_start_rad: field of view to start from where the tags hint at none.
+        work_width: pictures wider than this are reduced for the refinement.
+        dem: shape of the ground from outside, None to find it from the pictures.
+    """
+
+    fov_start_rad: float = float(np.radians(80.0))
+    work_width: int = 960
+    dem: HeightModel | None = None
+
+    def ground(self, origin: Array) -> GroundModel:
+        """What is known of the ground before a picture is looked at, in the frame with this origin."""
+        if self.dem is None:
+            return GroundModel()
+        return GroundModel(given=Given(self.dem, (float(origin[0]), float(origin[1]))))
+
+
+def read_frame(frame: Frame) -> NDArray[np.uint8]:
+    """A frame's grey picture."""
+    return read_gray(frame.path)
+
+
+def solo(
+    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
+) -> VehicleState:
+    """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
+    state = followed(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
+    if state is None:
+        watch = Stopwatch()
+        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
+        watch.lap("tracks")
+        state = from_flight(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, watch)
+    return state
+
+
+def followed(
+    frames: Sequence[Frame],
+    *,
+    epsg: int,
+    origin: Array,
+    basemap: MapWindow | None,
+    options: Options,
+    learned: bool = True,
+) -> VehicleState | None:
+    """Refine one vehicle by itself; None where its pictures cannot be followed, or what was followed does not hold.
+
+    learned: where edges do not find it on the map, ask learned matching at once (else see `look_again`).
+    """
+    watch = Stopwatch()
+    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
+    start = float(np.median(hints)) if hints else options.fov_start_rad
+    flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
+    watch.lap("tracks")
+    if flight is None:
+        return None
+    try:
+        surface = relative(flight, options.ground(origin))
+        if not NARROWEST_RAD < fov_rad(float(flight.rig().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
+            return None  # the recorded height that is behind such a lens cannot be right
+        if len(frames) < FEW and strong_lens(flight):
+            return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
+        return from_flight(flight, surface, origin, basemap, watch, learned)
+    except AdjustmentError:
+        return None
+
+
+def matched(
+    flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options, learned: bool = True
+) -> VehicleState:
+    """Refine one vehicle whose photos were matched and adjusted together with those of others."""
+    surface = fit_surface(flight.adjustment, options.ground(origin))
+    return from_flight(flight, surface, origin, basemap, Stopwatch(), learned)
+
+
+def from_flight(
+    flight: Flight,
+    surface: GroundModel,
+    origin: Array,
+    basemap: MapWindow | None,
+    watch: Stopwatch,
+    learned: bool = True,
+) -> VehicleState:
+    """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
+    adj = flight.adjustment
+    belief = surface.belief(adj.points)
+    coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
+    coarse = replace(
+        adj.rig, position=adj.rig.position.copy(), rotation=adj.rig.rotation.copy(), lens=adj.rig.lens.copy()
+    )
+    watch.lap("relative")
+    none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    state = VehicleState(
+        flight.frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
+        (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
+        coarse_surface=surface,
+    )  # fmt: skip
+    if basemap is not None:
+        state.had_map = True
+        fit = coarse_fit(flight, basemap, origin)
+        if fit is None and learned:
+            fit = second_look(flight, basemap, origin)
+        watch.lap("coarse registration")
+        state.unfound = fit is None
+        if fit is not None:
+            _onto_map(state, fit, basemap, origin, watch)
+        elif learned:
+            flight.warnings.append(NOT_FOUND)
+    flight.pictures.drop()
+    state.timings = watch.seconds
+    return state
+
+
+def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
+    """The adjustment without a map, its ground fitted as soon as the points allow (surface: what is known of it)."""
+    surface = surface or GroundModel()
+    begun = Snapshot.of(flight.adjustment)
+    found = _relative(flight, surface, SCHEDULE)
+    if ran_away(flight):
+        # A few wrong tracks, far off, threw it out of the valley before it could tell that they are wrong.
+        flight.adjustment = begun.restored()
+        found = _relative(flight, surface, WARY)
+    if ran_away(flight):
+        flight.adjustment = begun.restored()
+        p = flight.adjustment.priors
+        sigma = p.lens_sigma.copy()
+        sigma[:, 0] = flight.calibration.focal_sigma
+        flight.adjustment.priors = replace(p, lens_sigma=sigma)
+        found = _relative(flight, surface, WARY)
+    return _without_wrong_heights(flight, found)
+
+
+def ran_away(flight: Flight) -> bool:
+    """True if the focal length is far from what the flow of the pictures told: another minimum was found."""
+    told = flight.calibration
+    if told.pairs < FLOW_PAIRS or not told.trusted_height or not np.isfinite(told.spread):
+        return False
+    away = abs(float(np.log(flight.adjustment.rig.lens[0, F] / told.focal_px)))
+    return away > max(RUNAWAY, RUNAWAY_SIGMAS * told.focal_sigma)
+
+
+def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -> GroundModel:
+    schedule = list(schedule)
+    for k, c in enumerate(schedule):
+        first = k < 2
+        flight.adjustment.step(
+            c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
+        )
+        if k == 3:
+            weigh_records(flight)
+            if free_strong_lens(flight):
+                schedule += [9.0] * 4
+        if k >= 3:
+            surface = fit_surface(flight.adjustment, surface)
+    return surface
+
+
+def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
+    """Go on without the recorded heights where the pictures contradict them.
+
+    They must do so still when the adjustment is at rest, and it must come to rest without the heights, too: few
+    pictures of a camera that is held level tell little of the focal length, and without heights run anywhere.
+    """
+    if not flight.records.has_height.any() or not contradicted(flight.adjustment).any():
+        return surface
+    surface, _ = _steps(flight, surface, REST_STEPS)
+    believed, calibration, was = Snapshot.of(flight.adjustment), flight.calibration, surface
+    if not release_heights(flight.adjustment).any():
+        return surface
+    flight.calibration = replace(calibration, trusted_height=False)
+    for _ in range(FREE_ROUNDS):
+        surface, focal_px = _steps(flight, surface, FREE_STEPS)
+        at_rest = np.ptp(np.log(focal_px[-3:])) < AT_REST
+        if at_rest:
+            break
+    said = float(np.median(flight.records.position[flight.records.has_height, 2]))
+    seen = float(np.median(flight.adjustment.rig.position[:, 2])) - surface.level_m
+    if not at_rest or abs(seen - said) < AGREES * said:
+        flight.adjustment, flight.calibration = believed.restored(), calibration
+        flight.adjustment.step(9.0, was.belief(flight.adjustment.points))  # what is asked of a step is not restored
+        return was
+    flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
+    return surface
+
+
+def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundModel, list[float]]:
+    """So many steps near the end, with the focal length after each."""
+    focal_px = []
+    for _ in range(count):
+        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points))
+        surface = fit_surface(flight.adjustment, surface)
+        focal_px.append(float(flight.adjustment.rig.lens[0, F]))
+    return surface, focal_px
+
+
+def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """Where learned matching finds a flight that edges did not find on the map.
+
+    PyTorch and the network stay in memory, 400 MB: so one process looks for all flights, one after the other.
+    """
+    watch = Stopwatch()
+    fit = second_look(state.flight, basemap, origin)
+    state.flight.pictures.drop()
+    watch.lap("coarse registration")
+    watch.add_to(state.timings)
+    return fit
+
+
+def placed_again(
+    item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
+) -> VehicleState:
+    """A flight that edges did not find, after `look_again`: settled where it was found, else told of."""
+    state, fit = item
+    if fit is None or basemap is None:
+        state.flight.warnings.append(NOT_FOUND)
+        return state
+    watch = Stopwatch()
+    state.unfound = False
+    _onto_map(state, fit, basemap, origin, watch)
+    state.flight.pictures.drop()
+    watch.add_to(state.timings)
+    return state
+
+
+def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
+    """Settle a flight where it was found; it stays as it was where that would need another field of view."""
+    flight = state.flight
+    before, alone, sigma = Snapshot.of(flight.adjustment), state.surface, state.fov_sigma_deg
+    shift_cameras(flight, fit.correction)
+    settled = settle(flight, basemap, origin, state.surface)
+    told, now = (
+        float(np.degrees(fov_rad(float(a.rig.lens[0, F]), flight.pictures.size[0])))
+        for a in (before, flight.adjustment)
+    )
+    if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
+        flight.adjustment = before.restored()
+        flight.warnings.append(
+            f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
+            "found on the map is not believed"
+        )
+        return
+    state.map_shift = fit.correction
+    state.surface, state.ties, state.matches, state.roofs = (
+        settled.surface,
+        settled.ties,
+        settled.matches,
+        settled.roofs,
+    )
+    state.on_map, state.confidence = True, fit.confidence
+    watch.lap("ties and absolute")
+
+
+def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
+    """How far the field of view may be off by what the adjustment takes for granted.
+
+    The takeoff spot need not be at the ground's middle level: over flat ground straight down only f / h is observable;
+    the more relief, the less the level is known. Recorded heights may be wrong: as far as they disagree with the
+    pictures. Photos without heights tell it a little, on one straight way not at all. A lens that was found together
+    with other vehicles is held, and known as well as it was then; one that distorts strongly is not quite as modelled.
+    """
+    unknown = flight.sparse or not flight.records.has_height.any()
+    if unknown and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
+        return ONE_WAY_FOV_SIGMA_DEG
+    rig = flight.rig()
+    held = flight.focal_sigma
+    share = float(np.hypot(held, DECENTRED_SHARE if strong_lens(flight) else 0.0))
+    if flight.calibration.trusted_height and flight.records.has_height.any():
+        relief = 0.0 if surface.fit is None else surface.fit.sd_m
+        level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
+        share = float(np.linalg.norm([share, level, height_doubt(flight.adjustment)]))
+    elif not flight.sparse:
+        share = float(np.hypot(share, NO_HEIGHT_SHARE))
+    half = 0.5 * fov_rad(float(rig.lens[0, F]), int(rig.lens[0, WIDTH]))
+    return float(np.degrees(np.sin(2 * half))) * share

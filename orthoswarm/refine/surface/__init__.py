@@ -1,0 +1,1 @@
+"""The ground below the pictures: terrain, dense points, given height models, tall things."""

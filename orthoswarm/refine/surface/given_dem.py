@@ -1,0 +1,216 @@
+"""Ground whose shape an outside height model gives, and what the pictures say against it.
+
+The model's datum is another than that of heights over the takeoff, and it may be old (a debris flow lies on it now),
+coarse, or end in the middle of the area. So only what is left of the points' heights over the model is fitted, as
+ground is fitted without one. Where that is level, as over a right model, it is one vertical shift and the model's own
+shape stays; where it is not, the pictures are right. A model that explains nothing is not used at all.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import Terrain
+from orthoswarm.raster.height_model import HeightModel, KnownGround
+from orthoswarm.refine.surface.corner_lift import mode
+from orthoswarm.refine.surface.smooth_surface import FitSettings
+from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
+
+Array = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
+
+BLOCK_M = 64.0
+"""Windows lie on multiples of this, so that a path that moves by metres does not have the file read again."""
+NODES = 150_000
+"""Nodes of the model in memory for one vehicle."""
+ROUGHER_M = 0.3
+"""If what is left over the model varies by so much more than the ground itself, the model contradicts the pictures."""
+NOISE_M, AROUND = 0.4, 2.0
+"""Differences from a model of this size, over so many nodes around, are the errors of the points' own surface."""
+TRUSTED_M, DOUBTED_M = 0.15, 0.3
+"""Usual difference up to which a model is better than the points' own surface, and from which it is not."""
+LEVEL_KERNEL_M = 0.2
+FEWEST = 60
+"""With fewer points on a model its level is a guess, and it is left out."""
+SEAM_M = 90.0
+"""Over this distance the ground beyond a model is led to its level at the border."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A height model in a local frame.
+
+    Attributes:
+        model: the height model. origin: east and north of the local frame.
+    """
+
+    model: HeightModel
+    origin: tuple[float, float]
+
+    def over(self, bounds: Bounds, most_nodes: int = NODES) -> KnownGround:
+        """Heights over the model's zero on bounds, both in the local frame."""
+        low = [float(np.floor((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[:2], self.origin)]
+        high = [float(np.ceil((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[2:], self.origin)]
+        ground = self.model.window((low[0], low[1], high[0], high[1]), most_nodes)
+        t = ground.terrain
+        return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
+
+    def height(self, xy: Array) -> Array:
+        """Heights (M,) over the model's zero at positions (M, 2)."""
+        ok: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
+        if not ok.any():
+            return np.zeros(len(xy))
+        low, high = np.quantile(xy[ok], [0.01, 0.99], axis=0)
+        ground = self.over((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+        return ground.terrain.height(np.where(ok[:, None], xy, low))
+
+
+@dataclass(frozen=True, slots=True)
+class Stacked:
+    """Ground as the sum of two surfaces."""
+
+    lower: Terrain
+    upper: Terrain
+
+    def height(self, east_north: Array) -> Array:
+        """Heights (...,) at ground points (..., 2)."""
+        return self.lower.height(east_north) + self.upper.height(east_north)
+
+
+@dataclass(frozen=True)
+class GivenFit:
+    """A given ground at the points' level; takes the place of a TerrainFit.
+
+    Attributes:
+        given: the shape. bounds: of the nodes, local frame. most_nodes: how many at most.
+        shift_m: what has to be added to the model's heights.
+        rest: where and by how much the ground differs from the model so shifted.
+        pull_m: how far the robust centre of the points lies over the ground (see TerrainFit).
+        sd_m: standard deviation of the ground over nodes with data.
+        beyond: ground over the model's zero where the model has no heights.
+    """
+
+    given: Given
+    bounds: Bounds
+    most_nodes: int
+    shift_m: float
+    rest: Terrain
+    pull_m: float
+    sd_m: float
+    beyond: Terrain | None = None
+    _made: dict[str, Terrain] = field(default_factory=dict, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the nodes, which are read again from the file where they are needed."""
+        return {**self.__dict__, "_made": {}}
+
+    def prior(self, z0_m: float = 0.0) -> Stacked:
+        """The surface around which point heights are held, the model's zero at z0."""
+        return Stacked(self._shape(), _raised(self.rest, z0_m))
+
+    def rendering(self, lift_m: float = 0.0) -> Terrain:
+        """The ground for rectifying pictures, plus a lift."""
+        if "drawn" not in self._made:
+            shape = self._shape()
+            z = shape.z + self.rest.height(_nodes(shape)) + self.shift_m
+            self._made["drawn"] = replace(shape, z=z.astype(np.float32))
+        return _raised(self._made["drawn"], lift_m) if lift_m else self._made["drawn"]
+
+    def _shape(self) -> Terrain:
+        if "shape" not in self._made:
+            self._made["shape"] = _joined(self.given.over(self.bounds, self.most_nodes), self.beyond)
+        return self._made["shape"]
+
+
+def fit_given(
+    given: Given,
+    points: Array,
+    sigma_z: Array,
+    bounds: Bounds,
+    *,
+    kappa: float | None = None,
+    settings: FitSettings | None = None,
+    most_nodes: int = NODES,
+) -> tuple[GivenFit | None, float]:
+    """Fit the ground under points over a height model (see `fit_terrain` for what is not said here).
+
+    Args:
+        given: the model. points: float64 (P, 3), local frame. bounds: what the ground must cover.
+        most_nodes: how finely the model is read.
+
+    Returns:
+        The fit, None where the model contradicts the points (or has nothing to say); and how far the ground differs
+        from the model, the median over nodes with data.
+    """
+    ground = given.over(bounds, most_nodes)
+    if not ground.known.any():
+        return None, 0.0
+    beyond = None
+    if not ground.known.all():
+        found = fit_terrain(points, sigma_z, bounds, kappa=kappa, settings=settings)
+        on = ground.knows(points[:, :2])
+        if int(on.sum()) < FEWEST:
+            return None, 0.0
+        above = points[on, 2] - ground.terrain.height(points[on, :2])
+        beyond = _raised(found.rendering(), -mode(above, LEVEL_KERNEL_M))
+    shape = _joined(ground, beyond)
+    over = points.copy()
+    over[:, 2] -= shape.height(points[:, :2])
+    left = fit_terrain(over, sigma_z, bounds, kappa=kappa, settings=settings)
+    nodes, known = left.terrain, left.support & ground.knows(_nodes(left.terrain))
+    if not known.any():
+        return None, 0.0
+    sd = float((nodes.z + shape.height(_nodes(nodes)))[known].std())
+    shift = mode(nodes.z[known].astype(np.float64), LEVEL_KERNEL_M)
+    difference = nodes.z - np.float32(shift)
+    off = float(np.median(np.abs(difference[known])))
+    if float(difference[known].std()) > sd + ROUGHER_M:
+        return None, off
+    rest = replace(nodes, z=difference * _believed(difference, left.support, off))
+    good = np.isfinite(over).all(1) & (sigma_z > 0)
+    pull = robust_centre(over[good, 2] - rest.height(over[good, :2]) - shift)
+    return GivenFit(given, bounds, most_nodes, shift, rest, pull, sd, beyond), off
+
+
+def _believed(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
+    """Share (rows, columns) of a difference from the model that is believed: none where it is small around a node.
+
+    A surface through points errs by decimetres, most where they end; a model that agrees with it nearly everywhere is
+    better than that. One that seldom agrees is not.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    noise = NOISE_M * float(np.clip((DOUBTED_M - usual_m) / (DOUBTED_M - TRUSTED_M), 0.25, 1.0))
+    weight = known.astype(np.float64)
+    power = gaussian_filter(weight * difference**2, AROUND) / np.maximum(gaussian_filter(weight, AROUND), 1e-3)
+    return np.asarray(np.maximum(0.0, 1.0 - noise**2 / np.maximum(power, 1e-9)), np.float32)
+
+
+def _raised(terrain: Terrain, by_m: float) -> Terrain:
+    return replace(terrain, z=terrain.z + np.float32(by_m))
+
+
+def _nodes(terrain: Terrain) -> Array:
+    """Positions (rows, columns, 2) of a terrain's nodes."""
+    rows, columns = terrain.z.shape
+    east = terrain.west + terrain.step_m * np.arange(columns)
+    north = terrain.south + terrain.step_m * np.arange(rows)
+    return np.stack(np.meshgrid(east, north), -1)
+
+
+def _joined(ground: KnownGround, beyond: Terrain | None) -> Terrain:
+    """The known heights, and where there are none other ground, led to the known at the border."""
+    t, known = ground.terrain, ground.known
+    if beyond is None or known.all():
+        return t
+    from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+    other = beyond.height(_nodes(t))
+    blur = SEAM_M / 3.0 / t.step_m
+    gap = gaussian_filter(np.where(known, t.z - other, 0.0), blur, mode="nearest")
+    gap /= np.maximum(gaussian_filter(known.astype(np.float64), blur, mode="nearest"), 1e-6)
+    away = distance_transform_edt(~known) * t.step_m
+    other += gap * np.clip(1.0 - away / SEAM_M, 0.0, 1.0)
+    return replace(t, z=np.where(known, t.z, other).astype(np.float32))

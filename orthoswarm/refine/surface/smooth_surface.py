@@ -1,0 +1,377 @@
+"""A smooth surface on regular nodes below points: the least-squares machinery behind the terrain.
+
+Unknowns are the heights of the nodes; points observe them bilinearly, robustly and not alike above and below;
+second differences (xx, yy, sqrt 2 xy) and first differences are held near zero. The normal equations are banded
+along the shorter side of the grid.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+
+Array = NDArray[np.float64]
+
+KAPPAS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Smoothness tried by the hold-out, from smooth to rough: one sigma of the second difference between nodes 30 m apart,
+metres (for other distances it is scaled, so that it means the same ground)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """How a surface is fitted; lengths in metres.
+
+    Attributes:
+        step_m: distance of the nodes.
+        floor_sigma_m: added to every point's own sigma.
+        scale_start_m, scale_end_m: robust scale above the surface in the first and the last solve.
+        below_factor, below_min_m: below the surface the scale is this multiple, but never less than the minimum:
+            equal scales climb roofs at the border. The end scales seek the mode of the heights: 0.6 and 1.5 m let
+            cars and bushes lift the surface by 0.1-0.2 m.
+        solves: number of solves over which the scale shrinks.
+        slope_sigma_m: one sigma of first differences (times min(1, kappa / 0.8)): ground is rather level.
+        level_ratio: sigma of first differences next to nodes without data, as a multiple of kappa: beyond the
+            data the surface goes on level instead of diving.
+        flat_sd_m: relief of this standard deviation or less is taken for noise.
+        render_flat_sd_m: the same for rendering, where following noise costs less than missing relief.
+        held_out_se: the smoothest surface is taken whose error at points left out is within so many standard errors
+            of the best.
+    """
+
+    step_m: float = 30.0
+    floor_sigma_m: float = 0.25
+    scale_start_m: float = 10.0
+    scale_end_m: float = 0.3
+    below_factor: float = 3.0
+    below_min_m: float = 0.8
+    solves: int = 12
+    slope_sigma_m: float = 6.0
+    level_ratio: float = 1.5
+    flat_sd_m: float = 0.5
+    render_flat_sd_m: float = 0.15
+    held_out_se: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Where nodes lie: the first one, their distance and number."""
+
+    west: float
+    south: float
+    step: float
+    columns: int
+    rows: int
+
+    @classmethod
+    def over(cls, bounds: tuple[float, float, float, float], step: float) -> "_Grid":
+        """The nodes on multiples of the step that cover bounds (west, south, east, north)."""
+        west, south = (float(np.floor(v / step) * step) for v in bounds[:2])
+        columns, rows = (int(np.ceil((v - first) / step)) + 1 for v, first in zip(bounds[2:], (west, south)))
+        return cls(west, south, step, max(3, columns), max(3, rows))
+
+    def window(self, column: int, row: int, count: int) -> "_Grid":
+        """At most count cells each way from a node on, within this grid."""
+        c, r = max(column, 0), max(row, 0)
+        columns, rows = min(column + count, self.columns - 1) - c + 1, min(row + count, self.rows - 1) - r + 1
+        return _Grid(self.west + c * self.step, self.south + r * self.step, self.step, max(columns, 3), max(rows, 3))
+
+    def holds(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (P, 3) lie within and have a height."""
+        c, r = (points[:, 0] - self.west) / self.step, (points[:, 1] - self.south) / self.step
+        inside = (c >= 0) & (r >= 0) & (c < self.columns - 1) & (r < self.rows - 1) & np.isfinite(points[:, 2])
+        return np.asarray(inside, np.bool_)
+
+
+@dataclass(slots=True)
+class Surface:
+    """Points on a grid of nodes, ready to be solved for any smoothness; inner is the shorter side of the grid.
+
+    Attributes:
+        columns, rows: number of nodes.
+        cell: int32 (P,), first node of the cell of each point, in the solver's order.
+        share: float64 (P, 2), place within the cell, inner and outer.
+        z: float64 (P,), heights; sigma: their sigma.
+        base: float64 (P,), weight of a point on the surface; 0 for points that do not count.
+        support: bool (N,), nodes that have data in a cell next to them.
+        curvature, slope, level: float64 (N + 4, band + 4), penalties for unit sigma, see `solve_banded`.
+    """
+
+    columns: int
+    rows: int
+    cell: NDArray[np.int32]
+    share: Array
+    z: Array
+    sigma: Array
+    base: Array
+    support: NDArray[np.bool_]
+    curvature: Array
+    slope: Array
+    level: Array
+    settings: FitSettings
+
+    @classmethod
+    def over(cls, points: Array, sigma_z: Array, grid: _Grid, s: FitSettings) -> "Surface":
+        """Set up the nodes of a grid; points (P, 3) outside or without a sigma do not count."""
+        columns, rows = grid.columns, grid.rows
+        c, r = (points[:, 0] - grid.west) / s.step_m, (points[:, 1] - grid.south) / s.step_m
+        good = grid.holds(points) & (sigma_z > 0)
+        inner, outer = sorted((columns, rows))
+        if columns > rows:
+            c, r = r, c
+        c, r = np.where(good, c, 0.0), np.where(good, r, 0.0)
+        ci, ri = np.floor(c), np.floor(r)
+        cell = np.asarray(ri * inner + ci, np.int32)
+        support: NDArray[np.bool_] = np.zeros(inner * outer, np.bool_)
+        for k in (0, 1, inner, inner + 1):
+            support[cell[good] + k] = True
+        size = (inner * outer + 4, 2 * inner + 4)
+        curvature, slope, level = np.zeros(size), np.zeros(size), np.zeros(size)
+        _penalties(inner, outer, support, curvature, slope, level)
+        return cls(
+            columns=columns, rows=rows, cell=cell, share=np.stack([c - ci, r - ri], 1),
+            z=np.where(good, points[:, 2], 0.0), sigma=np.where(good, sigma_z, 1.0),
+            base=np.where(good, 1.0 / (sigma_z**2 + s.floor_sigma_m**2), 0.0),
+            support=support, curvature=curvature, slope=slope, level=level, settings=s,
+        )  # fmt: skip
+
+    @property
+    def inner(self) -> int:
+        """Nodes along the shorter side."""
+        return min(self.columns, self.rows)
+
+    def grid(self, nodes: NDArray[Any]) -> NDArray[Any]:
+        """Node values (rows, columns), rows going north."""
+        g = nodes.reshape(-1, self.inner)
+        return np.ascontiguousarray(g.T) if self.columns > self.rows else g
+
+    def solve(self, kappa: float, base: Array | None = None, solves: int | None = None) -> Array:
+        """Heights of the nodes (N,), in the solver's order, for one smoothness."""
+        s, inner = self.settings, self.inner
+        base = self.base if base is None else base
+        ratio = s.step_m / 30.0
+        slope_sigma = s.slope_sigma_m * min(1.0, kappa / 0.8) * ratio
+        kappa *= ratio**2
+        penalty = self.curvature / kappa**2 + self.slope / slope_sigma**2 + self.level / (s.level_ratio * kappa) ** 2
+        band, rhs = np.empty_like(penalty), np.empty(len(self.support))
+        start = float(np.median(self.z[base > 0]))
+        z, weight = np.full(len(rhs), start), np.empty(len(base))
+        for scale in np.geomspace(s.scale_start_m, s.scale_end_m, solves or s.solves):
+            below = max(s.below_factor * scale, s.below_min_m)
+            _robust(z, self.cell, self.share, inner, self.z, self.sigma, scale, below, weight)
+            _assemble(penalty, self.cell, self.share, inner, self.z - start, base * weight, band, rhs)
+            solve_banded(band, 2 * inner, rhs)
+            z = rhs + start
+        return z
+
+    def choose_kappa(self) -> float:
+        """The smoothest surface whose error at points left out is about that of the best (settings.held_out_se).
+
+        Every fourth point is left out. The best itself would be too rough: rubble is rough and real, but no ground.
+        """
+        s = self.settings
+        out = np.flatnonzero(self.base > 0)[3::4]
+        if len(out) < 10:
+            return KAPPAS[0]
+        base = self.base.copy()
+        base[out] = 0.0
+        costs: list[Array] = []
+        mean: list[float] = []
+        for kappa in KAPPAS:
+            z = self.solve(kappa, base, max(6, 2 * s.solves // 3))
+            e = self.z[out] - _interpolate(z, self.cell[out], self.share[out], self.inner)
+            q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
+            costs.append(q / (1.0 + q))
+            mean.append(float(costs[-1].mean()))
+            if min(mean[-2:]) > min(mean):  # rougher twice in vain
+                break
+        best = int(np.argmin(mean))
+        limit = mean[best] + s.held_out_se * float(costs[best].std()) / np.sqrt(len(out))
+        return KAPPAS[next(i for i, m in enumerate(mean) if m <= limit)]
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """A solved surface: first node, heights (rows, columns; rows go north), nodes that have data next to them."""
+
+    west: float
+    south: float
+    z: Array
+    support: NDArray[np.bool_]
+    kappa: float
+
+
+def fit_nodes(
+    points: Array,
+    sigma_z: Array,
+    bounds: tuple[float, float, float, float],
+    kappa: float | None,
+    s: FitSettings,
+    *,
+    core: int = 40,
+    overlap: int = 8,
+) -> Nodes | None:
+    """Solve for nodes that cover bounds; None without a point. Large areas in overlapping tiles, blended.
+
+    The band's cost grows with the square of the shorter side, and ground 8 nodes away has no influence where there
+    is data. The smoothness of tiles is the median of what the four fullest ask for.
+    """
+    grid = _Grid.over(bounds, s.step_m)
+    if max(grid.columns, grid.rows) <= core + 3 * overlap:
+        surface = Surface.over(points, sigma_z, grid, s)
+        if not (surface.base > 0).any():
+            return None
+        kappa = kappa or surface.choose_kappa()
+        return Nodes(grid.west, grid.south, surface.grid(surface.solve(kappa)), surface.grid(surface.support), kappa)
+    tiles = []
+    for row in range(0, grid.rows - 1, core):
+        for column in range(0, grid.columns - 1, core):
+            part = grid.window(column - overlap, row - overlap, core + 2 * overlap)
+            inside = part.holds(points)
+            if inside.any():
+                tiles.append((part, inside))
+    if not tiles:
+        return None
+    if kappa is None:
+        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[:4]
+        asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
+        kappa = sorted(asked)[len(asked) // 2]
+    total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))
+    support: NDArray[np.bool_] = np.zeros((grid.rows, grid.columns), np.bool_)
+    for part, inside in tiles:
+        surface = Surface.over(points[inside], sigma_z[inside], part, s)
+        r, c = round((part.south - grid.south) / s.step_m), round((part.west - grid.west) / s.step_m)
+        at = (slice(r, r + part.rows), slice(c, c + part.columns))
+        ramp = np.multiply.outer(_ramp(part.rows, 2 * overlap), _ramp(part.columns, 2 * overlap))
+        total[at] += ramp * surface.grid(surface.solve(kappa))
+        weight[at] += ramp
+        support[at] |= surface.grid(surface.support)
+    return Nodes(grid.west, grid.south, _blended(total, weight), support, kappa)
+
+
+def _ramp(count: int, reach: int) -> Array:
+    """Weights of a tile's nodes along one side: small at its ends, 1 from `reach` nodes on."""
+    k = np.arange(count)
+    return np.asarray(np.minimum(np.minimum(k, k[::-1]) + 0.1, reach) / reach, np.float64)
+
+
+def _blended(total: Array, weight: Array) -> Array:
+    from scipy.ndimage import distance_transform_edt
+
+    z = total / np.where(weight > 0, weight, 1.0)
+    if (weight > 0).all():
+        return z
+    nearest = distance_transform_edt(weight == 0, return_distances=False, return_indices=True)
+    return np.asarray(z[tuple(nearest)])
+
+
+def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) -> Array:
+    c, r = share[:, 0], share[:, 1]
+    low = z[cell] * (1 - c) + z[cell + 1] * c
+    return np.asarray(low * (1 - r) + (z[cell + inner] * (1 - c) + z[cell + inner + 1] * c) * r)
+
+
+@kernel
+def solve_banded(a, width, x):  # type: ignore[no-untyped-def]
+    """Solve a symmetric positive definite banded system in place: Cholesky, four columns at a time.
+
+    A kernel of its own because a threaded LAPACK is slow on small bands and rounds differently with each number of
+    threads.
+
+    Args:
+        a: float64 (n + 4, width + 4), a[i, k] = A[i, i + k], zero beyond the band and in the last four rows;
+            overwritten by the factor.
+        width: number of diagonals above the main one.
+        x: float64 (n,), right-hand side; overwritten by the solution.
+    """
+    n = len(x)
+    for i in range(0, n, 4):
+        for p in range(min(4, n - i)):
+            column = a[i + p]
+            d = 1.0 / np.sqrt(max(column[0], 1e-300))
+            for k in range(width + 1):
+                column[k] *= d
+            for k in range(1, min(4 - p, n - i - p)):
+                f, t = column[k], a[i + p + k]
+                for j in range(width + 1 - k):
+                    t[j] -= f * column[k + j]
+        c0, c1, c2, c3 = a[i], a[i + 1], a[i + 2], a[i + 3]
+        for k in range(4, min(width + 4, n - i)):
+            t = a[i + k]
+            f0, f1, f2, f3 = c0[k], c1[k - 1], c2[k - 2], c3[k - 3]
+            o1, o2, o3 = k - 1, k - 2, k - 3
+            for j in range(width + 4 - k):
+                t[j] -= f0 * c0[k + j] + f1 * c1[o1 + j] + f2 * c2[o2 + j] + f3 * c3[o3 + j]
+    for i in range(n):
+        x[i] /= a[i, 0]
+        for k in range(1, min(width, n - 1 - i) + 1):
+            x[i + k] -= a[i, k] * x[i]
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for k in range(1, min(width, n - 1 - i) + 1):
+            total -= a[i, k] * x[i + k]
+        x[i] = total / a[i, 0]
+
+
+@kernel
+def _robust(z, cell, share, inner, height, sigma, above, below, weight):  # type: ignore[no-untyped-def]
+    """Geman-McClure weights of residuals, each scale widened by the point's own sigma."""
+    for m in range(len(cell)):
+        i, c, r = cell[m], share[m, 0], share[m, 1]
+        low = z[i] * (1.0 - c) + z[i + 1] * c
+        high = z[i + inner] * (1.0 - c) + z[i + inner + 1] * c
+        e = height[m] - low * (1.0 - r) - high * r
+        scale = above if e > 0.0 else below
+        q = 1.0 + e * e / (scale * scale + sigma[m] * sigma[m])
+        weight[m] = 1.0 / (q * q)
+
+
+@kernel
+def _assemble(penalty, cell, share, inner, height, weight, band, rhs):  # type: ignore[no-untyped-def]
+    """Normal equations: penalty plus weighted bilinear observations; band[i, k] = A[i, i + k]."""
+    band[:] = penalty
+    rhs[:] = 0.0
+    b = np.empty(4)
+    node = np.empty(4, np.int64)
+    for m in range(len(cell)):
+        c, r, w = share[m, 0], share[m, 1], weight[m]
+        if w == 0.0:
+            continue
+        b[0], b[1], b[2], b[3] = (1.0 - c) * (1.0 - r), c * (1.0 - r), (1.0 - c) * r, c * r
+        node[0], node[1], node[2], node[3] = cell[m], cell[m] + 1, cell[m] + inner, cell[m] + inner + 1
+        for i in range(4):
+            rhs[node[i]] += w * b[i] * height[m]
+            for j in range(i, 4):
+                band[node[i], node[j] - node[i]] += w * b[i] * b[j]
+
+
+@kernel
+def _add_row(band, nodes, values):  # type: ignore[no-untyped-def]
+    for i in range(len(nodes)):
+        for j in range(len(nodes)):
+            if nodes[j] >= nodes[i] and values[i] != 0.0 and values[j] != 0.0:
+                band[nodes[i], nodes[j] - nodes[i]] += values[i] * values[j]
+
+
+@kernel
+def _penalties(inner, outer, support, curvature, slope, level):  # type: ignore[no-untyped-def]
+    """Squares of second and first differences; first differences at nodes without data go to `level`."""
+    three, four = np.array([1.0, -2.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0]) * np.sqrt(2.0)
+    two = np.array([-1.0, 1.0])
+    for r in range(outer):
+        for c in range(inner):
+            i = r * inner + c
+            if c + 2 < inner:
+                _add_row(curvature, np.array([i, i + 1, i + 2]), three)
+            if r + 2 < outer:
+                _add_row(curvature, np.array([i, i + inner, i + 2 * inner]), three)
+            if c + 1 < inner and r + 1 < outer:
+                _add_row(curvature, np.array([i, i + 1, i + inner, i + inner + 1]), four)
+            for step in (1, inner):
+                if (step == 1 and c + 1 < inner) or (step == inner and r + 1 < outer):
+                    pair = np.array([i, i + step])
+                    _add_row(slope, pair, two)
+                    if not (support[i] and support[i + step]):
+                        _add_row(level, pair, two)

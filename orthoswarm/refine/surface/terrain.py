@@ -1,0 +1,161 @@
+"""The ground under the pictures: a smooth surface below the points, and whether it is more than a plane.
+
+Points of a reconstruction lie on the ground and on everything that stands on it, so the surface is fitted from
+below: far points above it lose their weight first. Heights and the nodes share the datum of the cameras.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.placement import Terrain
+from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class TerrainFit:
+    """A fitted surface and what the adjustment and the renderer make of it.
+
+    Attributes:
+        terrain: the surface T as fitted (not shrunk).
+        weight: float64 (P,), final robust weight (0 to 1) of each point as ground: 1 on T, near 0 on a roof.
+        kappa: smoothness, sigma of the second difference between nodes 30 m apart, metres.
+        sd_m: standard deviation of T over nodes with data; median_m: its median there.
+        ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
+            the mode of the heights (rubble, cars and bushes only lift points, nothing digs them in).
+        pull_m: how far the robust centre (scale 2 m) of the points lies over that ground; a height prior around
+            level + pull lets the ground itself settle at the level.
+        support: bool (rows, columns), nodes that have data in a cell next to them.
+        settings: how it was fitted.
+    """
+
+    terrain: Terrain
+    weight: Array
+    kappa: float
+    sd_m: float
+    median_m: float
+    ground_m: float
+    pull_m: float
+    support: NDArray[np.bool_]
+    settings: FitSettings = field(default_factory=FitSettings)
+
+    @property
+    def shrink(self) -> float:
+        """Share of the relief that is believed by the height prior, 0 to 1."""
+        return _shrink(self.sd_m, self.settings.flat_sd_m)
+
+    @property
+    def is_flat(self) -> bool:
+        """True where the relief cannot be told from noise, so that the prior is a level plane."""
+        return self.shrink == 0.0
+
+    def prior(self, z0_m: float = 0.0) -> Terrain:
+        """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
+
+        With z0 = level + pull the ground itself settles at the level, and not the centre of all points.
+        """
+        return _about(self.terrain, self.median_m, self.shrink, z0_m)
+
+    def rendering(self, lift_m: float = 0.0) -> Terrain:
+        """T shrunk about its own median for rectifying pictures (never about zero), plus a lift."""
+        s = _shrink(self.sd_m, self.settings.render_flat_sd_m)
+        return _about(self.terrain, self.median_m, s, self.median_m + lift_m)
+
+
+def fit_terrain(
+    points: Array,
+    sigma_z: Array,
+    bounds: tuple[float, float, float, float],
+    *,
+    kappa: float | None = None,
+    settings: FitSettings | None = None,
+) -> TerrainFit:
+    """Fit the ground under points that lie on it and on things above it.
+
+    Bilinear nodes; penalties on second differences (xx, yy, sqrt 2 xy; sigma kappa) and on first differences;
+    Geman-McClure weights with a scale that shrinks over the solves and is wider below than above the surface.
+
+    Args:
+        points: float64 (P, 3), east, north, up in metres.
+        sigma_z: float64 (P,), one sigma of each height.
+        bounds: west, south, east, north that the nodes must cover (points outside are not used).
+        kappa: smoothness; None finds it by hold-out of every fourth point.
+        settings: lengths and scales.
+
+    Raises:
+        OrthoSwarmError: if no point lies within the bounds.
+    """
+    s = settings or FitSettings()
+    points, sigma_z = np.asarray(points, float).reshape(-1, 3), np.asarray(sigma_z, float)
+    nodes = fit_nodes(points, sigma_z, bounds, kappa, s)
+    if nodes is None:
+        raise OrthoSwarmError("no adjusted point lies on the area, so no terrain can be fitted; give one by --dem")
+    terrain = Terrain(nodes.west, nodes.south, s.step_m, nodes.z.astype(np.float32))
+    rows, columns = nodes.z.shape
+    c, r = (points[:, 0] - nodes.west) / s.step_m, (points[:, 1] - nodes.south) / s.step_m
+    used = (c >= 0) & (r >= 0) & (c < columns - 1) & (r < rows - 1) & np.isfinite(points[:, 2]) & (sigma_z > 0)
+    above = points[used, 2] - terrain.height(points[used, :2])
+    scale = np.where(above > 0, s.scale_end_m, s.below_min_m)
+    weight = np.zeros(len(points))
+    weight[used] = 1.0 / (1.0 + above**2 / (scale**2 + sigma_z[used] ** 2)) ** 2
+    sd, median = float(nodes.z[nodes.support].std()), float(np.median(nodes.z[nodes.support]))
+    flat = _shrink(sd, s.flat_sd_m) == 0.0
+    ground = lower_flank(points[used, 2], sigma_z[used]) if flat else median
+    pull = robust_centre(points[used, 2] - ground if flat else above)
+    return TerrainFit(terrain, weight, nodes.kappa, sd, median, ground, pull, nodes.support, s)
+
+
+def lower_flank(height: Array, sigma: Array | None = None, kernel_m: float = 0.15) -> float:
+    """Level of the ground among heights of which most are on it and the rest above it.
+
+    The half-maximum point on the lower side of the mode, moved up by the half width that a peak of the heights' own
+    noise would have: a symmetric peak returns its mode, one that is smeared upwards returns its lower edge. Of
+    several peaks the lowest counts that has at least 0.4 of the highest one's density: corners crowd on car roofs.
+    """
+    z = np.asarray(height, float)
+    if len(z) == 0:
+        return 0.0
+    centre = float(np.median(z))
+    z = z[np.abs(z - centre) < 15.0]
+    edges = np.arange(-15.5, 15.55, 0.05)
+    counts = np.histogram(z - centre, edges)[0].astype(float)
+    reach = np.arange(-int(5 * kernel_m / 0.05), int(5 * kernel_m / 0.05) + 1) * 0.05
+    density = np.convolve(counts, np.exp(-0.5 * (reach / kernel_m) ** 2), mode="same")
+    peak = np.r_[False, (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:]), False]
+    peak &= density >= 0.4 * density.max()
+    top = int(np.flatnonzero(peak)[0]) if peak.any() else int(density.argmax())
+    below = np.flatnonzero(density[:top] < 0.5 * density[top])
+    if len(below) == 0:
+        return centre + float(edges[top]) + 0.025
+    i = int(below[-1])
+    part = (0.5 * density[top] - density[i]) / max(density[i + 1] - density[i], 1e-12)
+    flank = edges[i] + 0.025 + 0.05 * part
+    mode = edges[top] + 0.025
+    noise = kernel_m
+    if sigma is not None and len(sigma):
+        noise = float(np.hypot(kernel_m, np.median(sigma)))
+    return centre + float(min(flank + 1.1774 * noise, mode))
+
+
+def robust_centre(x: Array, scale_m: float = 2.0, rounds: int = 20) -> float:
+    """Geman-McClure centre of values, started at their median."""
+    if len(x) == 0:
+        return 0.0
+    c = float(np.median(x))
+    for _ in range(rounds):
+        w = 1.0 / (1.0 + ((x - c) / scale_m) ** 2) ** 2
+        c = float((w * x).sum() / w.sum())
+    return c
+
+
+def _shrink(sd: float, noise: float) -> float:
+    return max(0.0, 1.0 - (noise / max(sd, 1e-9)) ** 2)
+
+
+def _about(terrain: Terrain, median: float, share: float, level: float) -> Terrain:
+    z = share * (terrain.z.astype(np.float64) - median) + level
+    return Terrain(terrain.west, terrain.south, terrain.step_m, z.astype(np.float32))

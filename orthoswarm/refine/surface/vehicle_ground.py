@@ -1,0 +1,99 @@
+"""The ground under one vehicle during its adjustment: fitted to the points, used as their height prior."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import Terrain
+from orthoswarm.oldpickles import set_fields
+from orthoswarm.refine.bundle.adjustment import Adjustment, Ground
+from orthoswarm.refine.surface.given_dem import Given, GivenFit, fit_given
+from orthoswarm.refine.surface.smooth_surface import FitSettings
+from orthoswarm.refine.surface.terrain import TerrainFit, fit_terrain
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GroundModel:
+    """Ground as it is believed now.
+
+    Attributes:
+        fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`, or has
+            the given shape).
+        level_m: height that the middle of the ground should have (0: the takeoff level).
+        lift_m: ground between the points over the fitted surface (corners sit on raised things, so it is negative).
+        given: shape of the ground from outside, None to find it from the points.
+        contradicted_m: how far the ground is from the shape that was given but is not used any more, median.
+    """
+
+    fit: TerrainFit | GivenFit | None = None
+    level_m: float = 0.0
+    lift_m: float = 0.0
+    given: Given | None = None
+    contradicted_m: float = 0.0
+
+    def __setstate__(self, state: Any) -> None:
+        """From a pickle, perhaps of an earlier version."""
+        set_fields(self, state)
+
+    def height(self, xy: Array) -> Array:
+        """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""
+        if self.fit is None:
+            return self._begun(xy)
+        return np.asarray(self.terrain().height(xy))
+
+    def terrain(self) -> Terrain:
+        """The ground for rectifying pictures."""
+        return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.lift_m)
+
+    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> Ground:
+        """The height prior of points (P, 3)."""
+        if self.fit is None:
+            expected = self._begun(points[:, :2])
+        else:
+            expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
+        return Ground(expected, sigma_m, 20.0, c)
+
+    def _begun(self, xy: Array) -> Array:
+        level = np.full(len(xy), self.level_m)
+        return level if self.given is None else level + self.given.height(xy)
+
+
+def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:
+    """Points fit for the terrain, float64 (K, 3), and one sigma of their heights (K,)."""
+    n = len(adjustment.points)
+    point = adjustment.tracks.point
+    total = np.maximum(np.bincount(point, minlength=n), 1)
+    weight = np.bincount(point, adjustment.obs_weight, minlength=n) / total
+    sigma = np.sqrt(np.maximum(adjustment.point_inverse[:, 2, 2], 0.0))
+    good = (total >= min_observations) & (weight > 0.6) & (sigma < 1.5) & (sigma > 0)
+    return adjustment.points[good], sigma[good]
+
+
+def fit_surface(
+    adjustment: Adjustment,
+    before: GroundModel,
+    *,
+    kappa: float | None = None,
+    extra: tuple[Array, Array] | None = None,
+    settings: FitSettings | None = None,
+) -> GroundModel:
+    """Fit the ground to the points now (and to extra ones with their sigmas); few points leave it as it was."""
+    points, sigma = ground_points(adjustment)
+    if extra is not None:
+        points, sigma = np.concatenate([points, extra[0]]), np.concatenate([sigma, extra[1]])
+    if len(points) < 60:
+        return before
+    position = adjustment.rig.position[:, :2]
+    reach = 0.9 * float(np.median(adjustment.rig.position[:, 2])) * 1.2
+    low, high = position.min(0) - reach, position.max(0) + reach
+    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    if before.given is not None:
+        fit, off = fit_given(before.given, points, sigma, bounds, kappa=kappa, settings=settings)
+        if fit is not None:
+            return replace(before, fit=fit)
+        before = replace(before, given=None, contradicted_m=off)  # for good: its level is another than the points' own
+    return replace(before, fit=fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings))

@@ -1,0 +1,304 @@
+"""Compiled parts of the vertical line locus: choice of pictures, rectified strips, correlation, peaks.
+
+Cameras come as the arrays of a Rig; `plane` is float64 (C, 3): terrain height and slope (east, north) at each cell.
+"""
+
+import numpy as np
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.raster.subpixel_peak import vertex
+from orthoswarm.refine.bundle.block_arrays import project_point
+
+ENOUGH = 3
+"""Partners of a reference below which other legs are asked for some."""
+
+
+@kernel
+def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped-def]
+    """True where a camera sees a patch of this half width whole (its diagonal counts)."""
+    u, v = project_point(position, rotation, lens, x, y, z)
+    margin = 1.42 * half_m * lens[0] / max(position[2] - z, 1.0) + 1.5
+    return u > margin and v > margin and u < lens[6] - 1.0 - margin and v < lens[7] - 1.0 - margin
+
+
+@kernel
+def choose(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, ref, partner
+):
+    """For each cell the nearest-nadir picture and its partners: those closest to the wished signed baselines."""
+    for c in range(len(cells)):
+        x, y, z = cells[c, 0], cells[c, 1], plane[c, 0]
+        best, r = np.inf, -1
+        for k in range(len(key)):
+            i = key[k]
+            d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
+            if d < best and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                best, r = d, k
+        if r < 0:
+            continue
+        ref[c] = key[r]
+        first, last = r, r
+        while first > 0 and leg[first - 1] == leg[r]:
+            first -= 1
+        while last + 1 < len(key) and leg[last + 1] == leg[r]:
+            last += 1
+        for w in range(len(wished)):
+            nearest, choice = np.inf, -1
+            for k in range(first, last + 1):
+                b = along[k] - along[r]
+                if b * wished[w] <= 0.0 or abs(b) < least or abs(b - wished[w]) >= nearest:
+                    continue
+                i = key[k]
+                taken = False
+                for q in range(w):
+                    taken = taken or partner[c, q] == i
+                if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                    nearest, choice = abs(b - wished[w]), i
+            partner[c, w] = choice
+        _fill_from_other_legs(
+            position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner[c]
+        )
+
+
+@kernel
+def _fill_from_other_legs(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner
+):
+    """Where the reference's own leg ends before ENOUGH partners are found, those of other legs that see best."""
+    count, reach = 0, 0.0
+    for w in range(len(wished)):
+        count += partner[w] >= 0
+        reach = max(reach, abs(wished[w]))
+    o = key[r]
+    while count < ENOUGH:
+        best, choice = np.inf, -1
+        for k in range(len(key)):
+            i = key[k]
+            if leg[k] == leg[r]:
+                continue
+            b = np.sqrt((position[i, 0] - position[o, 0]) ** 2 + (position[i, 1] - position[o, 1]) ** 2)
+            d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
+            if b < least or b > reach or d >= best:
+                continue
+            taken = False
+            for w in range(len(wished)):
+                taken = taken or partner[w] == i
+            if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                best, choice = d, i
+        if choice < 0:
+            return
+        for w in range(len(wished)):
+            if partner[w] < 0:
+                partner[w] = choice
+                break
+        count += 1
+
+
+@kernel
+def _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, h):  # type: ignore[no-untyped-def]
+    """Where a partner's (p) ray meets the plane, for the point at height h over it on the reference's (c) ray.
+
+    The plane goes through (x, y, z) with slope (gx, gy), and the reference's ray through that point.
+    """
+    hc = cz - z - gx * (cx - x) - gy * (cy - y)
+    t = (hc - h) / hc
+    qx, qy = cx + t * (x - cx), cy + t * (y - cy)
+    hp = pz - z - gx * (px - x) - gy * (py - y)
+    s = hp / (hp - h)
+    return px + s * (qx - px), py + s * (qy - py)
+
+
+@kernel
+def _rectify(  # type: ignore[no-untyped-def]
+    image, factor, rows, columns, position, rotation, lens, x, y, plane, ex, ey, step, half_u, half_v, out
+):
+    """Sample a picture on a plane: out[j, i] at (i - half_u) step along e and (j - half_v) step across it.
+
+    Nine projections and biquadratic interpolation between them: exact to 0.01 px over such small windows. Returns
+    the first and last column that lie in the picture in every row (first > last: none).
+    """
+    u, v = np.empty((3, 3)), np.empty((3, 3))
+    for a in range(3):
+        for b in range(3):
+            s, t = (b - 1) * half_u * step, (a - 1) * half_v * step
+            px, py = s * ex - t * ey, s * ey + t * ex
+            pu, pv = project_point(position, rotation, lens, x + px, y + py, plane[0] + plane[1] * px + plane[2] * py)
+            if np.isnan(pu):
+                return 1, 0
+            u[a, b], v[a, b] = (pu + 0.5) / factor - 0.5, (pv + 0.5) / factor - 0.5
+    first, last = 0, 2 * half_u
+    for j in range(2 * half_v + 1):
+        t = (j - half_v) / half_v
+        c0, c1, c2 = 0.5 * t * (t - 1.0), 1.0 - t * t, 0.5 * t * (t + 1.0)
+        ul, vl = c0 * u[0, 0] + c1 * u[1, 0] + c2 * u[2, 0], c0 * v[0, 0] + c1 * v[1, 0] + c2 * v[2, 0]
+        um, vm = c0 * u[0, 1] + c1 * u[1, 1] + c2 * u[2, 1], c0 * v[0, 1] + c1 * v[1, 1] + c2 * v[2, 1]
+        ur, vr = c0 * u[0, 2] + c1 * u[1, 2] + c2 * u[2, 2], c0 * v[0, 2] + c1 * v[1, 2] + c2 * v[2, 2]
+        ua, ub, va, vb = 0.5 * (ur - ul), 0.5 * (ur + ul) - um, 0.5 * (vr - vl), 0.5 * (vr + vl) - vm
+        while first <= last and not _inside(first, half_u, um, ua, ub, vm, va, vb, rows, columns):
+            first += 1
+        while first <= last and not _inside(last, half_u, um, ua, ub, vm, va, vb, rows, columns):
+            last -= 1
+        if _leaves(first, last, half_u, um, ua, ub, columns) or _leaves(first, last, half_u, vm, va, vb, rows):
+            return 1, 0
+        for i in range(first, last + 1):
+            s = (i - half_u) / half_u
+            uu, vv = um + s * (ua + s * ub), vm + s * (va + s * vb)
+            iu, iv = int(uu), int(vv)
+            fu, fv = np.float32(uu - iu), np.float32(vv - iv)
+            p, q = np.float32(image[iv, iu]), np.float32(image[iv, iu + 1])
+            c, d = np.float32(image[iv + 1, iu]), np.float32(image[iv + 1, iu + 1])
+            low = p + fu * (q - p)
+            out[j, i] = low + fv * (c + fu * (d - c) - low)
+    return first, last
+
+
+@kernel
+def _inside(i, half_u, um, ua, ub, vm, va, vb, rows, columns):  # type: ignore[no-untyped-def]
+    s = (i - half_u) / half_u
+    u, v = um + s * (ua + s * ub), vm + s * (va + s * vb)
+    return u >= 0.0 and v >= 0.0 and u < columns - 1.0 and v < rows - 1.0
+
+
+@kernel
+def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-untyped-def]
+    """True where a row that begins and ends in the picture bends out of it in between (on a cliff)."""
+    if bend == 0.0:
+        return False
+    s = -0.5 * slope / bend
+    if not (first - half_u <= s * half_u <= last - half_u):
+        return False
+    extreme = middle + 0.5 * s * slope
+    return not (extreme >= 0.0 and extreme < size - 1.0)
+
+
+@kernel
+def _zncc_along(patch, strip, first, last, score):  # type: ignore[no-untyped-def]
+    """Normalised correlation of a square patch with every place in a strip; NaN where the strip has no data."""
+    n = len(patch)
+    count = np.float32(n * n)
+    mean = np.float32(patch.sum()) / count
+    energy = np.float32(0.0)
+    for j in range(n):
+        for i in range(n):
+            patch[j, i] -= mean
+            energy += patch[j, i] * patch[j, i]
+    score[:] = np.nan
+    if energy < 2.0 * count:  # grey values vary by less than the noise of a JPEG: nothing to find
+        return
+    for k in range(first, last - n + 2):
+        dot, total, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for j in range(n):
+            for i in range(n):
+                q = strip[j, k + i] - mean
+                dot += patch[j, i] * q
+                total += q
+                square += q * q
+        score[k] = dot / np.sqrt(energy * max(square - total * total / count, count))
+
+
+@kernel
+def _pair(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, stack, slot, factor, x, y, plane, r, p, heights, half, step, total, seen
+):
+    """Add one partner's correlation at each height to `total` and count it in `seen`."""
+    n, top = 2 * half + 1, heights[-1]
+    cx, cy, cz = position[r]
+    px, py, pz = position[p]
+    z, gx, gy = plane
+    lowest = min(cz - gx * (cx - x) - gy * (cy - y), pz - gx * (px - x) - gy * (py - y)) - z
+    if lowest < 1.5 * top:  # the sweep would pass the cameras
+        return
+    ax, ay = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, -top)
+    bx, by = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, top)
+    length = np.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+    if not length > 2.0 * step:  # no parallax
+        return
+    ex, ey = (bx - ax) / length, (by - ay) / length
+    low, high = (ax - x) * ex + (ay - y) * ey, (bx - x) * ex + (by - y) * ey
+    reach = int(max(-low, high) / step) + 3
+    half_u = half + reach
+    lr, lp, fr, fp = lens[lens_id[r]], lens[lens_id[p]], factor[lens_id[r]], factor[lens_id[p]]
+    patch, strip = np.empty((n, n), np.float32), np.empty((n, 2 * half_u + 1), np.float32)
+    a, b = _rectify(
+        stack[slot[r]], fr, int(lr[7] / fr), int(lr[6] / fr), position[r], rotation[r], lr, x, y, plane,
+        ex, ey, step, half, half, patch,
+    )  # fmt: skip
+    if a > 0 or b < n - 1:
+        return
+    a, b = _rectify(
+        stack[slot[p]], fp, int(lp[7] / fp), int(lp[6] / fp), position[p], rotation[p], lp, x, y, plane,
+        ex, ey, step, half_u, half, strip,
+    )  # fmt: skip
+    score = np.empty(2 * reach + 1, np.float32)
+    _zncc_along(patch, strip, a, b, score)
+    for h in range(len(heights)):
+        qx, qy = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, heights[h])
+        s = ((qx - x) * ex + (qy - y) * ey) / step + reach
+        i = int(s)
+        if i < 1 or i + 2 > 2 * reach:
+            continue
+        f, s0, s1, s2, s3 = s - i, score[i - 1], score[i], score[i + 1], score[i + 2]
+        value = s1 + 0.5 * f * (  # Catmull-Rom: linear interpolation would pull peaks to the samples
+            s2 - s0 + f * (2.0 * s0 - 5.0 * s1 + 4.0 * s2 - s3 + f * (3.0 * (s1 - s2) + s3 - s0))
+        )
+        if not np.isnan(value):
+            total[h] += value
+            seen[h] += 1
+
+
+@kernel
+def correlate(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, stack, slot, factor, cells, plane, ref, partner, heights, half, step, curve
+):
+    """Mean normalised correlation over partners for each cell and height; NaN with fewer than two partners."""
+    total, seen = np.empty(len(heights)), np.empty(len(heights), np.int64)
+    for c in range(len(cells)):
+        total[:], seen[:] = 0.0, 0
+        for k in range(partner.shape[1]):
+            if partner[c, k] >= 0:
+                _pair(
+                    position, rotation, lens_id, lens, stack, slot, factor, cells[c, 0], cells[c, 1], plane[c],
+                    ref[c], partner[c, k], heights, half, step, total, seen,
+                )  # fmt: skip
+        for h in range(len(heights)):
+            curve[c, h] = total[h] / seen[h] if seen[h] >= 2 else np.nan
+
+
+@kernel
+def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyped-def]
+    """Height and score of each curve's peak; score -1 where it lies at the end, or where a rival is as good.
+
+    Neither counts a curve that is not known over the inner half of the heights: its true peak may be in the gap.
+    """
+    step = heights[1] - heights[0]
+    for c in range(len(curve)):
+        best, at = -2.0, -1
+        for h in range(len(heights)):
+            if curve[c, h] > best:
+                best, at = curve[c, h], h
+        found[c, 0], found[c, 1] = 0.0, -1.0
+        if at < 1 or at > len(heights) - 2:
+            continue
+        left, right = curve[c, at - 1], curve[c, at + 1]
+        if np.isnan(left) or np.isnan(right):
+            continue
+        ambiguous = False
+        for h in range(len(heights)):
+            if np.isnan(curve[c, h]) and 2.0 * abs(heights[h]) <= heights[-1]:
+                ambiguous = True
+            if abs(heights[h] - heights[at]) > rival_m and curve[c, h] > rival_share * best:
+                ambiguous = True
+        if not ambiguous and left + right < 2.0 * best:
+            found[c, 0] = heights[at] + step * vertex(left, best, right)
+            found[c, 1] = best
+
+
+@kernel
+def raise_points(position, ref, cells, plane, height, points):  # type: ignore[no-untyped-def]
+    """Points at heights over the cells' planes, on the rays of the reference cameras through the cells."""
+    for m in range(len(cells)):
+        cx, cy, cz = position[ref[m]]
+        x, y, z, gx, gy = cells[m, 0], cells[m, 1], plane[m, 0], plane[m, 1], plane[m, 2]
+        above = cz - z - gx * (cx - x) - gy * (cy - y)
+        t = (above - height[m]) / above
+        points[m, 0], points[m, 1], points[m, 2] = cx + t * (x - cx), cy + t * (y - cy), cz + t * (z - cz)

@@ -1,0 +1,291 @@
+"""Ground points where tracks are missing: a vertical line locus through several pictures.
+
+At a free position the picture that sees it from nearest above is the reference; partners fore and aft on the same
+leg are compared with it for every height, and where the leg ends too early pictures of other legs. A patch of the
+reference is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on
+that plane: on it a change of height is a plain shift, so each picture is sampled once and the sweep is a correlation
+along the strip. Pictures are read one after the other along the legs and only a window of them is kept.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import Terrain
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F, Rig
+from orthoswarm.refine.surface import vertical_line_kernels as kernels
+
+Array = NDArray[np.float64]
+Gray = Callable[[int], NDArray[np.uint8]]
+
+STEEPEST = 1.5
+"""Ground is no steeper for a patch: a given height model has walls, and no patch is a plane across one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """How heights are searched. Lengths in metres, chosen for 150 m above ground; see `at_height`.
+
+    Attributes:
+        half: half width of the square patch in samples (7: 15 x 15).
+        step_m: distance of samples.
+        reach_m: heights searched above and below the terrain; height_step_m: their distance (peaks are
+            interpolated by a parabola).
+        min_score: least mean normalised correlation.
+        rival_m: a second peak farther than this from the best one, above rival_share of it, makes the height
+            ambiguous; infinite switches the test off.
+        sigma_m: one sigma of a height on open ground, for the fit.
+        baselines_m: wished distances of the partners, on both sides of the reference.
+        spacing_m: only pictures this far apart along a leg are used, so that few have to be decoded.
+    """
+
+    half: int = 7
+    step_m: float = 0.7
+    reach_m: float = 9.0
+    height_step_m: float = 0.375
+    min_score: float = 0.6
+    rival_m: float = 4.0
+    rival_share: float = 0.95
+    sigma_m: float = 0.25
+    baselines_m: tuple[float, ...] = (40.0, 75.0, 110.0)
+    spacing_m: float = 17.0
+
+    def at_height(self, height_m: float) -> "Sweep":
+        """The same sweep for cameras at another height above ground: all but the reach scales."""
+        k = height_m / 150.0
+        return replace(
+            self,
+            step_m=self.step_m * k,
+            height_step_m=self.height_step_m * k,
+            sigma_m=self.sigma_m * k,
+            baselines_m=tuple(b * k for b in self.baselines_m),
+            spacing_m=self.spacing_m * k,
+            rival_m=self.rival_m * k,
+        )
+
+    @property
+    def heights(self) -> Array:
+        """The heights searched, about zero."""
+        count = int(np.ceil(self.reach_m / self.height_step_m))
+        return np.asarray(np.arange(-count, count + 1) * self.height_step_m, np.float64)
+
+
+SMALL = Sweep(half=4, step_m=0.5, min_score=0.7, sigma_m=0.15)
+"""9 x 9 samples of 0.5 m fit between cars, bushes and houses: on a street scene three quarters of its heights lie
+within 0.2 m of the bare ground, of the large patch's half, most others above it."""
+
+LARGE = Sweep()
+"""15 x 15 samples of 0.7 m find heights on ground with little texture."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocusPoints:
+    """Points that a sweep found.
+
+    Attributes:
+        points: float64 (M, 3), on the reference's ray through the position, so slightly beside it.
+        sigma_z: float64 (M,), one sigma of each height.
+        score: float64 (M,), mean normalised correlation at the peak.
+        cell: int64 (M,), which of the positions each point belongs to, ascending.
+    """
+
+    points: Array
+    sigma_z: Array
+    score: Array
+    cell: NDArray[np.int64]
+
+
+def dense_ground(
+    rig: Rig,
+    gray: Gray,
+    cells: Array,
+    terrain: Terrain,
+    leg_of_camera: NDArray[np.integer],
+    sweeps: Sequence[Sweep] | None = None,
+    *,
+    slots: int = 64,
+) -> LocusPoints:
+    """Heights at free positions from correlation between pictures, of one leg where there are enough.
+
+    Args:
+        rig: cameras of one or several vehicles.
+        gray: picture of a camera by its index, uint8 (rows, columns) as its lens says; called in the order of the
+            legs, once a picture unless a window of `slots` pictures is too short for it.
+        cells: float64 (C, 2), positions, east and north.
+        terrain: where heights are searched around; its slope tilts the patches.
+        leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
+        sweeps: how to search, one after the other, each at the positions where those before found nothing. Baselines
+            and spacing are the first one's. None: SMALL, then LARGE, for the cameras' height above the terrain.
+        slots: number of pictures held at a time (more only where the cells of one reference need more).
+    """
+    if sweeps is None:
+        height = height_above(rig, terrain)
+        sweeps = (SMALL.at_height(height), LARGE.at_height(height))
+    s = sweeps[0]
+    cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
+    plane = _planes(terrain, cells, max(5.0, s.half * s.step_m))
+    keys = _key_cameras(rig, np.asarray(leg_of_camera), s.spacing_m)
+    ref = np.full(len(cells), -1, np.int32)
+    found = np.full((len(cells), 3), -1.0)
+    if len(keys.camera) and len(cells):
+        wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
+        partner = np.full((len(cells), len(wished)), -1, np.int32)
+        kernels.choose(
+            rig.position, rig.rotation, rig.lens_id, rig.lens, keys.camera, keys.leg, keys.along,
+            cells, plane, s.half * s.step_m, wished, 0.4 * min(s.baselines_m), ref, partner,
+        )  # fmt: skip
+        _sweep_in_windows(rig, gray, keys.order, cells, plane, ref, partner, sweeps, slots, found)
+    good = np.flatnonzero(found[:, 1] >= 0.0)
+    points = np.empty((len(good), 3))
+    kernels.raise_points(rig.position, ref[good], cells[good], plane[good], found[good, 0], points)
+    return LocusPoints(points, found[good, 2], found[good, 1], good)
+
+
+def height_above(rig: Rig, terrain: Terrain) -> float:
+    """Median height of cameras above the terrain, metres, at least 1."""
+    if len(rig) == 0:
+        return 150.0
+    return max(1.0, float(np.median(rig.position[:, 2] - terrain.height(rig.position[:, :2]))))
+
+
+@dataclass(frozen=True, slots=True)
+class _Keys:
+    """Cameras used as reference or partner, sorted by leg and way along it; order: rank of every camera, -1 unused."""
+
+    camera: NDArray[np.int32]
+    leg: NDArray[np.int64]
+    along: Array
+    order: NDArray[np.int64]
+
+
+def spaced(
+    rig: Rig, leg_of_camera: NDArray[np.integer], spacing_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
+    """Cameras at least so far apart along their legs, and each leg's last one: leg, camera and way along it, sorted."""
+    camera: list[int] = []
+    leg: list[int] = []
+    along: list[float] = []
+    for number in np.unique(leg_of_camera[leg_of_camera >= 0]):
+        members = np.flatnonzero(leg_of_camera == number)
+        if len(members) < 2:
+            continue
+        p = rig.position[members, :2]
+        way = (p - p.mean(0)) @ np.linalg.svd(p - p.mean(0), full_matrices=False)[2][0]
+        last = -np.inf
+        rank = np.argsort(way)
+        for i in rank:
+            if way[i] >= last + spacing_m or i == rank[-1]:
+                camera.append(int(members[i]))
+                leg.append(int(number))
+                along.append(float(way[i]))
+                last = way[i]
+    return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
+
+
+def _key_cameras(rig: Rig, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
+    leg, camera, along = spaced(rig, leg_of_camera, spacing)
+    order = np.full(len(rig), -1, np.int64)
+    order[camera] = np.arange(len(camera))
+    return _Keys(camera, leg, along, order)
+
+
+def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
+    """Height and slope (east, north) of the terrain at positions: float64 (C, 3)."""
+    e, n = np.array([reach, 0.0]), np.array([0.0, reach])
+    z = terrain.height(cells)
+    ge = (terrain.height(cells + e) - terrain.height(cells - e)) / (2 * reach)
+    gn = (terrain.height(cells + n) - terrain.height(cells - n)) / (2 * reach)
+    return np.stack([z, np.clip(ge, -STEEPEST, STEEPEST), np.clip(gn, -STEEPEST, STEEPEST)], 1)
+
+
+def _sweep_in_windows(
+    rig: Rig,
+    gray: Gray,
+    order: NDArray[np.int64],
+    cells: Array,
+    plane: Array,
+    ref: NDArray[np.int32],
+    partner: NDArray[np.int32],
+    sweeps: Sequence[Sweep],
+    slots: int,
+    found: Array,
+) -> None:
+    """Search all cells in the order of the legs, the pictures held in a bounded stack.
+
+    found: float64 (C, 3), height over the plane, score, sigma of each cell; untouched where nothing is found.
+    """
+    usable = np.flatnonzero(ref >= 0)
+    if len(usable) == 0:
+        return
+    usable = usable[np.argsort(order[ref[usable]], kind="stable")]
+    groups = [
+        (a, b, {int(c) for c in np.unique(np.c_[ref[usable[a:b]], partner[usable[a:b]]]) if c >= 0})
+        for a, b in pairwise(np.flatnonzero(np.r_[True, np.diff(ref[usable]) != 0, True]).tolist())
+    ]
+    slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
+    window = _Window(rig, gray, _reduction(rig, plane, ref, min(s.step_m for s in sweeps)), slots)
+    factor = window.factor.astype(np.float64)
+
+    def search(block: NDArray[np.int64], needed: set[int]) -> None:
+        window.hold(sorted(needed, key=lambda camera: int(order[camera])))
+        for s in sweeps:
+            curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
+            kernels.correlate(
+                rig.position, rig.rotation, rig.lens_id, rig.lens, window.stack, window.slot, factor,
+                cells[block], plane[block], ref[block], partner[block], s.heights, s.half, s.step_m, curve,
+            )  # fmt: skip
+            kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
+            good = peak[:, 1] >= s.min_score
+            found[block[good], :2], found[block[good], 2] = peak[good], s.sigma_m
+            block = block[~good]
+
+    begin, held = 0, set[int]()
+    for a, _, needed in groups:
+        if held and len(held | needed) > slots:
+            search(usable[begin:a], held)
+            begin, held = a, set()
+        held |= needed
+    search(usable[begin:], held)
+
+
+class _Window:
+    """The pictures held at a time, shrunk to what the sweep needs: a stack, and the slot of each camera in it."""
+
+    def __init__(self, rig: Rig, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
+        self.factor = factor
+        self.slot = np.full(len(rig), -1, np.int32)
+        sizes = rig.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
+        self.stack = np.zeros((slots, int(sizes[:, 0].max()), int(sizes[:, 1].max())), np.uint8)
+        self._lens_id, self._gray, self._free = rig.lens_id, gray, list(range(slots))
+
+    def hold(self, cameras: list[int]) -> None:
+        """Read the pictures that are not held yet, into the places of those no longer needed."""
+        for camera in set(np.flatnonzero(self.slot >= 0).tolist()).difference(cameras):
+            self._free.append(int(self.slot[camera]))
+            self.slot[camera] = -1
+        for camera in cameras:
+            if self.slot[camera] < 0:
+                place = self._free.pop()
+                picture = _reduced(self._gray(camera), int(self.factor[self._lens_id[camera]]))
+                self.stack[place, : picture.shape[0], : picture.shape[1]] = picture
+                self.slot[camera] = place
+
+
+def _reduction(rig: Rig, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
+    """Whole number by which each lens's pictures are shrunk, so that a pixel is not finer than a sample needs."""
+    above = float(np.median(rig.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
+    gsd = max(above, 1.0) / rig.lens[:, F]
+    return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
+
+
+def _reduced(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    if factor == 1:
+        return picture
+    import cv2
+
+    rows, columns = picture.shape[0] // factor, picture.shape[1] // factor
+    cut = picture[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)

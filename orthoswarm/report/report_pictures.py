@@ -1,0 +1,221 @@
+"""Pictures of the report: windows of the products, drawings on them, and their encoding into the page."""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.raster.resampling import resample
+
+Bytes = NDArray[np.uint8]
+Array = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
+Colour = tuple[int, int, int]
+
+PAPER: Colour = (238, 240, 243)
+_SUBPIXEL_BITS = 4
+
+
+@dataclass(slots=True)
+class Picture:
+    """Colours on the ground.
+
+    Attributes:
+        rgb: uint8 (rows, columns, 3), empty ground in the page's colour.
+        seen: bool (rows, columns), where there is something.
+        grid: where it lies.
+    """
+
+    rgb: Bytes
+    seen: NDArray[np.bool_]
+    grid: GroundGrid
+
+    def copy(self) -> "Picture":
+        """One to draw on."""
+        return Picture(self.rgb.copy(), self.seen, self.grid)
+
+    def on(self, grid: GroundGrid) -> "Picture":
+        """The same on another grid, as far as it reaches."""
+        bands, seen = _regrid(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)), self.seen, self.grid, grid)
+        return on_paper(np.ascontiguousarray(bands.transpose(1, 2, 0)), seen, grid)
+
+
+def _regrid(
+    bands: Bytes, valid: NDArray[np.bool_], old: GroundGrid, new: GroundGrid
+) -> tuple[Bytes, NDArray[np.bool_]]:
+    first = ((new.west - old.west) / old.gsd_m, (old.north - new.north) / old.gsd_m)
+    scale = new.gsd_m / old.gsd_m
+    return resample(bands, valid, first, (scale, scale), (new.width, new.height))
+
+
+def view_grid(epsg: int, bounds: Bounds, most_px: int, least_gsd_m: float = 0.0) -> GroundGrid:
+    """A grid of at most so many pixels a side over bounds, no finer than a ground pixel."""
+    side = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    return GroundGrid.around(epsg, bounds, max(side / (most_px - 2), least_gsd_m, 1e-3))
+
+
+def product_bounds(path: Path) -> Bounds:
+    """West, south, east, north of what is drawn in a product."""
+    import rasterio
+
+    with rasterio.open(path) as source:
+        shrink = max(1.0, max(source.width, source.height) / 512)
+        shape = (max(1, int(source.height / shrink)), max(1, int(source.width / shrink)))
+        alpha = source.read(4, out_shape=shape)
+        rows, cols = np.nonzero(alpha.any(axis=1))[0], np.nonzero(alpha.any(axis=0))[0]
+        if not len(rows):
+            return tuple(source.bounds)
+        left, top = source.bounds.left, source.bounds.top
+        dx, dy = (source.bounds.right - left) / shape[1], (top - source.bounds.bottom) / shape[0]
+        return (
+            left + float(cols[0]) * dx,
+            top - float(rows[-1] + 1) * dy,
+            left + float(cols[-1] + 1) * dx,
+            top - float(rows[0]) * dy,
+        )
+
+
+def product_picture(path: Path, grid: GroundGrid) -> Picture:
+    """A product on a grid (to half a pixel: for looking at)."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window
+
+    rgba = np.zeros((4, grid.height, grid.width), np.uint8)
+    with rasterio.open(path) as source:
+        step = source.res[0]
+        left, top = (grid.west - source.bounds.left) / step, (source.bounds.top - grid.north) / step
+        scale = grid.gsd_m / step
+        # Whole pixels of the answer that lie within the product.
+        c0, c1 = max(0, round(-left / scale)), min(grid.width, round((source.width - left) / scale))
+        r0, r1 = max(0, round(-top / scale)), min(grid.height, round((source.height - top) / scale))
+        if c0 < c1 and r0 < r1:
+            x0, y0 = max(0.0, left + c0 * scale), max(0.0, top + r0 * scale)
+            x1, y1 = min(source.width, left + c1 * scale), min(source.height, top + r1 * scale)
+            how = Resampling.average if scale > 1 else Resampling.bilinear
+            shape, window = (4, r1 - r0, c1 - c0), Window(x0, y0, x1 - x0, y1 - y0)
+            rgba[:, r0:r1, c0:c1] = source.read(window=window, out_shape=shape, resampling=how)
+    return on_paper(np.ascontiguousarray(rgba[:3].transpose(1, 2, 0)), rgba[3] > 127, grid)
+
+
+@dataclass(frozen=True, slots=True)
+class MapView:
+    """The map in grey on a grid: uint8 (rows, columns), and where it means something."""
+
+    gray: Bytes
+    valid: NDArray[np.bool_]
+    grid: GroundGrid
+
+    @classmethod
+    def read(cls, basemap: MapWindow, grid: GroundGrid) -> "MapView":
+        """Read a window of a map."""
+        gray, valid = basemap.gray(grid.bounds, grid.gsd_m)
+        whole = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m)
+        return cls(np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid, whole).on(grid)
+
+    def on(self, grid: GroundGrid) -> "MapView":
+        """The same on another grid, as far as it reaches."""
+        gray, valid = _regrid(self.gray[None], self.valid, self.grid, grid)
+        return MapView(gray[0], valid, grid)
+
+    def picture(self) -> Picture:
+        """To draw on."""
+        return on_paper(np.repeat(self.gray[..., None], 3, axis=2), self.valid, self.grid)
+
+
+def on_paper(rgb: Bytes, seen: NDArray[np.bool_], grid: GroundGrid) -> Picture:
+    """A picture whose empty ground has the page's colour."""
+    rgb[~seen] = PAPER
+    return Picture(rgb, seen, grid)
+
+
+def pale(picture: Picture, share: float = 0.55) -> Picture:
+    """A grey, light version to draw on."""
+    import cv2
+
+    gray = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    light = (255.0 - share * (255.0 - gray)).astype(np.uint8)
+    return on_paper(np.repeat(light[..., None], 3, axis=2), picture.seen, picture.grid)
+
+
+def draw_lines(
+    picture: Picture, lines: Sequence[Array], colour: Colour, width: int = 1, *, closed: bool = False
+) -> None:
+    """Draw ground polylines, float64 (K, 2) each."""
+    import cv2
+
+    points = [_pixels(picture.grid, line) for line in lines if len(line) > 1]
+    cv2.polylines(picture.rgb, points, closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def fill_polygons(picture: Picture, polygons: Sequence[Array], colour: Colour, opacity: float) -> None:
+    """Tint the ground inside polygons, more where several lie over each other."""
+    import cv2
+
+    layer = np.zeros(picture.rgb.shape[:2], np.float32)
+    for polygon in polygons:
+        one = np.zeros(picture.rgb.shape[:2], np.uint8)
+        cv2.fillPoly(one, [_pixels(picture.grid, polygon)], 1, cv2.LINE_8, _SUBPIXEL_BITS)
+        layer += one
+    weight = (1.0 - (1.0 - opacity) ** layer)[..., None]
+    picture.rgb[:] = (picture.rgb * (1 - weight) + np.array(colour, np.float32) * weight).astype(np.uint8)
+
+
+def draw_arrows(picture: Picture, start: Array, end: Array, colour: Colour) -> None:
+    """Draw arrows between ground points (K, 2), with a dot where each begins."""
+    import cv2
+
+    for a, b in zip(picture.grid.to_pixel(start), picture.grid.to_pixel(end), strict=True):
+        first, last = (int(a[0]), int(a[1])), (int(b[0]), int(b[1]))
+        cv2.circle(picture.rgb, first, 2, colour, -1, cv2.LINE_AA)
+        length = max(1.0, float(np.hypot(*(b - a))))
+        cv2.arrowedLine(picture.rgb, first, last, colour, 1, cv2.LINE_AA, 0, min(0.4, 5.0 / length))
+
+
+def scale_bar(picture: Picture) -> None:
+    """A bar of a round length in the lower left corner."""
+    import cv2
+
+    grid = picture.grid
+    wanted = 0.25 * grid.width * grid.gsd_m
+    unit = 10.0 ** np.floor(np.log10(wanted))
+    metres = float(max(s for s in (1, 2, 5) if s * unit <= wanted) * unit)
+    length = round(metres / grid.gsd_m)
+    x, y = 12, grid.height - 14
+    text = f"{metres / 1000:g} km" if metres >= 1000 else f"{metres:g} m"
+    cv2.rectangle(picture.rgb, (x - 6, y - 22), (x + max(length, 44) + 6, y + 6), (255, 255, 255), -1)
+    cv2.line(picture.rgb, (x, y), (x + length, y), (20, 24, 30), 2)
+    cv2.putText(picture.rgb, text, (x, y - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 24, 30), 1, cv2.LINE_AA)
+
+
+def map_edges(view: MapView) -> NDArray[np.bool_]:
+    """Strong edges of a map, the upper part of its own gradients."""
+    import cv2
+
+    smooth = cv2.GaussianBlur(view.gray, (0, 0), 1.0)
+    gx, gy = cv2.Sobel(smooth, cv2.CV_16S, 1, 0), cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
+    inside = cv2.erode(view.valid.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    size = np.hypot(gx, gy, dtype=np.float32)
+    if not inside.any():
+        return np.zeros(view.gray.shape, bool)
+    high = float(np.percentile(size[inside], 92))
+    edges = np.asarray(cv2.Canny(gx, gy, 0.4 * high, max(high, 1.0), L2gradient=True), np.uint8)
+    return np.asarray((edges > 0) & inside)
+
+
+def data_uri(rgb: Bytes, quality: int = 82) -> str:
+    """A picture as a JPEG inside the page."""
+    import simplejpeg
+
+    data = simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420")
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _pixels(grid: GroundGrid, points: Array) -> Any:
+    return np.round(np.clip(grid.to_pixel(points), -1e5, 1e5) * 2**_SUBPIXEL_BITS).astype(np.int32)

@@ -1,1 +1,0 @@
-"""The default refiner: tracks, joint adjustment, map registration, ties, terrain (beyond the paper)."""

@@ -1,0 +1,1 @@
+"""What a simulated camera makes of the ground: ray marching, sensor, EXIF and XMP tags."""

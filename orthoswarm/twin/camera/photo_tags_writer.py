@@ -1,0 +1,121 @@
+"""EXIF and XMP as a DJI camera writes them, put into a JPEG; no focal length or field of view (uncalibrated)."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fractions import Fraction
+
+from orthoswarm.model.angles import wrap_deg
+
+_XMP = (
+    '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
+    ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+    '  <rdf:Description rdf:about="DJI Meta Data"\n'
+    '    xmlns:tiff="http://ns.adobe.com/tiff/1.0/"\n'
+    '    xmlns:xmp="http://ns.adobe.com/xap/1.0/"\n'
+    '    xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"\n'
+    '   xmp:ModifyDate="{date}"\n'
+    '   xmp:CreateDate="{date}"\n'
+    '   tiff:Make="{make}"\n'
+    '   tiff:Model="{model}"\n'
+    '   drone-dji:AbsoluteAltitude="{altitude:+.3f}"\n'
+    '   drone-dji:RelativeAltitude="{height:+.3f}"\n'
+    '   drone-dji:GpsLatitude="{lat:.10f}"\n'
+    '   drone-dji:GpsLongitude="{lon:.10f}"\n'
+    '   drone-dji:GimbalRollDegree="{gimbal[2]:+.3f}"\n'
+    '   drone-dji:GimbalYawDegree="{gimbal[0]:+.3f}"\n'
+    '   drone-dji:GimbalPitchDegree="{gimbal[1]:+.3f}"\n'
+    '   drone-dji:FlightRollDegree="{flight[2]:+.3f}"\n'
+    '   drone-dji:FlightYawDegree="{flight[0]:+.3f}"\n'
+    '   drone-dji:FlightPitchDegree="{flight[1]:+.3f}">\n'
+    "  </rdf:Description>\n"
+    " </rdf:RDF>\n"
+    "</x:xmpmeta>\n"
+    '<?xpacket end="w"?>'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoTags:
+    """What a photo says about itself.
+
+    Attributes:
+        time_s: UTC epoch seconds.
+        lat_deg: latitude; lon_deg: longitude, WGS 84.
+        altitude_m: absolute altitude. height_m: over takeoff.
+        gimbal_deg: the camera's yaw (from true north), pitch (-90 straight down), roll.
+        flight_deg: the airframe's yaw, pitch, roll.
+        model: camera model.
+    """
+
+    time_s: float
+    lat_deg: float
+    lon_deg: float
+    altitude_m: float
+    height_m: float
+    gimbal_deg: tuple[float, float, float]
+    flight_deg: tuple[float, float, float]
+    model: str = "TWIN"
+
+
+def with_tags(jpeg: bytes, tags: PhotoTags) -> bytes:
+    """A JPEG with its EXIF and XMP segments; angles are wrapped to +-180 degrees."""
+    exif, xmp = _exif(tags), _xmp(tags)
+    return b"".join([jpeg[:2], _segment(exif), _segment(b"http://ns.adobe.com/xap/1.0/\x00" + xmp), jpeg[2:]])
+
+
+def _segment(payload: bytes) -> bytes:
+    return b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
+
+
+def _wrap(angles: tuple[float, float, float]) -> tuple[float, float, float]:
+    a, b, c = (wrap_deg(x) for x in angles)
+    return a, b, c
+
+
+def _xmp(tags: PhotoTags) -> bytes:
+    return _XMP.format(
+        date=datetime.fromtimestamp(tags.time_s, UTC).isoformat(timespec="seconds"),
+        make="DJI",
+        model=tags.model,
+        altitude=tags.altitude_m,
+        height=tags.height_m,
+        lat=tags.lat_deg,
+        lon=tags.lon_deg,
+        gimbal=_wrap(tags.gimbal_deg),
+        flight=_wrap(tags.flight_deg),
+    ).encode()
+
+
+def _exif(tags: PhotoTags) -> bytes:
+    from PIL import Image
+
+    moment = datetime.fromtimestamp(round(tags.time_s, 3), UTC)
+    stamp, fraction = moment.strftime("%Y:%m:%d %H:%M:%S"), f"{moment.microsecond // 1000:03d}"
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0132] = "DJI", tags.model, stamp
+    detail = exif.get_ifd(0x8769)
+    detail[0x9003] = detail[0x9004] = stamp
+    detail[0x9291] = detail[0x9292] = fraction
+    detail[0x9011] = "+00:00"
+    gps = exif.get_ifd(0x8825)
+    gps[0] = b"\x02\x03\x00\x00"
+    gps[1], gps[2] = ("N" if tags.lat_deg >= 0 else "S"), _sexagesimal(tags.lat_deg)
+    gps[3], gps[4] = ("E" if tags.lon_deg >= 0 else "W"), _sexagesimal(tags.lon_deg)
+    gps[5], gps[6] = (b"\x00" if tags.altitude_m >= 0 else b"\x01"), _rational(abs(tags.altitude_m), 1000)
+    return bytes(exif.tobytes())
+
+
+def _rational(value: float, denominator: int) -> tuple[int, int] | Fraction:
+    from PIL.TiffImagePlugin import IFDRational
+
+    rational: Fraction = IFDRational(round(value * denominator), denominator)
+    return rational
+
+
+def _sexagesimal(angle_deg: float) -> tuple[object, object, object]:
+    """Degrees, minutes, seconds to 1e-6 of a second (3e-10 degrees)."""
+    micro = round(abs(angle_deg) * 3.6e9)
+    degrees, rest = divmod(micro, 3_600_000_000)
+    minutes, seconds = divmod(rest, 60_000_000)
+    return _rational(degrees, 1), _rational(minutes, 1), _rational(seconds / 1e6, 1_000_000)

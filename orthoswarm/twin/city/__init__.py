@@ -1,0 +1,1 @@
+"""The simulated ground: a procedural city or a real place, its texture, buildings, trees and light."""

@@ -1,0 +1,93 @@
+"""A piece of ground with everything on it: colours, surface, bare ground, and what kind of thing lies where."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.geo import GroundGrid
+
+TEXEL_M = 0.25
+"""Side of a texture pixel, metres."""
+CELL_M = 0.5
+"""Side of a cell of the height fields, metres: two texels."""
+TILE_CELLS = 16
+"""Cells along the side of a tile of the renderer's table of highest points."""
+
+GRASS, ASPHALT, CONCRETE, SOIL, FIELD, WATER, ROOF, TREE, CAR, MARK, RUBBLE, PHOTO = range(12)
+"""Kinds of surface, for texture, season, and for what moves (WATER)."""
+KINDS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m).
+
+    Attributes:
+        grid: the texture's grid, CRS and place.
+        albedo: uint8 (rows, columns, 3), colours without light and shadow, seen from straight above.
+        kind: uint8 (rows, columns), kind of surface of each texel.
+        dsm: float32 (rows/2, columns/2), height of the surface with all that stands on it, metres over takeoff.
+        dtm: float32 (rows/2, columns/2), height of the bare ground.
+        wall: uint8 (rows/2, columns/2, 3), colour of a vertical face below the cell's top.
+        facade: uint8 (rows/2, columns/2), 1 where the vertical face has windows.
+        angle_rad: main direction of the walls, anticlockwise from east.
+    """
+
+    grid: GroundGrid
+    albedo: NDArray[np.uint8]
+    kind: NDArray[np.uint8]
+    dsm: NDArray[np.float32]
+    dtm: NDArray[np.float32]
+    wall: NDArray[np.uint8]
+    facade: NDArray[np.uint8]
+    angle_rad: float = 0.0
+
+    @classmethod
+    def blank(cls, grid: GroundGrid, angle_rad: float = 0.0) -> "Scene":
+        """A level, black scene on a texture grid whose sides are even."""
+        rows, cols = grid.height // 2, grid.width // 2
+        return cls(
+            grid,
+            np.zeros((grid.height, grid.width, 3), np.uint8),
+            np.zeros((grid.height, grid.width), np.uint8),
+            np.zeros((rows, cols), np.float32),
+            np.zeros((rows, cols), np.float32),
+            np.zeros((rows, cols, 3), np.uint8),
+            np.zeros((rows, cols), np.uint8),
+            angle_rad,
+        )
+
+    @property
+    def wall_axis(self) -> tuple[float, float]:
+        """Unit vector (columns, rows) along one of the two directions of the walls."""
+        return float(np.cos(self.angle_rad)), float(-np.sin(self.angle_rad))
+
+    @property
+    def cells(self) -> GroundGrid:
+        """The grid of the height fields."""
+        g = self.grid
+        return GroundGrid(g.epsg, g.west, g.north, CELL_M, g.width // 2, g.height // 2)
+
+    def copy(self) -> "Scene":
+        """A scene whose colours and surface may be changed without touching this one (the bare ground is shared)."""
+        return replace(
+            self,
+            albedo=self.albedo.copy(),
+            kind=self.kind.copy(),
+            dsm=self.dsm.copy(),
+            wall=self.wall.copy(),
+            facade=self.facade.copy(),
+        )
+
+    def above_ground(self) -> NDArray[np.float32]:
+        """Height of the surface over the bare ground, float32 (rows/2, columns/2)."""
+        return np.asarray(self.dsm - self.dtm)
+
+
+def scene_grid(epsg: int, center: tuple[float, float], half_east: float, half_north: float) -> GroundGrid:
+    """The texture grid around a centre, both sides a multiple of 24 m so that all levels and tiles fit."""
+    width, height = (int(np.ceil(2 * h / 24.0)) * 24 for h in (half_east, half_north))
+    west = float(np.floor(center[0] - width / 2))
+    north = float(np.ceil(center[1] + height / 2))
+    return GroundGrid(epsg, west, north, TEXEL_M, int(width / TEXEL_M), int(height / TEXEL_M))

@@ -1,0 +1,217 @@
+"""Flights over the area: boustrophedon legs per vehicle, true motion with its wobble, and where pictures are taken."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.camera import Lens, focal_px
+
+Array = NDArray[np.float64]
+
+FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
+"""The paper's cameras (IV.A)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightPlan:
+    """The swarm's task: blocks of parallel legs, one block a vehicle, in rows and columns.
+
+    Attributes:
+        columns: vehicles side by side across the legs; rows: one behind the other along them.
+        photos: pictures of each vehicle.
+        legs: legs of each vehicle.
+        spacing_m: distance of pictures along the path.
+        leg_spacing_m: distance of neighbouring legs, also across a border between vehicles.
+        height_m: flying height over takeoff.
+        speed_m_s: cruising speed.
+        heading_rad: grid azimuth of the first leg.
+        width: columns of a picture; height: rows.
+    """
+
+    columns: int = 3
+    rows: int = 1
+    photos: int = 339
+    legs: int = 4
+    spacing_m: float = 8.75
+    leg_spacing_m: float = 100.0
+    height_m: float = 150.0
+    speed_m_s: float = 8.75
+    heading_rad: float = 0.0
+    width: int = 640
+    height: int = 480
+
+    @property
+    def leg_length_m(self) -> float:
+        """Length of a leg, so that legs and the ways between them take the stated number of pictures."""
+        return ((self.photos - 1) * self.spacing_m - (self.legs - 1) * self.leg_spacing_m) / self.legs
+
+    @property
+    def vehicles(self) -> int:
+        """Number of vehicles."""
+        return self.columns * self.rows
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Size of the area: across the legs, along them (half a leg spacing around the outer legs)."""
+        across = self.columns * self.legs * self.leg_spacing_m
+        along = self.rows * (self.leg_length_m + self.leg_spacing_m) - self.leg_spacing_m
+        return across, along
+
+    def to_grid(self, across_along: Array, center: tuple[float, float]) -> Array:
+        """Grid coordinates (..., 2) of positions across and along the legs, about the area's centre."""
+        s, c = np.sin(self.heading_rad), np.cos(self.heading_rad)
+        x, y = across_along[..., 0], across_along[..., 1]
+        return np.stack([center[0] + x * c + y * s, center[1] - x * s + y * c], -1)
+
+    def corners(self, vehicle: int) -> Array:
+        """Waypoints (2 legs, 2) of a vehicle, across and along, about the area's centre."""
+        across, along = self.extent_m
+        column, row = vehicle % self.columns, vehicle // self.columns
+        x0 = -0.5 * across + (column * self.legs + 0.5) * self.leg_spacing_m
+        y0 = -0.5 * along + row * (self.leg_length_m + self.leg_spacing_m)
+        points = []
+        for k in range(self.legs):
+            x = x0 + k * self.leg_spacing_m
+            ends = [(x, y0), (x, y0 + self.leg_length_m)]
+            points += ends if k % 2 == 0 else ends[::-1]
+        return np.array(points)
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """What one vehicle really did.
+
+    Attributes:
+        vehicle: its id.
+        lens: its camera's true lens.
+        mount_rad: fixed offsets of the camera from the airframe (yaw, pitch).
+        time_s: float64 (N,), UTC epoch seconds of the pictures.
+        planned: float64 (N, 3), where the plan has it at each picture.
+        position: float64 (N, 3), true position of the camera.
+        velocity: float64 (N, 2), true ground speed.
+        angles: float64 (N, 3), the camera's true GRID yaw, pitch, roll in radians.
+        body: float64 (N, 3), the airframe's GRID yaw, pitch, roll in radians.
+    """
+
+    vehicle: str
+    lens: Lens
+    mount_rad: tuple[float, float]
+    time_s: Array
+    planned: Array
+    position: Array
+    velocity: Array
+    angles: Array
+    body: Array
+
+
+def smooth_noise(rng: np.random.Generator, n: int, length: float, sigma: float) -> Array:
+    """A smooth random curve of n values: standard deviation sigma, correlated over about `length` values."""
+    pad = int(4 * length) + 1
+    t = np.arange(-pad, pad + 1)
+    kernel = np.exp(-0.5 * (t / max(length, 1e-3)) ** 2)
+    kernel /= np.sqrt((kernel**2).sum())
+    white = rng.normal(0.0, sigma, n + 2 * pad)
+    return np.asarray(np.convolve(white, kernel, mode="valid")[:n])
+
+
+def _path(corners: Array, count: int, spacing: float) -> tuple[Array, Array]:
+    """Positions (N, 2) at equal steps along a polyline, and the direction (N,) there (clockwise from `along`)."""
+    step = np.diff(corners, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    start = np.concatenate([[0.0], np.cumsum(length)])
+    s = np.minimum(np.arange(count) * spacing, start[-1])
+    k = np.clip(np.searchsorted(start, s, side="right") - 1, 0, len(length) - 1)
+    t = (s - start[k]) / length[k]
+    heading = np.arctan2(step[k, 0], step[k, 1])
+    return corners[k] + step[k] * t[:, None], heading
+
+
+def _slew(heading: Array, seconds: float, rate_rad_s: float) -> Array:
+    """Headings that follow the path's with a limited turning rate."""
+    out = heading.copy()
+    for i in range(1, len(out)):
+        turn = wrap_rad(float(heading[i] - out[i - 1]))
+        out[i] = out[i - 1] + np.clip(turn, -rate_rad_s * seconds, rate_rad_s * seconds)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How calmly the swarm flies.
+
+    Attributes:
+        track_m: one sigma of the true path about the plan, slowly varying.
+        attitude_deg: one sigma of roll and pitch of the airframe, slowly varying; jitter_deg: from picture to picture.
+        height_m: one sigma of the height.
+        drift_m: size of the receiver's drift that the autopilot follows; the true path leaves the plan by it.
+        mount_yaw_deg: range of the camera's fixed yaw offset; mount_pitch_deg: of its pitch offset.
+    """
+
+    track_m: float = 0.4
+    attitude_deg: float = 1.2
+    jitter_deg: float = 0.25
+    height_m: float = 0.35
+    drift_m: float = 0.0
+    mount_yaw_deg: float = 30.0
+    mount_pitch_deg: float = 5.0
+
+
+def fly(
+    plan: FlightPlan,
+    motion: Motion,
+    center: tuple[float, float],
+    vehicle: int,
+    seed: int,
+    lens_k: tuple[float, float] = (0.0, 0.0),
+    start_s: float = 1_750_000_000.0,
+) -> Flight:
+    """One vehicle's true flight.
+
+    Args:
+        plan: the swarm's task.
+        motion: how calmly it flies.
+        center: grid coordinates of the area's centre.
+        vehicle: its number.
+        seed: of the set; each vehicle draws its own numbers from it.
+        lens_k: radial distortion k1, k2 of all lenses.
+        start_s: UTC epoch seconds of the first picture.
+    """
+    rng = np.random.default_rng([seed, 41, vehicle])
+    n = plan.photos
+    seconds = plan.spacing_m / plan.speed_m_s
+    local, heading = _path(plan.corners(vehicle), n, plan.spacing_m)
+    planned = np.c_[plan.to_grid(local, center), np.full(n, plan.height_m)]
+    fov = float(rng.choice(FOVS_DEG))
+    mount = np.radians([rng.uniform(-1, 1) * motion.mount_yaw_deg, rng.uniform(-1, 1) * motion.mount_pitch_deg])
+
+    position = planned.copy()
+    for axis in range(2):
+        position[:, axis] += smooth_noise(rng, n, 8.0, motion.track_m) + rng.normal(0, 0.05, n)
+        if motion.drift_m:
+            position[:, axis] += _receiver_drift(rng, n, motion.drift_m)
+    position[:, 2] += smooth_noise(rng, n, 12.0, motion.height_m)
+    velocity = np.gradient(position[:, :2], seconds, axis=0)
+
+    calm, jitter = np.radians(motion.attitude_deg), np.radians(motion.jitter_deg)
+    body = np.stack([_slew(heading + plan.heading_rad, seconds, np.radians(35.0)), np.zeros(n), np.zeros(n)], -1)
+    for axis in range(3):
+        body[:, axis] += smooth_noise(rng, n, 3.0, calm) + rng.normal(0, jitter, n)
+    body[:, 1] -= np.radians(1.0)  # nose down at cruise
+    # the mount holds the camera level but for a share of the airframe's motion
+    angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
+    lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
+    time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
+    name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
+    return Flight(name, lens, (float(mount[0]), float(mount[1])), time, planned, position, velocity, angles, body)
+
+
+def _receiver_drift(rng: np.random.Generator, n: int, size: float) -> Array:
+    """A smooth drift of a receiver along a flight of n pictures, 0 at the start, up to about `size` metres."""
+    i = np.arange(n) / max(1, n - 1)
+    line = rng.uniform(-1.0, 1.0) * size * i
+    slow = smooth_noise(rng, n, 0.12 * n + 1, 0.22 * size)
+    fast = smooth_noise(rng, n, 0.04 * n + 1, 0.05 * size)
+    curve = line + slow + fast
+    return np.asarray(curve - curve[0])

@@ -1,0 +1,1 @@
+"""One file a format: bytes in, samples or tags out."""

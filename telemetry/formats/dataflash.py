@@ -1,0 +1,180 @@
+"""ArduPilot's DataFlash log (.BIN): self-describing binary records.
+
+Each record: A3 95, type, then the columns that the type's FMT record (type 128) names. Only CAM, TRIG, POS, ATT, MNT,
+RFND, TERR, GPS and AHR2 are read. Source: ArduPilot's AP_Logger documentation.
+"""
+
+import mmap
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from telemetry.formats.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
+from telemetry.formats.mavlink_poses import CameraEvent
+from telemetry.samples.sample import Sample, checked
+
+_MARK = b"\xa3\x95"
+_FMT, _FMT_SIZE = 128, 89
+_GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800.0, 18.0, 604_800.0
+_CODES = {
+    "a": "64s", "b": "b", "B": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "n": "4s", "N": "16s",
+    "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "M": "B", "q": "q", "Q": "Q", "g": "e",
+}  # fmt: skip
+_SCALES = {"c": 1e-2, "C": 1e-2, "e": 1e-2, "E": 1e-2, "L": 1e-7}
+_EVENTS = frozenset({"CAM", "TRIG"})
+_WANTED = frozenset({"CAM", "TRIG", "POS", "ATT", "AHR2", "MNT", "RFND", "TERR", "GPS"})
+
+
+class _Format:
+    """One record type."""
+
+    def __init__(self, name: str, length: int, codes: str, columns: str) -> None:
+        self.name, self.length = name, length
+        self._names = columns.split(",") if columns else []
+        self._scales = [_SCALES.get(code) for code in codes]
+        self._struct = struct.Struct("<" + "".join(_CODES[code] for code in codes))
+        if self._struct.size != length - 3 or len(self._names) != len(codes):
+            raise ValueError("the columns do not fill the record")
+
+    def read(self, data: mmap.mmap, at: int) -> Row:
+        values = self._struct.unpack_from(data, at + 3)
+        return {
+            name: value if scale is None else value * scale
+            for name, value, scale in zip(self._names, values, self._scales, strict=True)
+        }
+
+
+def read_dataflash(path: Path) -> FlightLog:
+    """Read a DataFlash log; damaged parts are skipped.
+
+    Raises:
+        OSError: it cannot be read. NotALog: it is none.
+    """
+    with mapped(path) as data:
+        rows = _rows(data)
+    if not rows:
+        raise NotALog("the file holds no DataFlash record; it is no ArduPilot log")
+    log = FlightLog(path, "DataFlash", path.stem)
+    clock = _utc_minus_boot(rows.get("GPS", []))
+    each(rows.get("POS", []), lambda row: _position(log, row, clock))
+    each(rows.get("ATT") or rows.get("AHR2", []), lambda row: _attitude(log, row, clock))
+    each(rows.get("RFND", []), lambda row: _rangefinder(log, row, clock))
+    each(rows.get("TERR", []), lambda row: _terrain(log, row, clock))
+    each(rows.get("MNT", []), lambda row: _gimbal(log, row, clock))
+    for name in ("CAM", "TRIG"):
+        each(rows.get(name, []), lambda row, name=name: log.events.append(_event(row, name, clock)))  # type: ignore[misc]
+    return log
+
+
+def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
+    """Records of the wanted types, in order of the file."""
+    formats: dict[int, _Format | None] = {}
+    lengths: dict[int, int] = {_FMT: _FMT_SIZE}
+    found: dict[str, list[Row]] = {}
+    at, size = data.find(_MARK), len(data)
+    while 0 <= at < size - 3:
+        kind = data[at + 2]
+        length = lengths.get(kind)
+        if length is None or at + length > size or (data[at + length : at + length + 2] not in (_MARK, b"")):
+            # Unknown, cut off, or not followed by a record: damage; go on from the next mark.
+            at = data.find(_MARK, at + 1)
+            continue
+        if kind == _FMT:
+            _learn(data, at, formats, lengths)
+        else:
+            form = formats.get(kind)
+            if form is not None:
+                row, rows = form.read(data, at), found.setdefault(form.name, [])
+                if form.name in _EVENTS or not rows or not 0.0 <= _boot_s(row) - _boot_s(rows[-1]) < LEAST_STEP_S:
+                    rows.append(row)
+        at += length
+    return found
+
+
+def _learn(data: mmap.mmap, at: int, formats: dict[int, _Format | None], lengths: dict[int, int]) -> None:
+    kind, length, name, codes, columns = struct.unpack_from("<BB4s16s64s", data, at + 3)
+    if length < 3 or kind == _FMT:
+        return
+    lengths[kind] = length
+    text = name.rstrip(b"\0").decode("ascii", "replace")
+    formats[kind] = None
+    if text in _WANTED:
+        try:
+            formats[kind] = _Format(
+                text, length, codes.rstrip(b"\0").decode("ascii"), columns.rstrip(b"\0").decode("ascii")
+            )
+        except (ValueError, KeyError, UnicodeDecodeError):
+            return
+
+
+def _utc_minus_boot(rows: list[Row]) -> float | None:
+    """What to add to TimeUS for UTC, by GPS weeks and milliseconds of good fixes."""
+    offsets = [
+        _GPS_EPOCH_S + row["GWk"] * _WEEK_S + row["GMS"] * 1e-3 - _LEAP_S - row["TimeUS"] * 1e-6
+        for row in rows
+        if isinstance(row.get("GWk"), int) and row["GWk"] > 1000 and row.get("Status", 3) >= 3 and "GMS" in row
+    ]
+    # A fix is logged some time after it was measured, so the largest offsets are the best ones.
+    return float(np.quantile(offsets, 0.9)) if offsets else None
+
+
+def _boot_s(row: Row) -> float:
+    return float(row.get("TimeUS", row.get("TimeMS", 0) * 1000)) * 1e-6
+
+
+def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:
+    sample = checked(Sample(**values))
+    if sample is None or clock is None or ("lat_deg" in values and not sample.has_position):
+        return
+    sample.time_s = _boot_s(row) + clock
+    log.samples.append(sample)
+
+
+def _position(log: FlightLog, row: Row, clock: float | None) -> None:
+    height = row.get("RelHomeAlt", row.get("RelAlt"))
+    _add(log, row, clock, lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height)
+
+
+def _attitude(log: FlightLog, row: Row, clock: float | None) -> None:
+    _add(log, row, clock, flight_yaw_deg=row["Yaw"], flight_pitch_deg=row["Pitch"], flight_roll_deg=row["Roll"])
+
+
+def _rangefinder(log: FlightLog, row: Row, clock: float | None) -> None:
+    if row.get("Orient", 25) == 25 and row.get("Stat", 4) == 4 and 0.5 < row["Dist"] < 5000.0:
+        _add(log, row, clock, height_m=float(row["Dist"]), height_is_ground=True)
+
+
+def _terrain(log: FlightLog, row: Row, clock: float | None) -> None:
+    if row.get("Status", 2) == 2 and row["CHeight"] > 0.5:
+        _add(log, row, clock, height_m=float(row["CHeight"]), height_is_ground=True)
+
+
+def _gimbal(log: FlightLog, row: Row, clock: float | None) -> None:
+    from telemetry.samples.rotations import camera_angles_deg, euler_ned
+
+    yaw = row.get("YawE", row.get("Yaw"))
+    if yaw is None or not np.isfinite([yaw, row.get("Pitch", np.nan), row.get("Roll", np.nan)]).all():
+        return
+    log.has_gimbal = True
+    angles = camera_angles_deg(euler_ned(float(yaw), float(row["Pitch"]), float(row["Roll"])))
+    _add(log, row, clock, yaw_deg=angles[0], pitch_deg=angles[1], roll_deg=angles[2])
+
+
+def _event(row: Row, kind: str, clock: float | None) -> CameraEvent:
+    sample = Sample(
+        lat_deg=row.get("Lat"),
+        lon_deg=row.get("Lng"),
+        altitude_m=row.get("Alt"),
+        height_m=row.get("RelAlt"),
+        flight_roll_deg=row.get("R", row.get("Roll")),
+        flight_pitch_deg=row.get("P", row.get("Pitch")),
+        flight_yaw_deg=row.get("Y", row.get("Yaw")),
+    )
+    boot_s = _boot_s(row)
+    time_s = None if clock is None else boot_s + clock
+    if time_s is None and row.get("GPSWeek", 0) > 1000:
+        time_s = _GPS_EPOCH_S + row["GPSWeek"] * _WEEK_S + row["GPSTime"] * 1e-3 - _LEAP_S
+    number = row.get("Img", row.get("ImageNo"))
+    return CameraEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)

@@ -1,0 +1,229 @@
+"""Flight logs: tlog (MAVLink with arrival times), ArduPilot's DataFlash .BIN, PX4's .ulg; poses and camera events.
+
+All give the same: samples over UTC and exposures in order. Readers take only the messages they need and survive
+truncation and damage: a bad record is skipped, the next good one found.
+"""
+
+import mmap
+import os
+from collections.abc import Callable, Container
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from telemetry.formats.dataflash import read_dataflash
+from telemetry.formats.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
+from telemetry.formats.mavlink_poses import TYPES, CameraEvent, MavlinkPoses
+from telemetry.formats.ulog import read_ulog
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+
+__all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
+
+
+def read_log(path: Path) -> list[FlightLog]:
+    """Read a log of any of the kinds, one entry for each vehicle in it.
+
+    Raises:
+        NotALog: it is none, or holds nothing that can be used.
+    """
+    readers: dict[str, Callable[[Path], list[FlightLog]]] = {
+        ".tlog": read_tlog,
+        ".bin": lambda p: [read_dataflash(p)],
+        ".ulg": lambda p: [read_ulog(p)],
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg)")
+    try:
+        if path.stat().st_size == 0:
+            raise NotALog("the log is empty; copy it again")
+        logs = reader(path)
+    except OSError as error:
+        raise NotALog(f"the log cannot be read ({error.strerror}); check its permissions") from None
+    for log in logs:
+        finish(log)
+    logs = [log for log in logs if log.samples or log.events]
+    if not logs:
+        raise NotALog("the log holds neither positions nor camera events; check that it is the right one")
+    return logs
+
+
+def finish(log: FlightLog) -> None:
+    """Put a log in order: events once each, by time; a trigger goes where its picture is reported, too."""
+    kinds = {event.kind for event in log.events}
+    for richer, poorer in (
+        ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK"),
+        ("CAMERA_FEEDBACK", "CAMERA_TRIGGER"),
+        ("CAMERA_IMAGE_CAPTURED", "CAMERA_TRIGGER"),
+        ("CAM", "TRIG"),
+        ("camera_capture", "camera_trigger"),
+    ):
+        if richer in kinds:
+            log.events = [event for event in log.events if event.kind != poorer]
+    seen: set[tuple[int | None, int]] = set()
+    events = []
+    for event in sorted((e for e in log.events if e.time_s is not None), key=lambda e: e.time_s or 0.0):
+        key = (event.number, round((event.time_s or 0.0) * 100))
+        if key not in seen:
+            seen.add(key)
+            event.sample.time_s = event.time_s
+            events.append(event)
+    lost = len(log.events) - len(events)
+    undated = sum(e.time_s is None for e in log.events)
+    if undated:
+        log.findings.append(
+            Finding("event-without-time", f"{plural(undated, 'camera event')} of {log.path.name} have no time")
+        )
+    elif lost:
+        log.findings.append(
+            Finding("event-repeated", f"{plural(lost, 'camera event')} of {log.path.name} were repeated", note=True)
+        )
+    log.events = events
+    log.samples.sort(key=lambda s: s.time_s or 0.0)
+    _note_missing_numbers(log)
+
+
+def _note_missing_numbers(log: FlightLog) -> None:
+    numbers = sorted({e.number for e in log.events if e.number is not None})
+    missing = (numbers[-1] - numbers[0] + 1 - len(numbers)) if numbers else 0
+    if 0 < missing < 10 * len(numbers):
+        text = f"{plural(missing, 'camera event')} of {log.path.name} are missing by their numbers"
+        log.findings.append(Finding("event-gaps", text))
+
+
+_HEADER = 8
+_MAX_RECORDS = 100_000_000
+
+
+def read_tlog(path: Path) -> list[FlightLog]:
+    """Read a tlog: 8 bytes of arrival time (microseconds, big-endian) before each MAVLink packet.
+
+    Raises:
+        OSError: it cannot be read. NotALog: no packet in it.
+    """
+    os.environ.setdefault("MAVLINK20", "1")
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    wanted = {number: cls.msgname for number, cls in mavlink.mavlink_map.items() if cls.msgname in TYPES}
+    decoder = mavlink.MAVLink(None)
+    decoder.robust_parsing = True
+    vehicles: dict[int, _TlogVehicle] = {}
+    with mapped(path) as data:
+        packets = _read_packets(data, decoder, mavlink.MAVError, wanted, vehicles)
+    if not packets:
+        raise NotALog("the file holds no MAVLink packet; it is no tlog")
+    return [vehicle.log(path, system) for system, vehicle in sorted(vehicles.items())]
+
+
+def _read_packets(
+    data: mmap.mmap, decoder: Any, failure: type[Exception], wanted: Container[int], vehicles: dict[int, "_TlogVehicle"]
+) -> int:
+    """Feed every wanted packet to its vehicle; returns the number of packets."""
+    at, size, packets = 0, len(data), 0
+    while at + _HEADER + 8 <= size:
+        length, number, system = _packet_at(data, at + _HEADER)
+        if length == 0 or at + _HEADER + length > size:
+            at = _resync(data, at + 1)
+            continue
+        packets += 1
+        if number in wanted:
+            try:
+                message = decoder.decode(bytearray(data[at + _HEADER : at + _HEADER + length]))
+            except failure:
+                at = _resync(data, at + 1)
+                continue
+            arrival_s = int.from_bytes(data[at : at + _HEADER], "big") * 1e-6
+            if system not in vehicles:
+                vehicles[system] = _TlogVehicle()
+            vehicles[system].feed(message, arrival_s)
+        at += _HEADER + length
+    return packets
+
+
+def _packet_at(data: mmap.mmap, at: int) -> tuple[int, int, int]:
+    """Length, message number and system of the MAVLink packet at a place; length 0 where there is none."""
+    if data[at] == 0xFD and at + 10 <= len(data):
+        length = 12 + data[at + 1] + (13 if data[at + 2] & 1 else 0)
+        return length, int.from_bytes(data[at + 7 : at + 10], "little"), data[at + 5]
+    if data[at] == 0xFE:
+        return 8 + data[at + 1], data[at + 5], data[at + 3]
+    return 0, 0, 0
+
+
+def _resync(data: mmap.mmap, at: int) -> int:
+    """The next place where a record may begin: a plausible time (years 2000 to 2100), then a packet's mark."""
+    for start in range(at, min(len(data) - _HEADER, at + 70_000)):
+        if data[start + _HEADER] in (0xFD, 0xFE) and data[start] == 0 and 0x03 <= data[start + 1] <= 0x0E:
+            return start
+    return len(data)
+
+
+class _TlogVehicle:
+    """Collects one vehicle's messages; times since boot become UTC at the end of each boot."""
+
+    def __init__(self) -> None:
+        self._poses = MavlinkPoses()
+        self._samples: list[Sample] = []
+        self._events: list[CameraEvent] = []
+        self._done: tuple[list[Sample], list[CameraEvent]] = ([], [])
+        self._clocks: list[float] = []
+        self._arrivals: list[tuple[float, float]] = []
+        self._paces: list[float] = []
+        self._latest: dict[tuple[bool, bool, bool], float] = {}
+
+    def feed(self, message: object, arrival_s: float) -> None:
+        reboots = self._poses.reboots
+        found = self._poses.feed(message)
+        if self._poses.reboots != reboots:
+            self._close()
+        clock = self._poses.utc_minus_boot_s
+        if clock is not None and (not self._clocks or clock != self._clocks[-1]):
+            self._clocks.append(clock)
+        if isinstance(found, Sample):
+            kind = (found.has_position, found.yaw_deg is None, found.height_is_ground)
+            boot_s = found.time_s or 0.0
+            if not 0.0 <= boot_s - self._latest.get(kind, -1.0) < LEAST_STEP_S:
+                self._latest[kind] = boot_s
+                self._arrivals.append((boot_s, arrival_s))
+                self._samples.append(found)
+        elif found is not None:
+            self._events.append(found)
+
+    def _close(self) -> None:
+        """Turn times since boot into UTC, by the vehicle's clock, else by the arrivals."""
+        offset = None
+        if self._clocks:
+            offset = float(np.median(self._clocks))
+        elif self._arrivals:
+            offset = float(np.median([arrival - boot for boot, arrival in self._arrivals]))
+        if len(self._arrivals) > 100:
+            boot, arrival = np.array(self._arrivals).T
+            if np.ptp(arrival) > 1.0:
+                self._paces.append(float(np.ptp(boot) / np.ptp(arrival)))
+        for sample in self._samples:
+            sample.time_s = None if offset is None else (sample.time_s or 0.0) + offset
+        for event in self._events:
+            if event.time_s is None and event.boot_s is not None and offset is not None:
+                event.time_s = event.boot_s + offset
+        self._done[0].extend(self._samples)
+        self._done[1].extend(self._events)
+        self._samples, self._events, self._clocks, self._arrivals = [], [], [], []
+
+    def log(self, path: Path, system: int) -> FlightLog:
+        self._close()
+        log = FlightLog(path, "tlog", f"sysid{system}", *self._done, has_gimbal=self._poses.has_gimbal)
+        if self._poses.reboots:
+            text = f"the vehicle of {path.name} was started again {plural(self._poses.reboots, 'time')}"
+            log.findings.append(Finding("reboot", text))
+        pace = max(self._paces, default=1.0)
+        if not 0.8 < pace < 1.25:
+            log.findings.append(
+                Finding(
+                    "tlog-pace",
+                    f"the vehicle's times in {path.name} run {pace:.1f} times as fast as their arrival (a simulation "
+                    "or a replay); the vehicle's times are used",
+                )
+            )
+        return log

@@ -1,0 +1,66 @@
+"""What a flight log gives, whichever program wrote it, and what its readers share."""
+
+import contextlib
+import mmap
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from telemetry.formats.mavlink_poses import CameraEvent
+from telemetry.samples.findings import Finding
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+
+Row = dict[str, Any]
+"""One record of a binary log."""
+
+
+LEAST_STEP_S = 0.04
+"""Attitude and position are kept at 25 Hz at most: more adds nothing, and a long log would fill the memory."""
+
+
+class NotALog(Exception):
+    """A file with a log's suffix is none; the text is one sentence for the user."""
+
+
+@dataclass(slots=True)
+class FlightLog:
+    """One vehicle's log.
+
+    Attributes:
+        path: the file. kind: "tlog", "DataFlash" or "ULog". vehicle: "sysid3" or the file's name.
+        samples: poses over UTC, in order. events: exposures, in order.
+        has_gimbal: whether the camera's own attitude was logged.
+        findings: what is odd.
+    """
+
+    path: Path
+    kind: str
+    vehicle: str
+    samples: list[Sample] = field(default_factory=list)
+    events: list[CameraEvent] = field(default_factory=list)
+    has_gimbal: bool = False
+    findings: list[Finding] = field(default_factory=list)
+
+    def timeline(self) -> Timeline:
+        """Its poses, for reading at any moment."""
+        return Timeline(self.samples)
+
+
+@contextlib.contextmanager
+def mapped(path: Path) -> Iterator[mmap.mmap]:
+    """A log's bytes without reading them all into memory.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        yield data
+
+
+def each(rows: Iterable[Row], take: Callable[[Row], None]) -> None:
+    """Take every record; one whose fields are missing or of the wrong type (a damaged format) is skipped."""
+    for row in rows:
+        with contextlib.suppress(KeyError, TypeError, ValueError, ArithmeticError):
+            take(row)

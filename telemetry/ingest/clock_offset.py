@@ -1,0 +1,146 @@
+"""The offset between a camera's clock and a vehicle's, from what both have seen of the flight.
+
+All functions return camera time minus vehicle time in seconds, or None where nothing fits.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry.samples.course import local_metres
+from telemetry.samples.timeline import Timeline
+
+Array = NDArray[np.float64]
+
+_QUARTER_S = 900.0
+
+
+def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
+    """The zone (whole quarter hours) under which all photos fall into the flight; the smallest of several."""
+    span = timeline.span
+    if span is None:
+        return None
+    first, last = span
+    fits = [
+        quarters * _QUARTER_S
+        for quarters in range(-56, 57)
+        if times.min() - quarters * _QUARTER_S >= first - 2.0 and times.max() - quarters * _QUARTER_S <= last + 2.0
+    ]
+    return min(fits, key=abs) if fits else None
+
+
+def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, search_s: float = 30.0) -> float | None:
+    """The offset that brings a camera's own positions onto the vehicle's track, in any zone.
+
+    Args:
+        times: (N,) by the camera.
+        lat_lon: (N, 2) degrees by the camera.
+        timeline: the vehicle's.
+        search_s: furthest offset besides whole quarter hours.
+    """
+    if timeline.span is None or len(times) < 3:
+        return None
+    best: tuple[float, float] | None = None
+    for quarters in range(-56, 57):
+        base = quarters * _QUARTER_S
+        if times.max() - base + search_s < timeline.span[0] or times.min() - base - search_s > timeline.span[1]:
+            continue
+        for shift in np.arange(-search_s, search_s + 0.01, 1.0):
+            error = _distance(times - base - shift, lat_lon, timeline)
+            if error is not None and (best is None or error < best[0]):
+                best = error, base + float(shift)
+    if best is None or best[0] > 50.0:
+        return None
+    fine = [(_distance(times - best[1] - s, lat_lon, timeline), best[1] + s) for s in np.arange(-1.0, 1.01, 0.1)]
+    return float(min((e, o) for e, o in fine if e is not None)[1])
+
+
+def _distance(times: Array, lat_lon: Array, timeline: Timeline) -> float | None:
+    """Median distance in metres between positions and a track; None where the track covers too few of them."""
+    lat, lon = timeline.values("lat_deg", times), timeline.values("lon_deg", times)
+    known = ~np.isnan(lat)
+    if known.sum() < max(3, 0.6 * len(times)):
+        return None
+    ours = local_metres(
+        np.concatenate([lat[known], lat_lon[known, 0]]), np.concatenate([lon[known], lat_lon[known, 1]])
+    )
+    half = int(known.sum())
+    return float(np.median(np.hypot(*(ours[:half] - ours[half:]).T)))
+
+
+def offset_by_turning(
+    picture_times: Array, picture_rates: Array, timeline: Timeline, *, search_s: float = 120.0, step_s: float = 0.1
+) -> tuple[float, float] | None:
+    """The offset under which the pictures turn when the vehicle turns.
+
+    Args:
+        picture_times: (N,) video seconds or camera time.
+        picture_rates: (N,) yaw rate seen by the pictures, degrees a second.
+        timeline: the vehicle's; its flight yaw (or camera yaw) is read.
+        search_s: how far the clocks may be apart, beyond what aligns their beginnings.
+        step_s: resolution.
+
+    Returns:
+        Offset and the correlation there (0 to 1), None where the flight has too few turns to tell.
+    """
+    if timeline.span is None or len(picture_times) < 10 or np.std(picture_rates) < 0.5:
+        return None
+    first, last = timeline.span
+    grid = np.arange(first, last, step_s)
+    if len(grid) < 20:
+        return None
+    yaw = timeline.values("flight_yaw_deg", grid)
+    if np.isnan(yaw).all():
+        yaw = timeline.values("yaw_deg", grid)
+    known = ~np.isnan(yaw)
+    if known.sum() < 20:
+        return None
+    rate = np.gradient(np.degrees(np.unwrap(np.radians(np.interp(grid, grid[known], yaw[known])))), step_s)
+    if np.std(rate) < 0.3:
+        return None
+    start = picture_times[0] - first
+    best: list[tuple[float, float]] = []
+    for offset in np.arange(start - search_s, start + search_s, step_s):
+        at = picture_times - offset
+        inside = (at >= first) & (at <= last)
+        if inside.sum() < max(10, 0.5 * len(at)):
+            continue
+        theirs = np.interp(at[inside], grid, rate)
+        ours = picture_rates[inside]
+        if np.std(theirs) < 0.3 or np.std(ours) < 0.3:
+            continue
+        best.append((float(np.corrcoef(ours, theirs)[0, 1]), float(offset)))
+    if not best:
+        return None
+    correlation, offset = max(best)
+    rivals = [c for c, o in best if abs(o - offset) > 3.0]
+    if correlation < 0.5 or (rivals and max(rivals) > correlation - 0.1):
+        return None
+    return offset, correlation
+
+
+def turning_of_pictures(grays: Sequence[NDArray[np.uint8]], times: Array) -> tuple[Array, Array]:
+    """How fast consecutive pictures turn about their centre: times between them and degrees a second.
+
+    A picture that turns clockwise over the ground (yaw grows) shows the ground turning the other way.
+    """
+    import cv2
+
+    middle, rates = [], []
+    for i in range(len(grays) - 1):
+        points = cv2.goodFeaturesToTrack(grays[i], 200, 0.01, 8)
+        if points is None or len(points) < 12 or times[i + 1] <= times[i]:
+            continue
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(grays[i], grays[i + 1], points, None, winSize=(21, 21), maxLevel=4)
+        good = status.ravel() == 1
+        if good.sum() < 12:
+            continue
+        model, inliers = cv2.estimateAffinePartial2D(points[good], moved[good], ransacReprojThreshold=2.0)
+        if model is None or inliers.sum() < 10:
+            continue
+        # Rows run down: a positive angle of the model is clockwise as seen, which is the camera turning left.
+        angle = np.degrees(np.arctan2(model[1, 0], model[0, 0]))
+        middle.append(0.5 * (times[i] + times[i + 1]))
+        rates.append(-angle / (times[i + 1] - times[i]))
+    return np.array(middle), np.array(rates)

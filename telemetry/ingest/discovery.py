@@ -1,0 +1,213 @@
+"""What lies in the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
+    | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
+)
+LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg"})
+_SIDECARS = frozenset({".txt", ".csv"})
+_SUBTITLES = frozenset({".srt"})
+
+
+@dataclass(slots=True)
+class Folder:
+    """One folder with something in it.
+
+    Attributes:
+        path: of the folder. vehicle: id of the vehicle whose photos lie here.
+        pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
+    """
+
+    path: Path
+    vehicle: str
+    pictures: list[Path] = field(default_factory=list)
+    videos: list[Path] = field(default_factory=list)
+    logs: list[Path] = field(default_factory=list)
+    subtitles: list[Path] = field(default_factory=list)
+    tables: list[Path] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """All folders of the inputs, and the folder that picture names are relative to.
+
+    Attributes:
+        root: names are relative to it. folders: those with something in them.
+        left_out: files with a picture's suffix that are not looked into, and why.
+        videos: the vehicle of each video, unless its metadata names another.
+        everywhere: tables and logs that were named, themselves or by a folder, apart from all pictures and videos.
+    """
+
+    root: Path
+    folders: list[Folder]
+    left_out: list[tuple[Path, str]] = field(default_factory=list)
+    videos: dict[Path, str] = field(default_factory=dict)
+    everywhere: frozenset[Path] = frozenset()
+
+    def scope(self, path: Path) -> Path:
+        """The folder whose pictures and videos, with those below it, a table or log tells about."""
+        return self.root if path in self.everywhere else path.parent
+
+    def name(self, path: Path) -> str:
+        """A file's name in all products: relative to the root, forward slashes, writable as UTF-8."""
+        folder = _relative(str(path.parent), str(self.root))
+        return _text(path.name if folder == os.curdir else os.path.join(folder, path.name))
+
+
+@lru_cache(maxsize=1024)
+def _relative(folder: str, root: str) -> str:
+    return os.path.relpath(folder, root)
+
+
+def _text(name: str) -> str:
+    """A path as text: bytes of its name that are no UTF-8 come as escapes, for no file format could hold them."""
+    return name.replace(os.sep, "/").encode("utf-8", "backslashreplace").decode()
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key in which DJI_2 comes before DJI_10; upper and lower case count alike."""
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in _DIGITS.split(name.lower()) if part)
+
+
+_DIGITS = re.compile(r"([0-9]{1,18})")
+
+
+def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
+    """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are not looked into.
+
+    A video or photo that is named itself brings what lies beside it and tells its pose: the SRT of the same name,
+    geo.txt and CSV. Logs have to be named, for any flight's may lie there.
+
+    Raises:
+        InputError: no input, or one that does not exist.
+    """
+    if not inputs:
+        raise InputError("no input was given; name a folder of photos or a video")
+    absolute = [Path(os.path.abspath(path)) for path in inputs]
+    for given, path in zip(inputs, absolute, strict=True):
+        if not path.exists():
+            raise InputError(f"{given} does not exist; check the path")
+    tops = [path if path.is_dir() else path.parent for path in absolute]
+    root = Path(os.path.commonpath(tops))
+    outside = {os.path.abspath(path) for path in exclude}
+    folders: dict[Path, Folder] = {}
+    seen: dict[str, Path] = {}
+    left_out: dict[Path, str] = {}
+    sorted_in: set[Path] = set()
+    inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
+    named = [path for path in absolute if not path.is_dir()]
+    files = [*inside, *((path, False) for path in named), *((path, True) for path in _beside(named))]
+    real_folder = lru_cache(maxsize=None)(os.path.realpath)
+    links = [(file.is_symlink(), file, walked) for file, walked in files]
+    for is_link, file, walked in sorted(links, key=lambda entry: entry[0]):  # the file itself before links to it
+        if walked and file.name.startswith("."):
+            left_out[file] = "a hidden file; rename it if it is a photo to be mapped"
+            continue
+        real = os.path.realpath(file) if is_link else os.path.join(real_folder(str(file.parent)), file.name)
+        first = seen.setdefault(real, file)
+        if first != file:
+            left_out[file] = f"the same file as {first.name}, which is in the input already"
+        elif file not in sorted_in:
+            sorted_in.add(file)
+            _sort_in(file, folders, explicit=not walked)
+    for folder in folders.values():
+        folder.pictures.sort(key=_by_name)
+    ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
+    _name_vehicles(ordered, root)
+    pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
+    left = [(file, why) for file, why in pictures if file not in sorted_in]
+    return Discovery(root, ordered, left, _video_vehicles(ordered, root), _far_from_pictures(tops, ordered))
+
+
+def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
+    return natural_key(path.name)
+
+
+def _walk(top: Path, outside: set[str]) -> list[Path]:
+    found: list[Path] = []
+    for folder, below, files in os.walk(top):
+        below[:] = sorted(
+            name for name in below if not name.startswith(".") and os.path.join(folder, name) not in outside
+        )
+        found += [Path(folder, name) for name in sorted(files, key=natural_key)]
+    return found
+
+
+def _beside(named: list[Path]) -> list[Path]:
+    """Files beside videos and photos that tell where these were taken."""
+    videos = {(path.parent, path.stem.lower()) for path in named if path.suffix.lower() in VIDEO_SUFFIXES}
+    photos = {path.parent for path in named if path.suffix.lower() in PICTURE_SUFFIXES}
+    found: list[Path] = []
+    for folder in sorted(photos | {parent for parent, _ in videos}):
+        try:
+            files = sorted(path for path in folder.iterdir() if path.is_file())
+        except OSError:  # a folder that may be entered but not listed
+            continue
+        for path in files:
+            suffix = path.suffix.lower()
+            table = suffix == ".csv" or path.name.lower() == "geo.txt"
+            if (table and folder in photos) or (suffix in _SUBTITLES and (folder, path.stem.lower()) in videos):
+                found.append(path)
+    return found
+
+
+def _far_from_pictures(tops: Sequence[Path], folders: list[Folder]) -> frozenset[Path]:
+    """Tables and logs in named folders (or named themselves in folders) that hold no picture and no video."""
+    seen = {up for folder in folders if folder.pictures or folder.videos for up in (folder.path, *folder.path.parents)}
+    apart = {top for top in tops if top not in seen}
+    there = (folder for folder in folders if not apart.isdisjoint((folder.path, *folder.path.parents)))
+    return frozenset(path for folder in there for path in (*folder.tables, *folder.logs))
+
+
+def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None:
+    suffix = file.suffix.lower()
+    folder = folders.get(file.parent) or Folder(file.parent, "")
+    kinds = (
+        (PICTURE_SUFFIXES, folder.pictures),
+        (VIDEO_SUFFIXES, folder.videos),
+        (LOG_SUFFIXES, folder.logs),
+        (_SUBTITLES, folder.subtitles),
+        (_SIDECARS, folder.tables),
+    )
+    for suffixes, where in kinds:
+        if suffix in suffixes:
+            where.append(file)
+            folders[file.parent] = folder
+            return
+    if explicit:
+        raise InputError(f"{file.name} is of no kind that can be read; name a folder of photos, a video or a log")
+
+
+def _name_vehicles(folders: list[Folder], root: Path) -> None:
+    taken: set[str] = set()
+    for folder in sorted(folders, key=lambda f: len(f.path.parts), reverse=True):
+        relative = _text(os.path.relpath(folder.path, root))
+        name = (_text(root.name) or "vehicle") if relative == "." else relative
+        while name in taken:
+            name += "_top"
+        taken.add(name)
+        folder.vehicle = name
+
+
+def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
+    """A video is a vehicle by its name; by its path where cameras of several drones gave the same name."""
+    videos = [path for folder in folders for path in folder.videos]
+    often = Counter([path.stem for path in videos] + [folder.vehicle for folder in folders if folder.pictures])
+    paths = {path: _text(os.path.relpath(path, root)) for path in videos}
+    twice = Counter(os.path.splitext(name)[0] for name in paths.values())
+    return {
+        path: _text(path.stem) if often[path.stem] == 1 else stem if twice[stem] == 1 else name
+        for path, name in paths.items()
+        for stem in [os.path.splitext(name)[0]]
+    }

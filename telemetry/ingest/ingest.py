@@ -1,0 +1,237 @@
+"""From inputs to frames: finds the sources, merges them field by field, decides between contradicting tags.
+
+The richer source wins a field, none throws away what another has: a geo.txt without angles leaves the photos'
+angles, and an absolute altitude never becomes a height.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Ingest, Rejection
+from telemetry.formats import pose_table
+from telemetry.formats.picture_container import NotAPicture
+from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
+from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
+from telemetry.ingest.photo_order import in_order
+from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey
+from telemetry.ingest.video_ingest import read_videos
+from telemetry.photos.flight_checks import flight_findings
+from telemetry.photos.photo_frames import frames_of
+from telemetry.photos.photo_tags import Angles, PhotoTags, read_photos
+from telemetry.samples.findings import Finding, plural
+
+__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
+
+_BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
+"""Spectral bands by how well they show the ground; "" is a colour picture."""
+
+
+def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
+    """Read inputs into frames.
+
+    Args:
+        inputs: folders of photos (recursive; each folder with photos is one vehicle), photos, videos.
+        progress: called while reading.
+        options: see LoadOptions.
+
+    Raises:
+        InputError: an input does not exist or is of no known kind, or a pose table is damaged.
+    """
+    found = survey(inputs, progress=progress, options=options)
+    findings = [*found.findings, *(f for source in found.sources for f in source.findings)]
+    warnings = dict.fromkeys(str(finding) for finding in findings if not finding.note)
+    return Ingest(found.frames(), found.rejected, list(warnings))
+
+
+def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
+    """The same as `load`, source by source, for `inspect`."""
+    options = options or LoadOptions()
+    found = discover([Path(path) for path in inputs], options.exclude)
+    result = Survey(found.root, found)
+    vehicles = {folder.path: folder.vehicle for folder in found.folders}
+    for path, why in found.left_out:
+        result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, "")))
+    tables = _tables(found, result)
+    logs = read_logs(found, result)
+    total = sum(len(folder.pictures) for folder in found.folders)
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress("reading photos", done, total)
+
+    # One sequence over all folders: with a call for each, processes would wait at every folder's end.
+    pictures = [picture for folder in found.folders for picture in folder.pictures]
+    with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
+        for folder in found.folders:
+            if folder.pictures:
+                _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result)
+            if folder.videos or folder.subtitles:
+                read_videos(folder, found, logs, options, progress, result)
+    _check_vehicles(result)
+    return result
+
+
+def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, pose_table.PoseTable]]:
+    """Pose tables with the folder they apply to (and what lies below), innermost last."""
+    tables: list[tuple[Path, str, pose_table.PoseTable]] = []
+    for folder in found.folders:
+        for path in folder.tables:
+            if pose_table.is_geo_txt(path):
+                table: pose_table.PoseTable | None = pose_table.read_geo_txt(path)
+                kind = "geo.txt"
+            elif path.suffix.lower() == ".csv":
+                table, kind = pose_table.read_pose_csv(path), "CSV"
+            else:
+                continue
+            if table is not None:
+                where = found.scope(path)
+                tables.append((where, kind, table))
+                source = SourceInfo(found.name(path), kind)
+                source.findings += _table_findings(path, where, table, found)
+                result.sources.append(source)
+    return sorted(tables, key=lambda entry: len(entry[0].parts))
+
+
+def _table_findings(path: Path, folder: Path, table: pose_table.PoseTable, found: Discovery) -> list[Finding]:
+    """Lines of a pose table that say nothing, or are about pictures that are not there."""
+    findings = []
+    if table.useless:
+        text = f"{plural(table.useless, 'line')} of {path.name} hold no position that can be one; they are not used"
+        findings.append(Finding("table-lines", text))
+    pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
+    names = {p.name.lower() for p in pictures} | {p.relative_to(folder).as_posix().lower() for p in pictures}
+    absent = [name for name in table if name not in names]
+    if absent:
+        text = f"{plural(len(absent), 'line')} of {path.name} name pictures that are not here, {absent[0]} first"
+        findings.append(Finding("table-pictures", text, note=len(absent) < len(table)))
+    return findings
+
+
+def _photo_folder(
+    folder: Folder,
+    tags: Iterable[PhotoTags | NotAPicture | None],
+    found: Discovery,
+    tables: Sequence[tuple[Path, str, pose_table.PoseTable]],
+    logs: Sequence[LogSource],
+    result: Survey,
+) -> None:
+    """Make one folder's photos, of which these are the tags, one source."""
+    at_root = folder.path == found.root
+    source = SourceInfo(folder.path.name if at_root else found.name(folder.path), "photos")
+    groups: dict[str, list[PhotoTags]] = {}
+    seen = 0
+    for path, photo in zip(folder.pictures, tags, strict=True):
+        if photo is None:
+            continue
+        seen += 1
+        name = found.name(path)
+        if isinstance(photo, NotAPicture):
+            result.rejected.append(Rejection(name, str(photo), folder.vehicle))
+            continue
+        vehicle = _merge_tables(photo, path, tables) or folder.vehicle
+        groups.setdefault(vehicle, []).append(photo)
+    for vehicle in sorted(groups, key=natural_key):
+        photos = sorted(groups[vehicle], key=_photo_key)
+        add_logs(photos, folder.path, vehicle, logs, source.findings)
+        photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
+        photos = in_order(photos, vehicle, source.findings)
+        frames = frames_of(photos, vehicle, found.name, source.findings)
+        source.frames += frames
+        source.findings += flight_findings(photos, frames, vehicle)
+    source.counts["frames"] = len(source.frames)
+    if seen:
+        result.sources.append(source)
+
+
+def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+    """Of a multispectral camera's pictures the colour ones, else those of one band; the others are rejected."""
+    bands = {photo.band for photo in photos}
+    if len(bands) < 2:
+        return list(photos)
+    kept = next((band for band in _BANDS if band in {b.lower() for b in bands}), min(bands).lower())
+    for photo in photos:
+        if photo.band.lower() != kept:
+            what = "the colour pictures" if not kept else f"band {kept}"
+            reason = f"a picture of one spectral band ({photo.band or 'colour'}); of each exposure {what} is mapped"
+            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
+    return [photo for photo in photos if photo.band.lower() == kept]
+
+
+def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+    """Those that have a position; the others are rejected."""
+    placed = []
+    for photo in photos:
+        if photo.lat_deg is not None and photo.lon_deg is not None:
+            placed.append(photo)
+        else:
+            reason = "the picture has no position; put a geo.txt beside it or name a log, too"
+            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
+    return placed
+
+
+def _photo_key(photo: PhotoTags) -> tuple[object, ...]:
+    return (math.inf if photo.time_s is None else photo.time_s, natural_key(photo.path.name))
+
+
+def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, pose_table.PoseTable]]) -> str | None:
+    """Put what tables say over the photo's own tags, field by field; returns a vehicle's name if one is given."""
+    vehicle = None
+    for where, kind, table in tables:
+        if not path.is_relative_to(where):
+            continue
+        row = pose_table.lookup(table, path.relative_to(where).as_posix())
+        if row is None:
+            continue
+        vehicle = row.vehicle or vehicle
+        if row.lat_deg is not None and row.lon_deg is not None:
+            photo.lat_deg, photo.lon_deg = row.lat_deg, row.lon_deg
+            photo.origin["position"] = kind
+            photo.position_sigma_m = row.sigma_m if row.sigma_m is not None else photo.position_sigma_m
+        if row.altitude_m is not None:
+            photo.altitude_m = row.altitude_m
+        if row.height_m is not None:
+            photo.height_m, photo.origin["height"] = row.height_m, kind
+        if row.time_s is not None:
+            photo.time_s, photo.origin["time"] = row.time_s, kind
+        if row.fov_deg is not None and 2.0 < row.fov_deg < 150.0:
+            photo.fov_hint_rad, photo.origin["fov_hint"] = math.radians(row.fov_deg), kind
+        given: Angles = (row.yaw_deg, row.pitch_deg, row.roll_deg)
+        if any(angle is not None for angle in given):
+            own = photo.camera_deg
+            photo.camera_deg = (
+                own[0] if given[0] is None else given[0],
+                own[1] if given[1] is None else given[1],
+                own[2] if given[2] is None else given[2],
+            )
+            photo.origin["angles"] = kind
+            photo.yaw_is_stated |= given[0] is not None
+    return vehicle
+
+
+def _check_vehicles(result: Survey) -> None:
+    """Findings over all sources."""
+    if not result.sources and not result.rejected:
+        result.findings.append(Finding("nothing", "no picture was found in the inputs"))
+
+
+def require_frames(ingest: Ingest) -> None:
+    """Raise if there is nothing to map, saying why.
+
+    Raises:
+        InputError: no frame came out of the inputs.
+    """
+    if ingest.frames:
+        return
+    if not ingest.rejected:
+        raise InputError("no picture was found in the input; name a folder of photos or a video")
+    reasons = Counter(rejection.reason for rejection in ingest.rejected)
+    reason, count = reasons.most_common(1)[0]
+    raise InputError(f"none of the {plural(len(ingest.rejected), 'picture')} can be used; {count} because {reason}")

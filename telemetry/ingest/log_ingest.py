@@ -1,0 +1,262 @@
+"""Flight logs as sources: exposures for `inspect`, poses for photos and videos that lie beside them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from telemetry.formats.flight_logs import FlightLog, NotALog, read_log
+from telemetry.formats.mavlink_poses import CameraEvent, fixed_camera
+from telemetry.ingest.discovery import Discovery
+from telemetry.ingest.event_pairing import Pairing, pair
+from telemetry.ingest.survey import SourceInfo, Survey
+from telemetry.photos.flight_checks import number_of
+from telemetry.photos.photo_tags import PhotoTags
+from telemetry.samples.course import local_metres
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+
+_LEAST_SHARE = 0.5
+_SAME_EXPOSURE_S = 1.0
+_FAR_M = 60.0
+_NAME_BONUS = 0.05
+
+
+@dataclass(slots=True)
+class LogSource:
+    """A log, the folder that it is about, and what of it was used."""
+
+    folder: Path
+    log: FlightLog
+    source: SourceInfo
+    timeline: Timeline
+    used: bool = False
+
+
+def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
+    """All logs of the inputs, as sources; the same exposures in a second log are counted once."""
+    logs: list[LogSource] = []
+    for folder in found.folders:
+        for path in folder.logs:
+            try:
+                vehicles = read_log(path)
+            except NotALog as reason:
+                # A .bin may be anything; only what calls itself a log is worth a word.
+                if path.suffix.lower() != ".bin":
+                    result.findings.append(Finding("not-a-log", f"{found.name(path)}: {reason}"))
+                continue
+            source = SourceInfo(found.name(path), vehicles[0].kind)
+            result.sources.append(source)
+            for log in vehicles:
+                source.findings += log.findings
+                source.tracks[log.vehicle] = [s for s in log.samples if s.has_position]
+                source.shown[log.vehicle] = 0
+                logs.append(LogSource(found.scope(path), log, source, log.timeline()))
+    _count_once(logs)
+    return logs
+
+
+def _count_once(logs: Sequence[LogSource]) -> None:
+    """Count exposures; a log whose exposures are all in another one's names it instead."""
+    counted: list[LogSource] = []
+    for entry in sorted(logs, key=lambda e: (-len(e.log.events), e.log.kind != "DataFlash")):
+        twin = next((other for other in counted if _same_exposures(entry.log, other.log)), None)
+        if twin is None or not entry.log.events:
+            entry.source.counts["camera_events"] += len(entry.log.events)
+            counted.append(entry)
+            continue
+        text = (
+            f"its {plural(len(entry.log.events), 'camera event')} are those of {twin.log.path.name}, where they are "
+            "counted"
+        )
+        entry.source.findings.append(Finding("same-exposures", text, note=True))
+
+
+def _same_exposures(a: FlightLog, b: FlightLog) -> bool:
+    """Whether two logs hold the same exposures: same moments at the same places."""
+    if not a.events or len(b.events) < len(a.events):
+        return False
+    times = np.array([e.time_s for e in b.events], dtype=np.float64)
+    for event in a.events:
+        i = int(np.argmin(np.abs(times - (event.time_s or 0.0))))
+        other = b.events[i]
+        if abs(times[i] - (event.time_s or 0.0)) > _SAME_EXPOSURE_S or _apart_m(event.sample, other.sample) > 3.0:
+            return False
+    return True
+
+
+def _apart_m(a: Sample, b: Sample) -> float:
+    if a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
+        return 0.0
+    return float(np.hypot(*local_metres([a.lat_deg, b.lat_deg], [a.lon_deg, b.lon_deg])[1]))
+
+
+def add_logs(
+    photos: Sequence[PhotoTags], folder: Path, vehicle: str, logs: Sequence[LogSource], findings: list[Finding]
+) -> None:
+    """Fill what photos lack from the log that fits them best.
+
+    Args:
+        photos: of one vehicle, in order of time and name.
+        folder: where they lie; logs there and above are considered.
+        vehicle: id, for messages.
+        logs: all logs.
+        findings: what was found is appended here.
+    """
+    near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
+    if not near or not photos or all(_is_complete(photo) for photo in photos):
+        return
+    tried = []
+    for entry in near:
+        pairing = _pair(photos, entry.log.events)
+        if len(pairing.pairs) >= max(1.0, _LEAST_SHARE * min(len(photos), len(entry.log.events))):
+            tried.append((_fit(photos, pairing, entry), _same_number(vehicle, entry.log), pairing, entry))
+    if not tried:
+        _use_timeline(photos, near, vehicle, findings)
+        return
+    tried.sort(key=lambda row: -(row[0] + _NAME_BONUS * row[1]))
+    fit, named, pairing, entry = tried[0]
+    _use_events(photos, pairing, entry, vehicle, findings)
+    rivals = [other for rival, _, _, other in tried[1:] if rival > fit - _NAME_BONUS and not other.used]
+    if rivals and not named:
+        text = f"the photos fit {rivals[0].log.path.name} as well as {entry.log.path.name}, which was taken"
+        findings.append(Finding("log-ambiguous", text, vehicle))
+
+
+def _fit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> float:
+    """How well a log fits photos: 1 where each has its event, less for what is left over, rests, and reuse."""
+    share = len(pairing.pairs) / max(len(photos), len(entry.log.events))
+    return share - 0.5 * (pairing.how != "time") - 0.6 * entry.used - 0.01 * math.log1p(pairing.residual_s)
+
+
+def _same_number(vehicle: str, log: FlightLog) -> bool:
+    """Whether a vehicle's name and a log's end in the same number: swarms fly alike, and their logs fit each other."""
+    number = number_of(vehicle)
+    return number is not None and number in (number_of(log.path.name), number_of(log.vehicle))
+
+
+def _is_complete(photo: PhotoTags) -> bool:
+    return photo.lat_deg is not None and photo.height_m is not None and photo.camera_deg[0] is not None
+
+
+def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent]) -> Pairing:
+    return pair(
+        [p.time_s for p in photos],
+        [e.time_s for e in events],
+        [number_of(p.path.name) for p in photos],
+        [e.number for e in events],
+    )
+
+
+def _use_events(
+    photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
+) -> None:
+    """Give photos the poses of their events."""
+    entry.used = True
+    log = entry.log
+    far = 0
+    for i, j in pairing.pairs:
+        event = log.events[j]
+        around = entry.timeline.at(event.time_s or 0.0)
+        pose = event.sample.merge(around)
+        if not log.has_gimbal:
+            pose = fixed_camera(pose)
+        photo = photos[i]
+        if photo.lat_deg is not None and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > _FAR_M:
+            far += 1
+        fill(photo, replace(pose, time_s=event.time_s), f"{event.kind} ({log.path.name})", gimbal=log.has_gimbal)
+    findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
+    if far > 0.2 * len(pairing.pairs):
+        text = f"{plural(far, 'photo')} lie more than {_FAR_M:.0f} m from their camera events; the log may be another's"
+        findings.append(Finding("pairing-distance", text, vehicle))
+
+
+def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: FlightLog) -> list[Finding]:
+    used_photos, used_events = {i for i, _ in pairing.pairs}, {j for _, j in pairing.pairs}
+    how = {"time": "by time", "number": "by their numbers", "order": "by order alone"}[pairing.how]
+    count = f"{len(pairing.pairs)} of {plural(len(photos), 'photo')}"
+    text = f"{count} were paired with camera events of {log.path.name} {how}"
+    if pairing.offset_s is not None:
+        text += f"; the camera's clock is {pairing.offset_s:+.1f} s off (rest {pairing.residual_s:.2f} s)"
+    found = [Finding("paired", text, note=True)]
+    if len(used_events) < len(log.events):
+        first = next((j for j in range(len(log.events)) if j in used_events), 0)
+        missing = len(log.events) - len(used_events)
+        where = f", {first} of them before the first photo" if first else ""
+        text = f"{plural(missing, 'camera event')} of {log.path.name} have no photo{where}"
+        found.append(Finding("photos-missing", text))
+    if len(used_photos) < len(photos):
+        text = f"{plural(len(photos) - len(used_photos), 'photo')} have no camera event in {log.path.name}"
+        found.append(Finding("photos-extra", text))
+    if pairing.ambiguous:
+        text = f"photos fit the camera events of {log.path.name} in more than one way; check the map for a shift"
+        found.append(Finding("pairing-ambiguous", text))
+    if not log.has_gimbal:
+        text = f"{log.path.name} reports no gimbal: the camera is taken as fixed under the airframe"
+        found.append(Finding("fixed-camera", text, note=True))
+    return found
+
+
+def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:
+    """Put a pose's fields where a photo has none; its time replaces the camera's clock."""
+    if photo.lat_deg is None and pose.has_position:
+        photo.lat_deg, photo.lon_deg = pose.lat_deg, pose.lon_deg
+        photo.position_sigma_m = pose.sigma_m
+        photo.origin["position"] = origin
+    if photo.height_m is None and pose.height_m is not None:
+        photo.height_m, photo.height_is_ground = pose.height_m, pose.height_is_ground
+        photo.origin["height"] = origin
+    if photo.altitude_m is None:
+        photo.altitude_m = pose.altitude_m
+    if photo.camera_deg[0] is None and pose.yaw_deg is not None:
+        photo.camera_deg = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
+        photo.yaw_is_stated = True
+        photo.origin["angles"] = origin if gimbal else f"{origin}, camera fixed under the airframe"
+    if photo.flight_deg[0] is None and pose.flight_yaw_deg is not None:
+        photo.flight_deg = (pose.flight_yaw_deg, pose.flight_pitch_deg, pose.flight_roll_deg)
+        photo.origin["flight_yaw"] = origin
+    if pose.time_s is not None:
+        photo.time_s, photo.origin["time"] = pose.time_s, origin
+
+
+def _use_timeline(
+    photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]
+) -> None:
+    """Without camera events: poses at the photos' times, the clock corrected by positions or whole quarter hours."""
+    from telemetry.ingest.clock_offset import offset_by_positions, offset_by_zone
+
+    timed = [p for p in photos if p.time_s is not None]
+    if not timed:
+        return
+    times = np.array([p.time_s for p in timed], dtype=np.float64)
+    for entry in near:
+        placed = [p.lat_deg is not None for p in timed]
+        offset: float | None
+        if sum(placed) > 4:
+            known = [p for p in timed if p.lat_deg is not None]
+            offset = offset_by_positions(
+                np.array([p.time_s for p in known], dtype=np.float64),
+                np.array([[p.lat_deg, p.lon_deg] for p in known], dtype=np.float64),
+                entry.timeline,
+            )
+        else:
+            offset = offset_by_zone(times, entry.timeline)
+        if offset is None:
+            continue
+        count = 0
+        for photo, pose in zip(timed, entry.timeline.at_all(times - offset), strict=True):
+            if pose.has_position:
+                count += 1
+                pose = pose if entry.log.has_gimbal else fixed_camera(pose)
+                fill(photo, pose, f"track of {entry.log.path.name}", gimbal=entry.log.has_gimbal)
+        if count:
+            entry.used = True
+            text = (
+                f"{plural(count, 'photo')} got poses from the track of {entry.log.path.name} by time; the camera's "
+                f"clock was taken to be {offset:+.1f} s off"
+            )
+            findings.append(Finding("posed-by-time", text, vehicle, note=sum(placed) > 4))
+            return

@@ -1,0 +1,53 @@
+"""The order in which photos were taken, also where the camera's clock was set in between."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from telemetry.ingest.discovery import natural_key
+from telemetry.photos.photo_tags import PhotoTags
+from telemetry.samples.course import local_metres
+from telemetry.samples.findings import Finding, plural
+
+_JUMP_S = 60.0
+
+
+def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
+    """Photos in the order of their times, or of their names where the clock jumped.
+
+    Where the two orders differ, the one with the shorter track is believed; times are then shifted after each jump so
+    that they follow on, which keeps intervals within each part.
+
+    Args:
+        photos: of one vehicle.
+        vehicle: id, for messages.
+        findings: what was found is appended here.
+    """
+    by_name = sorted(photos, key=lambda p: natural_key(p.path.name))
+    by_time = sorted(by_name, key=lambda p: float("inf") if p.time_s is None else p.time_s)
+    if by_time == by_name or any(p.time_s is None or p.lat_deg is None for p in photos):
+        return by_time
+    times = np.array([p.time_s for p in by_name], dtype=np.float64)
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0.0)
+    if len(back) > 3 or steps[back].min() > -_JUMP_S or _length_m(by_name) > 0.7 * _length_m(by_time):
+        return by_time
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    for at in back:
+        shift = times[at] + usual - times[at + 1]
+        times[at + 1 :] += shift
+    for photo, time_s in zip(by_name, times.tolist(), strict=True):
+        if photo.time_s != time_s:
+            photo.time_s = time_s
+            photo.origin["time"] = f"{photo.origin.get('time', 'camera clock')}, shifted after a jump"
+    text = (
+        f"the camera's clock jumped back {plural(len(back), 'time')} during the flight; the order of the file names is "
+        "used, and times after a jump are shifted"
+    )
+    findings.append(Finding("clock-jump", text, vehicle))
+    return by_name
+
+
+def _length_m(photos: Sequence[PhotoTags]) -> float:
+    ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
+    return float(np.hypot(*np.diff(ground, axis=0).T).sum()) if len(ground) > 1 else 0.0

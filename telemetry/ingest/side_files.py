@@ -1,0 +1,90 @@
+"""Files beside pictures that are no pictures: ground control points and georeferenced rasters; named, not mapped."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from telemetry.samples.findings import Finding
+
+
+@dataclass(frozen=True, slots=True)
+class ControlPoints:
+    """What an ODM control point file holds.
+
+    Attributes:
+        rows: number of observations. points: number of points. heights: their z values.
+        widest: largest column of a pixel. images: lower-case names of pictures.
+    """
+
+    rows: int
+    points: int
+    heights: tuple[float, ...]
+    widest: float
+    images: frozenset[str]
+
+
+def read_control_points(path: Path) -> ControlPoints | None:
+    """Read an ODM `gcp_list.txt` (projection, then x y z column row image); None where it is no such file."""
+    try:
+        if path.stat().st_size > 8 << 20:
+            return None
+        lines = path.read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return None
+    if not lines or not ("+proj" in lines[0] or "EPSG" in lines[0].upper() or "UTM" in lines[0].upper()):
+        return None
+    points: dict[tuple[float, float], float] = {}
+    images, widest, rows = set(), 0.0, 0
+    for line in lines[1:]:
+        words = line.split()
+        try:
+            x, y, z, column, _ = (float(word) for word in words[:5])
+        except ValueError:
+            continue
+        if len(words) < 6 or Path(words[5]).suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".dng"):
+            continue
+        points[x, y] = z
+        images.add(words[5].lower())
+        widest, rows = max(widest, column), rows + 1
+    return ControlPoints(rows, len(points), tuple(points.values()), widest, frozenset(images)) if rows else None
+
+
+def control_point_findings(path: Path, points: ControlPoints, widths: Collection[int]) -> list[Finding]:
+    """What to know about control points beside pictures of some widths."""
+    text = f"{path.name} holds {points.points} ground control points in {points.rows} pictures; they are not used"
+    found = [Finding("control-points", text, note=True)]
+    width = max(widths, default=0)
+    if width and points.widest > 1.05 * width:
+        found.append(
+            Finding(
+                "control-points-scale",
+                f"the pixels of {path.name} go up to column {points.widest:.0f}, but the pictures are {width} wide: "
+                "they belong to larger originals and have to be scaled",
+            )
+        )
+    if len(points.heights) > 2 and len(set(points.heights)) == 1:
+        text = f"all control points of {path.name} have the same height, {points.heights[0]:g} m: it was not measured"
+        found.append(Finding("control-points-height", text))
+    return found
+
+
+def raster_finding(path: Path) -> Finding | None:
+    """What a georeferenced raster is; None where it cannot be read."""
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with rasterio.open(path) as raster:
+            gsd = abs(raster.transform.a)
+            crs = raster.crs.to_string() if raster.crs else "no CRS"
+            kind = raster.dtypes[0]
+            unit = " m" if raster.crs and raster.crs.is_projected else ""
+            what = "colours" if raster.count >= 3 and kind == "uint8" else "values, such as heights"
+            use = "--basemap" if what == "colours" else "--dem"
+            text = (
+                f"{path.name} is a georeferenced raster and no picture of a camera: {raster.width} x {raster.height}, "
+                f"{gsd:g}{unit} a pixel, {crs}, {raster.count} x {kind} {what}; give it with {use}"
+            )
+    except (RasterioError, OSError, ValueError):
+        return None
+    return Finding("raster", text, note=True)

@@ -1,0 +1,198 @@
+"""Live video with metadata: RTSP, RTMP, MPEG-TS over UDP or TCP; pictures with their poses as they arrive.
+
+SEI is bound to its own picture as in files. KLV that comes beside the pictures is interpolated where the next packet
+is already here, else the last one is held for half a second at most. A lost link is opened again until told to stop.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry.formats import bitstream, klv, sei
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+from telemetry.video.extraction import to_rgb
+from telemetry.video.picture_choice import Candidate, Picker
+from telemetry.video.video_file import NotAVideo, open_video, parked
+
+_HELD_S = 0.5
+_KEPT_SAMPLES = 64
+_RETRY_S = (0.5, 1.0, 2.0, 5.0)
+
+
+@dataclass(slots=True)
+class LivePicture:
+    """One picture of a live stream.
+
+    Attributes:
+        number: counts the pictures since the stream was first opened.
+        rgb: uint8 (rows, columns, 3).
+        sample: its pose, None where the stream carries none. origin: where the pose is from.
+        time_s: UTC epoch seconds of the exposure by the stream, else of its arrival.
+        damaged: True where the decoder had to conceal losses.
+    """
+
+    number: int
+    rgb: NDArray[np.uint8]
+    sample: Sample | None
+    origin: str
+    time_s: float
+    damaged: bool = False
+
+
+def open_stream(
+    url: str,
+    *,
+    every_m: float | None = None,
+    every_s: float | None = None,
+    all_pictures: bool = False,
+    stop: threading.Event | None = None,
+    reconnect: bool = True,
+    timeout_s: float = 10.0,
+    options: Mapping[str, str] | None = None,
+    clock: Callable[[], float] = time.time,
+    on_state: Callable[[str], None] | None = None,
+) -> Iterator[LivePicture]:
+    """Pictures of a live stream, thinned as those of a file (`telemetry.video.picture_choice`).
+
+    Args:
+        url: rtsp://, rtmp://, udp://, tcp://, or a file.
+        every_m: spacing in metres.
+        every_s: spacing in seconds.
+        all_pictures: True to get every picture.
+        stop: ends the iteration when set (within `timeout_s`).
+        reconnect: whether a lost link is opened again; False ends with the stream.
+        timeout_s: of opening and of waiting for data.
+        options: for FFmpeg, over the defaults.
+        clock: gives the time of arrival.
+        on_state: told "open" and "lost: reason".
+
+    Raises:
+        NotAVideo: the first opening fails and `reconnect` is False.
+    """
+    stop = stop or threading.Event()
+    picker = None if all_pictures else Picker(every_m, every_s)
+    numbers = iter(range(1 << 62))
+    attempt = 0
+    while not stop.is_set():
+        try:
+            with open_video(url, timeout=timeout_s, options=_options(url, timeout_s, options)) as container:
+                attempt = 0
+                if on_state is not None:
+                    on_state("open")
+                yield from _read(container, picker, stop, numbers, clock)
+            reason = "the stream ended"
+        except NotAVideo as error:
+            if not reconnect:
+                raise
+            reason = str(error)
+        except _Lost as error:
+            reason = str(error)
+        if on_state is not None:
+            on_state(f"lost: {reason}")
+        if not reconnect:
+            return
+        stop.wait(_RETRY_S[min(attempt, len(_RETRY_S) - 1)])
+        attempt += 1
+
+
+class _Lost(Exception):
+    """The link broke."""
+
+
+def _options(url: str, timeout_s: float, given: Mapping[str, str] | None) -> dict[str, str]:
+    # Not "nobuffer": it throws away what was read while probing, and with it the first key picture.
+    options = {"flags": "low_delay", "analyzeduration": "1000000", "probesize": "1000000"}
+    if "://" in url:  # PyAV's own timeout is off while streams are looked for
+        options["rw_timeout"] = str(round(timeout_s * 1e6))
+    if url.startswith("rtsp"):
+        options["rtsp_transport"] = "tcp"
+    elif url.startswith("udp"):
+        options |= {"fifo_size": "1000000", "overrun_nonfatal": "1"}
+    return options | dict(given or {})
+
+
+def _read(
+    container: Any, picker: Picker | None, stop: threading.Event, numbers: Iterator[int], clock: Callable[[], float]
+) -> Iterator[LivePicture]:
+    """Pictures of one connection."""
+    import av
+    from av.codec.context import Flags
+
+    stream = container.streams.video[0]
+    context = stream.codec_context
+    context.flags |= int(Flags.copy_opaque) | int(Flags.output_corrupt)
+    form = bitstream.StreamFormat.of(context.name, context.extradata)
+    wanted = [stream, *(s for s in container.streams if s.type == "data")]
+    beside: deque[Sample] = deque(maxlen=_KEPT_SAMPLES)
+    source = container.demux(*wanted)
+    now_s = 0.0
+    with parked(context):
+        while not stop.is_set():
+            try:
+                packet = next(source)
+                is_video = packet.stream is stream
+                if packet.size and packet.pts is not None:
+                    seconds = float(packet.pts * packet.time_base)
+                    now_s = seconds if is_video else now_s
+                else:
+                    seconds = now_s
+                if not is_video:
+                    beside.extend(
+                        replace(p.sample, time_s=seconds)
+                        for p in klv.packets(bytes(packet))
+                        if p.sample is not None and p.sample.has_position
+                    )
+                    continue
+                packet.opaque = (
+                    None if form is None or not packet.size else sei.read(bitstream.sei_messages(bytes(packet), form))
+                )
+                frames = packet.decode()
+            except StopIteration:
+                return
+            except (av.error.InvalidDataError, ValueError):
+                continue
+            except (av.error.FFmpegError, OSError) as error:
+                raise _Lost(str(getattr(error, "strerror", None) or error).lower()) from None
+            for frame in frames:
+                yield from _offer(frame, beside, picker, next(numbers), now_s, clock)
+
+
+def _offer(
+    frame: Any, beside: deque[Sample], picker: Picker | None, number: int, now_s: float, clock: Callable[[], float]
+) -> Iterator[LivePicture]:
+    seconds = float(frame.time) if frame.time is not None else now_s
+    reading = frame.opaque if isinstance(frame.opaque, sei.Reading) else None
+    sample, origin = (reading.sample, " + ".join(reading.decoders)) if reading is not None else (None, "")
+    if beside and (sample is None or not sample.has_position):
+        held = _beside(beside, seconds)
+        if held is not None:
+            held = replace(held, time_s=None if sample is None else sample.time_s)
+            sample, origin = (held if sample is None else held.merge(sample)), " + ".join(filter(None, ("KLV", origin)))
+    candidate = Candidate(number, frame, sample, seconds, origin)
+    taken = [candidate] if picker is None else picker.push(candidate)
+    for one in taken:
+        stated = None if one.sample is None else one.sample.time_s
+        yield LivePicture(
+            one.number,
+            to_rgb(one.frame),
+            one.sample,
+            one.origin,
+            clock() if stated is None else stated,
+            bool(one.frame.is_corrupt),
+        )
+
+
+def _beside(samples: deque[Sample], seconds: float) -> Sample | None:
+    """KLV at a moment of the stream: between two packets, or the last one held."""
+    last = max(samples, key=lambda s: s.time_s or 0.0)
+    if last.time_s is None or seconds > last.time_s + _HELD_S:
+        return None
+    found = Timeline([*samples, replace(last, time_s=last.time_s + _HELD_S)]).at(seconds)
+    return found if found.has_position else None

@@ -1,0 +1,217 @@
+"""What a flight's tags say about how well it can be mapped: gaps, coarse times, lens distortion, geometry.
+
+Nothing is changed here; most of it is worth knowing rather than wrong.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.frame import Frame
+from telemetry.photos.photo_tags import PhotoTags
+from telemetry.samples.course import Straight, courses_deg, local_metres, straight_legs
+from telemetry.samples.findings import Finding, plural
+
+Array = NDArray[np.float64]
+
+_ASTRAY_M = 100.0
+_LOW_SHARE = 0.4
+"""A picture taken below this part of the usual height shows too little ground to be followed."""
+_FOV_GUESS_RAD = math.radians(70.0)
+
+
+def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
+    """Observations on one vehicle's photos (in order, with the frames that were made of them)."""
+    if len(frames) < 2:
+        return []
+    ground = track_of(frames)
+    legs = straight_legs(ground)
+    found = [
+        _maker_notes(photos),
+        _distortion(photos),
+        _accurate_positions(frames),
+        *_times(frames, ground),
+        _astray(frames, ground),
+        _standing(ground),
+        _missing_numbers(frames),
+        _spacing(frames, ground, legs),
+        _one_height(frames),
+        _low(frames),
+    ]
+    return [Finding(f.code, f.message, vehicle, f.note) for f in found if f is not None]
+
+
+def track_of(frames: Sequence[Frame]) -> Array:
+    """East and north (N, 2) of frames in metres about the first."""
+    return local_metres([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
+
+
+def _maker_notes(photos: Sequence[PhotoTags]) -> Finding | None:
+    count = sum(p.origin.get("angles") == "DJI MakerNotes" for p in photos)
+    if not count:
+        return None
+    text = f"{plural(count, 'photo')} have no XMP; their attitude comes from DJI's MakerNotes"
+    return Finding("attitude-makernotes", text, note=True)
+
+
+def _distortion(photos: Sequence[PhotoTags]) -> Finding | None:
+    known = [p.dewarp_k1 for p in photos if p.dewarp_k1 is not None]
+    if not known:
+        return None
+    text = (
+        f"the pictures are not dewarped; their tags state a radial distortion of k1 = {np.median(known):+.3f}, "
+        "which is estimated anew"
+    )
+    return Finding("lens-distortion", text, note=True)
+
+
+def _accurate_positions(frames: Sequence[Frame]) -> Finding | None:
+    known = [f.fix.position_sigma_m for f in frames if f.fix.position_sigma_m is not None]
+    if len(known) < 0.5 * len(frames) or np.median(known) > 0.1:
+        return None
+    text = f"positions are accurate (RTK): one sigma {100 * float(np.median(known)):.1f} cm (median)"
+    return Finding("rtk", text, note=True)
+
+
+def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
+    times = np.array([np.nan if f.time_s is None else f.time_s for f in frames])
+    found: list[Finding] = []
+    if np.isnan(times).all():
+        return [Finding("time-missing", "the pictures have no times; they are taken in the order of their names")]
+    step, flown = np.diff(times), np.hypot(*np.diff(ground, axis=0).T)
+    moving = (step > 0) & (step < 120) & (flown > 2.0)
+    speed = float(np.median(flown[moving] / step[moving])) if moving.any() else 0.0
+    if np.nanmax(np.abs(times - np.round(times))) < 1e-3 and speed > 1.0:
+        text = (
+            f"times have whole seconds only, and positions may lag by as much: at {speed:.1f} m/s that is up to "
+            f"{speed:.0f} m along the track"
+        )
+        found.append(Finding("time-whole-seconds", text, note=True))
+    jumps = int((step > 3600).sum())
+    if jumps:
+        hours = float(step.max()) / 3600
+        text = (
+            f"the times jump {plural(jumps, 'time')} (by up to {hours:.1f} h): several flights or a clock that was set"
+        )
+        found.append(Finding("time-gap", text))
+    numbers = [number_of(f.image) for f in frames]
+    known = [n for n in numbers if n is not None]
+    if len(known) == len(frames) and len(frames) > 4:
+        back = int((np.diff(np.array(known)) < 0).sum())
+        if 0 < back < len(frames) // 10 + 2:
+            text = (
+                f"the order of times is not that of the file names ({plural(back, 'step')} back); "
+                "the clock may have jumped"
+            )
+            found.append(Finding("time-order", text))
+    return found
+
+
+def number_of(image: str) -> int | None:
+    """The last number in a picture's name, None where there is none."""
+    match = re.search(r"(\d{1,9})\D*$", image.rsplit("/", 1)[-1].rsplit(".", 1)[0])
+    return int(match[1]) if match else None
+
+
+def _astray(frames: Sequence[Frame], ground: Array) -> Finding | None:
+    """Pictures that lie far from both neighbours, which lie near each other: their position is wrong."""
+    if len(ground) < 3:
+        return None
+    step = np.hypot(*np.diff(ground, axis=0).T)
+    across = np.hypot(*(ground[2:] - ground[:-2]).T)
+    least = np.minimum(step[:-1], step[1:])
+    far = np.flatnonzero((least > _ASTRAY_M) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)) + 1
+    if not len(far):
+        return None
+    away = float(least[far - 1].max())
+    metres = f"{away / 1000:.0f} km" if away > 10_000 else f"{away:.0f} m"
+    first = frames[int(far[0])].image
+    return Finding(
+        "position-astray",
+        f"{plural(len(far), 'picture')} lie up to {metres} away from the pictures before and after ({first} first); "
+        "their positions are wrong",
+    )
+
+
+def _standing(ground: Array) -> Finding | None:
+    step = np.hypot(*np.diff(ground, axis=0).T)
+    still = int((step < 0.3).sum())
+    if still < max(3, 0.1 * len(ground)):
+        return None
+    return Finding("standing", f"{plural(still, 'picture')} were taken where the one before was", note=True)
+
+
+def _missing_numbers(frames: Sequence[Frame]) -> Finding | None:
+    numbers = sorted({n for f in frames if "#" not in f.image and (n := number_of(f.image)) is not None})
+    if len(numbers) < 5:
+        return None
+    steps = np.diff(np.array(numbers))
+    usual = int(np.median(steps))
+    missing = int(np.sum(steps // max(usual, 1) - 1))
+    if missing < max(2, 0.15 * len(numbers)):
+        return None
+    text = f"{missing} of {missing + len(numbers)} pictures are missing by their numbers; there are gaps"
+    return Finding("gaps", text)
+
+
+def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -> Finding | None:
+    """How far apart pictures are along the legs, against what they see."""
+    heights = [f.fix.height_m for f in frames if f.fix.height_m is not None]
+    if not heights or not legs:
+        return None
+    height = float(np.median(heights))
+    step = np.concatenate([np.hypot(*np.diff(ground[g.first : g.last + 1], axis=0).T) for g in legs])
+    usual = float(np.median(step))
+    first = frames[0]
+    footprint = 2.0 * height * math.tan(0.5 * (first.fov_hint_rad or _FOV_GUESS_RAD)) * first.height / first.width
+    if usual < 0.1 * height:
+        text = (
+            f"pictures are {usual:.1f} m apart at {height:.0f} m height, a short base: neighbours see heights of the "
+            "ground weakly"
+        )
+        return Finding("short-base", text, note=True)
+    overlap = 1.0 - usual / footprint
+    if overlap < 0.7:
+        text = (
+            f"pictures are {usual:.0f} m apart along the legs and overlap by about {100 * max(0.0, overlap):.0f} % "
+            f"only (the largest step is {float(step.max()):.0f} m)"
+        )
+        return Finding("sparse", text)
+    return None
+
+
+def _one_height(frames: Sequence[Frame]) -> Finding | None:
+    """Flat, level and straight down: the focal length cannot be told from the height."""
+    heights = np.array([f.fix.height_m for f in frames if f.fix.height_m is not None])
+    tilt = [abs(math.degrees(f.fix.pitch_rad) + 90.0) for f in frames if f.fix.pitch_rad is not None]
+    if len(heights) < 3 or len(tilt) < 3 or np.ptp(heights) > 0.02 * np.median(heights) or max(tilt) > 2.0:
+        return None
+    text = (
+        f"all pictures look straight down from {float(np.median(heights)):.1f} m: the field of view cannot be told "
+        "from the height, only the scale of both together"
+    )
+    return Finding("focal-and-height", text, note=True)
+
+
+def courses_of(frames: Sequence[Frame]) -> Array:
+    """Course over ground (N,) of frames in degrees, NaN in turns."""
+    return courses_deg(track_of(frames))
+
+
+def _low(frames: Sequence[Frame]) -> Finding | None:
+    """A few pictures from far below the others: takeoff, landing, a look at something."""
+    heights = np.array([np.nan if f.fix.height_m is None else f.fix.height_m for f in frames])
+    if np.isnan(heights).mean() > 0.5:
+        return None
+    usual = float(np.nanmedian(heights))
+    low = np.flatnonzero(heights < _LOW_SHARE * usual)
+    if not 0 < len(low) <= 0.2 * len(frames):
+        return None
+    text = (
+        f"{plural(len(low), 'picture')} taken at {np.nanmin(heights):.0f} m, the others at {usual:.0f} m "
+        f"({frames[int(low[0])].image} first)"
+    )
+    return Finding("low", text)

@@ -1,0 +1,113 @@
+"""Frames of one vehicle's photos: their tags weighed against each other, what cannot be true left out."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from orthoswarm.model.frame import Fix, Frame
+from telemetry.photos.attitude import check_legs, decide
+from telemetry.photos.photo_tags import Angles, PhotoTags
+from telemetry.samples.course import courses_deg, local_metres, straight_legs
+from telemetry.samples.findings import Finding, plural
+
+_LEAST_HEIGHT_M = 1.0
+
+
+def frames_of(
+    photos: Sequence[PhotoTags], vehicle: str, name: Callable[[Path], str], findings: list[Finding]
+) -> list[Frame]:
+    """Frames of one vehicle's photos (in order of time), after its tags were weighed against each other.
+
+    Args:
+        photos: with positions.
+        vehicle: id.
+        name: from a file to its name in the products.
+        findings: what was found is appended here.
+    """
+    ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
+    course = courses_deg(ground)
+    heights = _heights(photos, findings, vehicle)
+    chosen: dict[int, tuple[Angles, str]] = {}
+    for model in sorted({p.model for p in photos}):
+        index = [i for i, p in enumerate(photos) if p.model == model]
+        decided = decide([photos[i] for i in index], course[index], vehicle)
+        findings += decided.findings
+        chosen.update((i, (angles, decided.yaw_origin)) for i, angles in zip(index, decided.angles, strict=True))
+    yaw = np.array([math.nan if (y := chosen[i][0][0]) is None else y for i in range(len(photos))])
+    findings += check_legs(yaw, straight_legs(ground, least_frames=4), vehicle)
+    return [_frame(photo, vehicle, name(photo.path), heights[i], *chosen[i]) for i, photo in enumerate(photos)]
+
+
+def _frame(
+    photo: PhotoTags, vehicle: str, image: str, height_m: float | None, angles: Angles, yaw_origin: str
+) -> Frame:
+    def rad(value: float | None) -> float | None:
+        return None if value is None else math.radians(value)
+
+    origin = dict(photo.origin)
+    if angles[0] is not None and yaw_origin:
+        origin["yaw"] = f"{yaw_origin} ({origin.get('angles') or origin.get('flight_yaw', '')})"
+    fix = Fix(
+        lat_deg=photo.lat_deg or 0.0,
+        lon_deg=photo.lon_deg or 0.0,
+        height_m=height_m,
+        altitude_m=photo.altitude_m,
+        yaw_rad=rad(angles[0]),
+        pitch_rad=rad(angles[1]),
+        roll_rad=rad(angles[2]),
+        flight_yaw_rad=rad(photo.flight_deg[0]),
+        position_sigma_m=photo.position_sigma_m,
+        height_is_ground=photo.height_is_ground,
+    )
+    return Frame(
+        image=image,
+        path=photo.path,
+        vehicle=vehicle,
+        time_s=photo.time_s,
+        fix=fix,
+        width=photo.width,
+        height=photo.height,
+        camera=photo.camera,
+        fov_hint_rad=photo.fov_hint_rad,
+        origin=origin,
+    )
+
+
+def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str) -> list[float | None]:
+    """Heights that can be true; a height of nothing or below is not, and an altitude is none at all."""
+    heights = [p.height_m if p.height_m is not None and math.isfinite(p.height_m) else None for p in photos]
+    low = [h for h in heights if h is not None and h < _LEAST_HEIGHT_M]
+    if low:
+        findings.append(
+            Finding(
+                "height-implausible",
+                f"the recorded height is below {_LEAST_HEIGHT_M:g} m in {plural(len(low), 'photo')} "
+                f"(down to {min(low):.1f} m); these heights are ignored",
+                vehicle,
+            )
+        )
+    heights = [h if h is not None and h >= _LEAST_HEIGHT_M else None for h in heights]
+    missing = sum(h is None for h in heights)
+    if missing:
+        findings.append(
+            Finding(
+                "height-missing",
+                f"{plural(missing, 'photo')} of {len(photos)} have no height above ground; "
+                "it is estimated from the distance flown",
+                vehicle,
+            )
+        )
+    altitudes = np.array([p.altitude_m for p in photos if p.altitude_m is not None], dtype=np.float64)
+    wrong = altitudes[(altitudes < 0.0) | (altitudes > 15_000.0)]
+    if len(wrong):
+        findings.append(
+            Finding(
+                "altitude-implausible",
+                f"the GPS altitude is {wrong.min():.0f} to {wrong.max():.0f} m in {plural(len(wrong), 'photo')}, "
+                "which cannot be where it flew; altitudes are not used as heights",
+                vehicle,
+            )
+        )
+    return heights

@@ -1,0 +1,302 @@
+"""Photos: what one picture's own tags say about where its camera was, how it looked and when.
+
+Only evidence is gathered here, each value as its tag has it; `telemetry.photos.attitude` decides which of several
+yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
+"""
+
+import math
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from telemetry.formats import exif, xmp
+from telemetry.formats.makernotes import parse_dji
+from telemetry.formats.picture_container import Container, NotAPicture, read_container
+
+Angles = tuple[float | None, float | None, float | None]
+"""Yaw, pitch, roll in degrees, as recorded."""
+Run = Callable[..., Iterator[Any]]
+"""Maps a function over items, in order."""
+
+_FULL_FRAME_DIAGONAL_MM = 43.2666
+_MAX_HEIGHT_M = 12_000.0
+_CHUNK = 64
+
+
+@dataclass(slots=True)
+class PhotoTags:
+    """The evidence of one photo.
+
+    Attributes:
+        path: the file. width: columns as stored; height: rows.
+        lat_deg: latitude, None without a position; lon_deg: longitude.
+        altitude_m: absolute altitude. height_m: height above takeoff.
+        height_is_ground: whether height_m is above the ground instead.
+        time_s: UTC epoch seconds.
+        camera_deg: yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down.
+        flight_deg: yaw, pitch, roll of the airframe.
+        position_sigma_m: horizontal, one sigma, where stated.
+        make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
+        band: name of the spectral band, "" for a colour picture.
+        fov_hint_rad: horizontal field of view from focal length tags.
+        dewarp_k1: radial distortion that the tags state for a picture which still has it.
+        yaw_is_stated: True where the source defines its yaw as the picture's, so that nothing is left to choose.
+        origin: field -> where it came from.
+    """
+
+    path: Path
+    width: int
+    height: int
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    altitude_m: float | None = None
+    height_m: float | None = None
+    height_is_ground: bool = False
+    time_s: float | None = None
+    camera_deg: Angles = (None, None, None)
+    flight_deg: Angles = (None, None, None)
+    position_sigma_m: float | None = None
+    make: str = ""
+    model: str = ""
+    camera: str = ""
+    band: str = ""
+    fov_hint_rad: float | None = None
+    dewarp_k1: float | None = None
+    yaw_is_stated: bool = False
+    origin: dict[str, str] = field(default_factory=dict)
+
+
+def read_photo(path: Path) -> PhotoTags | None:
+    """Read the tags of one photo; None for a georeferenced raster, which is no photo.
+
+    Raises:
+        NotAPicture: the file is no readable picture; its text is the reason.
+    """
+    container = read_container(path)
+    if container.georeferenced:
+        return None
+    if container.raw:
+        raise NotAPicture("a raw picture (DNG) cannot be mapped; use the JPEG of the same exposure or develop it first")
+    return tags_of(path, container)
+
+
+def read_photos(
+    paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
+) -> Generator[PhotoTags | NotAPicture | None, None, None]:
+    """Read many photos in parallel, in order; a file that is no picture gives its exception.
+
+    Args:
+        paths: files.
+        workers: threads, while there is no `run`: reading from a slow disk waits more than it computes.
+        run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
+        progress: called with the number of photos done since the last call.
+    """
+    chunks = [paths[i : i + _CHUNK] for i in range(0, len(paths), _CHUNK)]
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        for result in (run or pool.map)(_read_chunk, chunks):
+            if progress is not None:
+                progress(len(result))
+            yield from result
+
+
+def _read_chunk(paths: Sequence[Path]) -> list[PhotoTags | NotAPicture | None]:
+    return [_read_or_reason(path) for path in paths]
+
+
+def _read_or_reason(path: Path) -> PhotoTags | NotAPicture | None:
+    try:
+        return read_photo(path)
+    except NotAPicture as reason:
+        return reason
+
+
+def tags_of(path: Path, container: Container) -> PhotoTags:
+    """The evidence in a container that was read."""
+    tags = container.exif
+    found = xmp.properties(container.xmp) if container.xmp else {}
+    photo = PhotoTags(path, container.width, container.height)
+    photo.make = exif.text(tags.main.get(exif.MAKE)) or found.get("tiff:Make", "")
+    photo.model = exif.text(tags.main.get(exif.MODEL)) or found.get("tiff:Model", "")
+    _position(photo, tags, found)
+    _heights(photo, tags, found)
+    _time(photo, tags, found)
+    _angles(photo, tags, found)
+    _lens(photo, tags, found)
+    return photo
+
+
+def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    position = exif.gps_position(tags.gps)
+    source = "EXIF GPS"
+    if position is None:
+        lat = xmp.number(found, "drone-dji:GpsLatitude", "drone-dji:Latitude")
+        lon = xmp.number(found, "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude")
+        if lat is not None and lon is not None and exif.is_position(lat, lon):
+            position, source = (lat, lon), "XMP position"
+    if position is not None:
+        photo.lat_deg, photo.lon_deg = position
+        photo.origin["position"] = source
+    flag = xmp.number(found, "drone-dji:RtkFlag")
+    if flag in (34.0, 50.0):  # 50 fixed, 34 float; 16 is a single fix, whose deviations mean little
+        parts = [xmp.number(found, f"drone-dji:RtkStd{axis}") for axis in ("Lat", "Lon")]
+        known = [p for p in parts if p is not None and 0.0 < p < 100.0]
+        if known:
+            photo.position_sigma_m = max(known)
+            photo.origin["position_sigma"] = "XMP RTK"
+    if photo.position_sigma_m is None:
+        stated = xmp.number(found, "Camera:GPSXYAccuracy") or exif.number(tags.gps.get(31))
+        if stated is not None and 0.0 < stated < 1000.0:
+            photo.position_sigma_m = stated
+            photo.origin["position_sigma"] = "stated accuracy"
+
+
+def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    photo.altitude_m = exif.gps_altitude(tags.gps)
+    if photo.altitude_m is None:
+        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
+    ground = xmp.number(found, "Camera:AboveGroundAltitude")
+    if ground is not None and 0.0 < ground < _MAX_HEIGHT_M:
+        photo.height_m, photo.height_is_ground = ground, True
+        photo.origin["height"] = "XMP AboveGroundAltitude"
+        return
+    names = ("drone-dji:RelativeAltitude", "drone-parrot:RelativeAltitude", "drone:RelativeAltitude")
+    relative = xmp.number(found, *names)
+    if relative is not None and abs(relative) < _MAX_HEIGHT_M:
+        photo.height_m = relative
+        photo.origin["height"] = "XMP RelativeAltitude"
+
+
+def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    exact = exif.parse_time(found.get("drone-dji:UTCAtExposure", ""))
+    taken = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
+    if taken is None:
+        written = exif.parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
+        if written is not None:
+            taken = written[0], "XMP time" if written[1] else "XMP time without zone, taken as UTC"
+    if taken is not None:
+        photo.time_s, photo.origin["time"] = taken
+
+
+def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    """Camera and airframe attitude: DJI, then Parrot, then Pix4D's Camera name space, then DJI's maker note."""
+    for prefix, names in _CAMERA_ANGLES:
+        angles = tuple(_angle(found, f"{prefix}:{name}") for name in names)
+        if angles[0] is not None or angles[1] is not None:
+            yaw, pitch, roll = angles
+            if prefix == "Camera":
+                pitch, roll = _from_pix4d(pitch, roll, photo.make)
+            photo.camera_deg = (yaw, pitch, roll)
+            photo.origin["angles"] = f"XMP {prefix}"
+            break
+    for prefix, names in _FLIGHT_ANGLES:
+        angles = tuple(_angle(found, f"{prefix}:{name}") for name in names)
+        if angles[0] is not None:
+            photo.flight_deg = (angles[0], angles[1], angles[2])
+            photo.origin["flight_yaw"] = f"XMP {prefix}"
+            break
+    note = tags.exif.get(exif.MAKER_NOTE)
+    if photo.camera_deg == (None, None, None) and isinstance(note, bytes):
+        dji = parse_dji(note)
+        if dji is not None:
+            photo.camera_deg = (dji.camera_yaw_deg, dji.camera_pitch_deg, dji.camera_roll_deg)
+            photo.flight_deg = (dji.flight_yaw_deg, dji.flight_pitch_deg, dji.flight_roll_deg)
+            photo.origin["angles"] = photo.origin["flight_yaw"] = "DJI MakerNotes"
+    direction = exif.number(tags.gps.get(17))
+    if (
+        photo.camera_deg[0] is None
+        and photo.flight_deg[0] is None
+        and direction is not None
+        and 0.0 <= direction <= 360.0
+        and exif.text(tags.gps.get(16)) != "M"
+    ):
+        photo.camera_deg = (direction, photo.camera_deg[1], photo.camera_deg[2])
+        photo.origin["angles"] = "EXIF GPSImgDirection"
+
+
+_CAMERA_ANGLES = (
+    ("drone-dji", ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")),
+    ("drone-parrot", ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree")),
+    ("Camera", ("Yaw", "Pitch", "Roll")),
+)
+_FLIGHT_ANGLES = (
+    ("drone-dji", ("FlightYawDegree", "FlightPitchDegree", "FlightRollDegree")),
+    ("drone-parrot", ("DroneYawDegree", "DronePitchDegree", "DroneRollDegree")),
+)
+
+
+def _angle(found: xmp.Properties, name: str) -> float | None:
+    value = xmp.number(found, name)
+    return value if value is not None and abs(value) <= 720.0 else None
+
+
+def _from_pix4d(pitch: float | None, roll: float | None, make: str) -> tuple[float | None, float | None]:
+    """The Camera name space counts pitch from nadir (senseFly, MicaSense) or from the horizon (Autel): by value.
+
+    senseFly's roll has the other sign.
+    """
+    if pitch is not None and pitch > -45.0:
+        pitch -= 90.0
+    if roll is not None and make.lower().startswith("sensefly"):
+        roll = -roll
+    return pitch, roll
+
+
+def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    focal = exif.number(tags.exif.get(exif.FOCAL_MM))
+    focal_35 = exif.number(tags.exif.get(exif.FOCAL_35MM))
+    zoom = exif.number(tags.exif.get(exif.DIGITAL_ZOOM)) or 1.0
+    photo.band = found.get("Camera:BandName", found.get("drone-dji:BandName", ""))
+    if photo.band.strip("{}").upper() in ("RGB", "R,G,B"):
+        photo.band = ""
+    sensor = found.get("drone-dji:ImageSource", "")
+    key = [photo.model or "camera", f"{photo.width}x{photo.height}"]
+    if focal:
+        key.append(f"{focal:.1f}mm")
+    if zoom > 1.0:
+        key.append(f"zoom{zoom:.1f}")
+    photo.camera = " ".join([*key, *filter(None, (sensor, photo.band))])
+    photo.dewarp_k1 = _dewarp_k1(found)
+    for hint, source in _fov_hints(photo, found, tags, focal, focal_35, max(zoom, 1.0)):
+        if hint is not None and math.radians(2.0) < hint < math.radians(150.0):
+            photo.fov_hint_rad = hint
+            photo.origin["fov_hint"] = source
+            return
+
+
+def _dewarp_k1(found: xmp.Properties) -> float | None:
+    """k1 of DJI's "date;fx,fy,cx,cy,k1,k2,p1,p2,k3" where the picture was not dewarped by the camera."""
+    if xmp.number(found, "drone-dji:DewarpFlag") != 0.0:
+        return None
+    numbers = found.get("drone-dji:DewarpData", "").partition(";")[2].split(",")
+    try:
+        return float(numbers[4])
+    except (IndexError, ValueError):
+        return None
+
+
+def _fov_hints(
+    photo: PhotoTags, found: xmp.Properties, tags: exif.Exif, focal: float | None, focal_35: float | None, zoom: float
+) -> Iterator[tuple[float | None, str]]:
+    """Horizontal field of view by several tags, the most trustworthy first."""
+    calibrated, centre = (
+        xmp.number(found, "drone-dji:CalibratedFocalLength"),
+        xmp.number(found, "drone-dji:CalibratedOpticalCenterX"),
+    )
+    if calibrated and centre and calibrated > 0 and centre > 0:
+        # Stated for the full picture, whose half width the centre tells: holds for a scaled copy, too.
+        yield 2.0 * math.atan(centre / calibrated), "XMP CalibratedFocalLength"
+    perspective = xmp.number(found, "Camera:PerspectiveFocalLength") or focal
+    per_unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_X))
+    unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_UNIT))
+    columns = exif.number(tags.exif.get(exif.PIXEL_X)) or photo.width
+    if perspective and per_unit and perspective > 0 and per_unit > 0:
+        pitch_mm = {3.0: 10.0, 4.0: 1.0}.get(unit or 0.0, 25.4) / per_unit
+        yield 2.0 * math.atan(0.5 * columns * pitch_mm / perspective), "EXIF focal plane resolution"
+    if focal_35 and focal_35 > 0:
+        diagonal = math.hypot(photo.width, photo.height)
+        if photo.make.upper().startswith("DJI") and photo.width > 1.7 * photo.height:
+            diagonal = 1.25 * photo.width  # the 16:9 mode crops rows off a 4:3 sensor, to which the tag belongs
+        pixels = focal_35 * zoom / _FULL_FRAME_DIAGONAL_MM * diagonal
+        yield 2.0 * math.atan(0.5 * photo.width / pixels), "EXIF FocalLengthIn35mmFilm"

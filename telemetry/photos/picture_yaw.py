@@ -1,0 +1,148 @@
+"""The yaw that pictures themselves show: one match of neighbours on each straight leg.
+
+The camera moves along the leg's course; the direction in which the ground runs through the picture tells where the
+picture's up direction pointed. Good to a few degrees, which is enough to find a yaw that is turned by 180 degrees or
+that belongs to the airframe instead of the camera.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.frame import Frame
+from orthoswarm.raster.picture_file import PictureError, read_gray
+from telemetry.photos.flight_checks import track_of
+from telemetry.samples.course import Straight, straight_legs
+from telemetry.samples.findings import Finding, plural
+
+Array = NDArray[np.float64]
+
+_WIDTH = 480
+_LEAST_INLIERS = 25
+_PAIRS_A_LEG = 3
+_LEAST_STEP_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class SeenHeading:
+    """What the pictures of a leg showed.
+
+    Attributes:
+        leg: the straight run. pair: indices of the pictures that were matched. inliers: matches that agree.
+        yaw_deg: azimuth of the second picture's up direction.
+    """
+
+    leg: Straight
+    pair: tuple[int, int]
+    inliers: int
+    yaw_deg: float
+
+
+def seen_headings(frames: Sequence[Frame], *, most_legs: int = 12) -> list[SeenHeading]:
+    """Yaw of each of a vehicle's straight legs by its pictures; legs that cannot be matched are left out."""
+    ground = track_of(frames)
+    legs = straight_legs(ground)
+    if len(legs) > most_legs:
+        legs = [legs[i] for i in np.linspace(0, len(legs) - 1, most_legs).round().astype(int)]
+    found: list[SeenHeading] = []
+    for leg in legs:
+        middle = (leg.first + leg.last) // 2
+        order = sorted(range(leg.first, leg.last), key=lambda i: abs(i - middle))
+        for i in order[:_PAIRS_A_LEG]:
+            seen = _match(frames[i], frames[i + 1], ground[i + 1] - ground[i])
+            if seen is not None:
+                found.append(SeenHeading(leg, (i, i + 1), seen[1], seen[0]))
+                break
+    return found
+
+
+def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
+    """Yaw of the second picture in degrees and how many matches agree; None where the two cannot be matched."""
+    if np.hypot(*moved) < _LEAST_STEP_M:
+        return None
+    one, two = _features(a.path), _features(b.path)
+    if one is None or two is None:
+        return None
+    import cv2
+
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one[1], two[1], k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+    if len(good) < _LEAST_INLIERS:
+        return None
+    source = np.array([one[0][m.queryIdx] for m in good])
+    target = np.array([two[0][m.trainIdx] for m in good])
+    model, inliers = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=4.0)
+    count = 0 if inliers is None else int(inliers.sum())
+    if model is None or count < _LEAST_INLIERS:
+        return None
+    centre = np.array([0.5 * (a.width - 1), 0.5 * (a.height - 1)]) * one[2]
+    shift = model[:, :2] @ centre + model[:, 2] - centre
+    if np.hypot(*shift) < 4.0:
+        return None
+    # In the second picture the first one's centre lies where the camera came from; up is against the rows.
+    to_the_right_of_up = np.degrees(np.arctan2(-shift[0], shift[1]))
+    course = np.degrees(np.arctan2(moved[0], moved[1]))
+    return wrap_deg(float(course - to_the_right_of_up)), count
+
+
+def _features(path: Path) -> tuple[Array, NDArray[np.float32], float] | None:
+    """Positions, descriptors and scale of a picture's features at reduced size."""
+    import cv2
+
+    try:
+        gray = read_gray(path)
+    except PictureError:
+        return None
+    scale = min(1.0, _WIDTH / gray.shape[1])
+    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else gray
+    points, descriptors = cv2.SIFT.create(nfeatures=800).detectAndCompute(small, None)
+    if descriptors is None or len(points) < _LEAST_INLIERS:
+        return None
+    return np.array([p.pt for p in points]), descriptors, scale
+
+
+def heading_findings(frames: Sequence[Frame], vehicle: str) -> list[Finding]:
+    """Contradictions between recorded yaw and pictures, leg by leg."""
+    seen = [h for h in seen_headings(frames) if frames[h.pair[1]].fix.yaw_rad is not None]
+    if not seen:
+        return []
+    recorded = np.array([np.degrees(frames[h.pair[1]].fix.yaw_rad or 0.0) for h in seen])
+    apart = wrap_deg(recorded - np.array([h.yaw_deg for h in seen]))
+    turned = np.abs(apart) > 130.0
+    found: list[Finding] = []
+    if turned.any():
+        numbers = ", ".join(
+            f"{frames[h.leg.first].image} to {frames[h.leg.last].image}" for h, t in zip(seen, turned) if t
+        )
+        found.append(
+            Finding(
+                "yaw-flip",
+                "the recorded yaw is turned by 180 degrees against the pictures on "
+                f"{plural(int(turned.sum()), 'leg')} of {len(seen)} ({numbers})",
+                vehicle,
+            )
+        )
+    rest = apart[~turned]
+    if len(rest) and np.median(np.abs(rest)) > 25.0:
+        found.append(
+            Finding(
+                "yaw-wrong",
+                f"the recorded yaw is {float(np.median(np.abs(rest))):.0f} degrees off what the pictures show (median)",
+                vehicle,
+            )
+        )
+    elif len(rest):
+        found.append(
+            Finding(
+                "yaw-confirmed",
+                f"the pictures confirm the recorded yaw on {plural(len(rest), 'leg')} "
+                f"within {float(np.abs(rest).max()):.0f} degrees",
+                vehicle,
+                note=True,
+            )
+        )
+    return found

@@ -1,0 +1,60 @@
+"""Attitudes of other conventions brought to ours (orthoswarm.model.camera: pitch -90 deg looks straight down)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import angles_from_rotation
+
+Array = NDArray[np.float64]
+
+_NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Camera (x right, y down, z along the optical axis) in a frame whose x is the optical axis, y right, z down.
+_CAMERA_TO_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def euler_ned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll): body (x forward, y right, z down) to north-east-down, float64 (3, 3)."""
+    y, p, r = np.radians([yaw_deg, pitch_deg, roll_deg])
+    cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def quaternion_ned(w: float, x: float, y: float, z: float) -> Array:
+    """Rotation body to north-east-down of a Hamilton quaternion (MAVLink order), float64 (3, 3)."""
+    n = w * w + x * x + y * y + z * z
+    s = 2.0 / n if n > 0 else 0.0
+    return np.array(
+        [
+            [1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+            [s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)],
+            [s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)],
+        ]
+    )
+
+
+def camera_angles_deg(forward_ned: Array) -> tuple[float, float, float]:
+    """Our yaw, pitch, roll in degrees of a camera whose optical axis is the x axis of a body-to-NED rotation.
+
+    This is the form of MISB sensor angles and of MAVLink gimbals: x along the optical axis, y to the picture's right,
+    z towards its lower edge.
+    """
+    yaw, pitch, roll = angles_from_rotation(_NED_TO_ENU @ forward_ned @ _CAMERA_TO_FORWARD)
+    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+
+
+def camera_frame_angles_deg(camera_ned: Array) -> tuple[float, float, float]:
+    """Our yaw, pitch, roll in degrees of a camera-to-NED rotation whose z is the optical axis, x right, y down."""
+    yaw, pitch, roll = angles_from_rotation(_NED_TO_ENU @ camera_ned)
+    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+
+
+def mounted_down_deg(body_ned: Array) -> tuple[float, float, float]:
+    """Our yaw, pitch, roll in degrees of a camera fixed under an airframe, its picture's up towards the nose."""
+    down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # optical axis = body z, picture up = body x
+    return camera_angles_deg(body_ned @ down)

@@ -1,0 +1,92 @@
+"""One reading of telemetry: what a SEI message, a KLV packet, a subtitle or a log line says about a moment."""
+
+import math
+from dataclasses import dataclass, fields
+
+from telemetry.formats.exif import is_position
+
+_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
+
+
+@dataclass(slots=True)
+class Sample:
+    """Position and attitude of a camera at a moment, degrees and metres; None where unknown.
+
+    Attributes:
+        time_s: UTC epoch seconds.
+        lat_deg: latitude, WGS 84; lon_deg: longitude.
+        height_m: height above takeoff, or above the ground where height_is_ground.
+        altitude_m: absolute altitude.
+        yaw_deg: of the picture's up direction at nadir, clockwise from true north.
+        pitch_deg: -90 looks straight down. roll_deg: > 0 right side down.
+        flight_yaw_deg: heading of the airframe; flight_pitch_deg, flight_roll_deg: its attitude.
+        fov_deg: horizontal field of view.
+        sigma_m: one sigma of the horizontal position.
+        vehicle: id of the vehicle.
+        height_is_ground: whether height_m is above the ground below.
+        number: number of the picture or exposure as the source counts them.
+    """
+
+    time_s: float | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    height_m: float | None = None
+    altitude_m: float | None = None
+    yaw_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+    flight_yaw_deg: float | None = None
+    flight_pitch_deg: float | None = None
+    flight_roll_deg: float | None = None
+    fov_deg: float | None = None
+    sigma_m: float | None = None
+    vehicle: str | None = None
+    height_is_ground: bool = False
+    number: int | None = None
+
+    @property
+    def has_position(self) -> bool:
+        """Whether it says where the camera was."""
+        return self.lat_deg is not None and self.lon_deg is not None
+
+    def merge(self, other: "Sample") -> "Sample":
+        """This sample with gaps filled from another; a position, a height and its kind stay together."""
+        result = Sample()
+        for name in _NAMES:
+            own = getattr(self, name)
+            setattr(result, name, own if own is not None else getattr(other, name))
+        if not self.has_position:
+            result.lat_deg, result.lon_deg = other.lat_deg, other.lon_deg
+        result.height_is_ground = other.height_is_ground if self.height_m is None else self.height_is_ground
+        return result
+
+
+_NAMES = tuple(f.name for f in fields(Sample))
+
+
+def checked(sample: Sample) -> Sample | None:
+    """A sample without what cannot be true (not finite, out of range, 0, 0); None if nothing is left."""
+    for name in _NAMES:
+        value = getattr(sample, name)
+        if isinstance(value, float) and not math.isfinite(value):
+            setattr(sample, name, None)
+    if sample.lat_deg is None or sample.lon_deg is None or not is_position(sample.lat_deg, sample.lon_deg):
+        sample.lat_deg = sample.lon_deg = None
+    for name in _ANGLES:
+        value = getattr(sample, name)
+        if value is not None and abs(value) > 720.0:
+            setattr(sample, name, None)
+    if sample.time_s is not None and not 0.0 < sample.time_s < 7.3e9:
+        sample.time_s = None
+    for name in ("height_m", "altitude_m"):
+        value = getattr(sample, name)
+        if value is not None and abs(value) > 100_000.0:
+            setattr(sample, name, None)
+    if sample.fov_deg is not None and not 0.1 < sample.fov_deg < 179.0:
+        sample.fov_deg = None
+    if sample.sigma_m is not None and not 0.0 < sample.sigma_m < 100_000.0:
+        sample.sigma_m = None
+    if sample.vehicle is not None:
+        sample.vehicle = "".join(c for c in sample.vehicle if c.isprintable()).strip()[:64] or None
+    empty = all(getattr(sample, name) is None for name in _NAMES if name not in ("height_is_ground", "number"))
+    return None if empty else sample

@@ -1,0 +1,1 @@
+"""Pictures of a video with the pose of their own packet."""

@@ -1,0 +1,297 @@
+"""Pictures out of a video: decoded once, picked, written as JPEG, each with the pose of its own packet."""
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry.photos.photo_tags import PhotoTags
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+from telemetry.video.extraction_cache import Kept, Taken, key_of, recall, remember
+from telemetry.video.picture_choice import Candidate, Picker
+from telemetry.video.picture_poses import Pose, Poses
+from telemetry.video.video_file import VideoScan, demux, open_video, parked, scan
+
+JPEG_QUALITY = 95
+_ZOOM_STEP = 0.03
+
+
+@dataclass(slots=True)
+class Picture:
+    """A picture that was taken from a video.
+
+    Attributes:
+        number: of the picture in the video, in order of presentation, from 0.
+        sample: its pose, None where nothing is known. origin: where the pose is from.
+        rgb: uint8 (rows, columns, 3). video_s: its time in the video.
+        packet: index of its packet, None where the decoder did not tell.
+    """
+
+    number: int
+    sample: Sample | None
+    origin: str
+    rgb: NDArray[np.uint8]
+    video_s: float
+    packet: int | None = None
+
+
+@dataclass(slots=True)
+class Extraction:
+    """What a video gave: photos by vehicle, findings, counts."""
+
+    photos: dict[str, list[PhotoTags]] = field(default_factory=dict)
+    names: dict[Path, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    pictures: int = 0
+    without_pose: int = 0
+    damaged: int = 0
+
+
+def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tuple[int, int | None, Any]]:
+    """Every picture of a file in order of presentation: number, index of its packet, decoded frame.
+
+    The packet's index travels through the decoder with the picture; where a decoder does not carry it the
+    presentation time tells. Pictures that cannot be decoded are left out, and counted in counter[0].
+    """
+    import av
+    from av.codec.context import Flags
+
+    by_time = {round(note.video_s, 6): i for i, note in enumerate(found.pictures) if note.video_s is not None}
+    rank = _presentation_rank(found)
+    with open_video(found.path) as container:
+        stream = container.streams.video[0]
+        start = stream.start_time or 0
+        context = stream.codec_context
+        context.thread_type = "AUTO"
+        context.flags |= int(Flags.copy_opaque)
+        with parked(context):
+            number, index = 0, 0
+            for packet in demux(container, [stream]):
+                if packet.size:
+                    packet.opaque = index
+                    index += 1
+                try:
+                    frames = packet.decode()
+                except (av.error.FFmpegError, ValueError):
+                    if counter is not None:
+                        counter[0] += 1
+                    continue
+                for frame in frames:
+                    own = frame.opaque if isinstance(frame.opaque, int) else None
+                    if own is None and frame.pts is not None:
+                        own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
+                    if own is not None and rank is not None and own < len(rank):
+                        number = max(number, rank[own])  # pictures that were lost keep their numbers
+                    yield number, own, frame
+                    number += 1
+
+
+def _presentation_rank(found: VideoScan) -> list[int] | None:
+    """Number in order of presentation of each packet's picture; None where times are missing or repeated."""
+    times = [note.video_s for note in found.pictures]
+    known = [t for t in times if t is not None]
+    if len(set(known)) != len(times):
+        return None
+    place = {t: i for i, t in enumerate(sorted(known))}
+    return [place[t] for t in times if t is not None]
+
+
+def pictures(
+    found: VideoScan,
+    poses: Poses,
+    *,
+    every_m: float | None = None,
+    every_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    result: Extraction | None = None,
+) -> Iterator[Picture]:
+    """The pictures of a video that are worth mapping, each with its pose.
+
+    Args:
+        found: the file's metadata.
+        poses: of its packets.
+        every_m: spacing in metres.
+        every_s: spacing in seconds; see `Picker` for the default.
+        progress: called with pictures decoded and their number in the file.
+        result: where counts are kept.
+    """
+    picker = Picker(every_m, every_s)
+    result = result if result is not None else Extraction()
+    damaged = [0]
+    total = len(found.pictures)
+    placed_only = poses.has_positions
+    for number, index, frame in decoded(found, damaged):
+        result.pictures += 1
+        if progress is not None and number % 25 == 0:
+            progress(number, total)
+        if frame.is_corrupt:
+            damaged[0] += 1
+            continue
+        pose = None if index is None or index >= total else poses.of(index)
+        if placed_only and (pose is None or not pose.sample.has_position):
+            result.without_pose += 1
+            continue
+        video_s = number / (found.rate or 30.0)
+        if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
+            video_s = own
+        sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
+        for taken in picker.push(Candidate(number, frame, sample, video_s, origin, index)):
+            yield _picture(taken)
+    for taken in picker.flush():
+        yield _picture(taken)
+    result.damaged = damaged[0]
+    if progress is not None:
+        progress(total, total)
+
+
+def _picture(taken: Candidate) -> Picture:
+    return Picture(taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s, taken.packet)
+
+
+def to_rgb(frame: Any) -> NDArray[np.uint8]:
+    """A decoded frame's colours, uint8 (rows, columns, 3); unmarked pictures of 720 rows or more are BT.709."""
+    from av.video.reformatter import ColorRange, Colorspace
+
+    if frame.format.is_rgb:
+        return np.asarray(frame.to_ndarray(format="rgb24"))
+    source = Colorspace.ITU709 if frame.height >= 720 or int(frame.colorspace) == 1 else Colorspace.ITU601
+    return np.asarray(
+        frame.reformat(
+            format="rgb24", src_colorspace=source, dst_colorspace=source, dst_color_range=ColorRange.JPEG
+        ).to_ndarray()
+    )
+
+
+def extract(
+    path: Path,
+    name: str,
+    cache: Path,
+    *,
+    poses: Poses | None = None,
+    every_m: float | None = None,
+    every_s: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    found: VideoScan | None = None,
+    vehicle: str | None = None,
+) -> Extraction:
+    """Take the pictures of a video and write them as JPEG files into a folder.
+
+    Pictures that an earlier call left there are used again while video, choice and poses are the same.
+
+    Args:
+        path: the video.
+        name: its name relative to the inputs; names its folder in the cache.
+        cache: folder for the pictures.
+        poses: of its pictures, with what lies beside it; None for what the file itself holds.
+        every_m: spacing in metres.
+        every_s: spacing in seconds.
+        progress: called with pictures decoded and their number.
+        found: the file's metadata if it was scanned already.
+        vehicle: id of the vehicle where the metadata names none; None for the file's name.
+
+    Raises:
+        telemetry.video.NotAVideo: it is none.
+        OSError: a picture cannot be written.
+    """
+    found = found or scan(path)
+    poses = poses or Poses(found)
+    result = Extraction()
+    folder = cache / name.replace("/", "__")
+    folder.mkdir(parents=True, exist_ok=True)
+    key = key_of(path, poses, len(found.pictures), (every_m, every_s, JPEG_QUALITY))
+    taken = recall(folder, key)
+    if taken is None:
+        kept = []
+        for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
+            kept.append(Kept(picture.number, picture.packet, picture.rgb.shape[1], picture.rgb.shape[0]))
+            write_jpeg(folder / kept[-1].name, picture.rgb)
+        taken = Taken(kept, result.pictures, result.without_pose, result.damaged)
+        remember(folder, key, taken)
+    result.pictures, result.without_pose, result.damaged = taken.seen, taken.without_pose, taken.damaged
+    lens = _LensKey(found)
+    for one in taken.pictures:
+        pose = None if one.packet is None else poses.of(one.packet)
+        photo = _photo(folder / one.name, one, pose, lens)
+        named = pose.sample.vehicle if pose is not None else None
+        result.photos.setdefault(named or vehicle or path.stem, []).append(photo)
+        result.names[photo.path] = one.number
+    if result.damaged:
+        result.findings.append(
+            Finding("video-damaged", f"{plural(result.damaged, 'picture')} of {path.name} cannot be decoded")
+        )
+    result.findings += poses.findings
+    if result.without_pose:
+        result.findings.append(
+            Finding(
+                "pictures-without-pose",
+                f"{plural(result.without_pose, 'picture')} of {result.pictures} in {path.name} have no position "
+                "and are left out",
+            )
+        )
+    return result
+
+
+def encode_jpeg(rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> bytes:
+    """A picture, uint8 (rows, columns, 3), as JPEG."""
+    import simplejpeg
+
+    return bytes(
+        simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB", colorsubsampling="420")
+    )
+
+
+def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> None:
+    """Write a picture as JPEG under its name once it is whole.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    temporary = path.with_suffix(".part")
+    temporary.write_bytes(encode_jpeg(rgb, quality=quality))
+    os.replace(temporary, path)
+
+
+class _LensKey:
+    """Names the lens of a picture; a zoom (the stated field of view changes) begins another."""
+
+    def __init__(self, found: VideoScan) -> None:
+        self._base = f"video {found.width}x{found.height}"
+        self._fov: float | None = None
+
+    def of(self, sample: Sample | None) -> str:
+        fov = None if sample is None else sample.fov_deg
+        if fov is None:
+            return self._base
+        if self._fov is None or abs(math.log(fov / self._fov)) > _ZOOM_STEP:
+            self._fov = fov
+        return f"{self._base} fov{self._fov:.1f}"
+
+
+def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTags:
+    photo = PhotoTags(path, kept.columns, kept.rows)
+    photo.camera = lens.of(None if pose is None else pose.sample)
+    if pose is None:
+        return photo
+    sample = pose.sample
+    photo.lat_deg, photo.lon_deg = sample.lat_deg, sample.lon_deg
+    photo.altitude_m, photo.height_m = sample.altitude_m, sample.height_m
+    photo.height_is_ground = sample.height_is_ground
+    photo.time_s = sample.time_s
+    photo.camera_deg = (sample.yaw_deg, sample.pitch_deg, sample.roll_deg)
+    photo.flight_deg = (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg)
+    photo.position_sigma_m = sample.sigma_m
+    # DJI's sources say "gimbal yaw" and mean different things by it; all others define the picture's.
+    photo.yaw_is_stated = not {"djmd", "SRT"} & set(pose.origin.split(" + "))
+    photo.fov_hint_rad = None if sample.fov_deg is None else math.radians(sample.fov_deg)
+    names = {
+        "position": sample.lat_deg, "height": sample.height_m, "time": sample.time_s, "angles": sample.yaw_deg,
+        "flight_yaw": sample.flight_yaw_deg, "fov_hint": sample.fov_deg,
+    }  # fmt: skip
+    photo.origin = {field: pose.origin for field, value in names.items() if value is not None}
+    return photo

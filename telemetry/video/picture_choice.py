@@ -1,0 +1,123 @@
+"""Which pictures of a video are worth mapping: one every few metres or seconds, the sharpest of its neighbours."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthoswarm.model.angles import wrap_deg
+from telemetry.samples.course import EARTH_RADIUS_M
+from telemetry.samples.sample import Sample
+
+_HEIGHT_SHARE = 0.04
+"""Default spacing as a share of the height: overlaps stay above 95 %, which following points likes."""
+_DEFAULT_S = 0.5
+_EARLY, _LATE = 0.8, 1.2
+_MAX_CANDIDATES = 6
+
+
+@dataclass(slots=True)
+class Candidate:
+    """A picture that may be taken.
+
+    Attributes:
+        number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
+        origin: where the pose is from. packet: index of its packet, None where the decoder did not tell.
+    """
+
+    number: int
+    frame: Any
+    sample: Sample | None
+    video_s: float
+    origin: str = ""
+    packet: int | None = None
+
+
+class Picker:
+    """Takes pictures from a stream of them, at most one each spacing.
+
+    Among the pictures whose progress is near the spacing the sharpest is taken. Where pictures are further apart than
+    the spacing (a slow camera, a thinned video) all are taken.
+
+    Args:
+        every_m: spacing in metres; with neither this nor every_s 4 % of the height, else half a second.
+        every_s: spacing in seconds.
+    """
+
+    def __init__(self, every_m: float | None = None, every_s: float | None = None) -> None:
+        self._every_m, self._every_s = every_m, every_s
+        self._last: Candidate | None = None
+        self._waiting: list[Candidate] = []
+
+    def push(self, candidate: Candidate) -> Iterator[Candidate]:
+        """Offer the next picture; yields those that are taken."""
+        if self._last is None:
+            self._last = candidate
+            yield candidate
+            return
+        progress = self._progress(candidate, self._last)
+        if progress < _EARLY:
+            return
+        if progress <= _LATE and len(self._waiting) < _MAX_CANDIDATES:
+            self._waiting.append(candidate)
+            return
+        if not self._waiting:
+            self._last = candidate
+            yield candidate
+            return
+        yield self._take()
+        yield from self.push(candidate)
+
+    def flush(self) -> Iterator[Candidate]:
+        """At the end: what still waits."""
+        if self._waiting:
+            yield self._take()
+
+    def _take(self) -> Candidate:
+        best = self._waiting[0]
+        if len(self._waiting) > 1:
+            best = max(self._waiting, key=lambda c: sharpness(c.frame))
+        self._waiting.clear()
+        self._last = best
+        return best
+
+    def _progress(self, new: Candidate, last: Candidate) -> float:
+        """How far a picture is from the last one taken, in units of the spacing."""
+        seconds = abs(new.video_s - last.video_s)
+        if self._every_s is not None and self._every_m is None:
+            return seconds / max(self._every_s, 1e-6)
+        metres = _distance_m(new.sample, last.sample)
+        spacing = self._every_m
+        if spacing is None and new.sample is not None and new.sample.height_m is not None:
+            spacing = _HEIGHT_SHARE * max(new.sample.height_m, 5.0)
+        if metres is None or spacing is None:
+            return seconds / (self._every_s or _DEFAULT_S)
+        by_time = seconds / self._every_s if self._every_s else 0.0
+        return max(metres / max(spacing, 1e-6), by_time)
+
+
+def _distance_m(a: Sample | None, b: Sample | None) -> float | None:
+    if a is None or b is None or a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
+        return None
+    north = np.radians(a.lat_deg - b.lat_deg)
+    east = np.radians(wrap_deg(a.lon_deg - b.lon_deg)) * np.cos(np.radians(a.lat_deg))
+    return float(EARTH_RADIUS_M * np.hypot(north, east))
+
+
+def sharpness(frame: Any) -> float:
+    """Variance of the Laplacian of a decoded picture's luma at half size: larger is sharper."""
+    import cv2
+
+    gray = luma(frame)[::2, ::2]
+    return float(cv2.Laplacian(np.ascontiguousarray(gray), cv2.CV_16S, ksize=3).var())
+
+
+def luma(frame: Any) -> Any:
+    """Grey values, uint8 (rows, columns), of a decoded picture; of a planar one its own plane, not converted."""
+    name = frame.format.name
+    if name.startswith(("yuv4", "yuvj4", "nv12", "nv21")) and not name.endswith(("le", "be")):
+        plane = frame.planes[0]
+        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        return rows[: frame.height, : frame.width]
+    return frame.to_ndarray(format="gray")

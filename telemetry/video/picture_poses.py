@@ -1,0 +1,267 @@
+"""Which pose belongs to which picture of a video.
+
+What is carried in or with a picture's own packet (SEI, djmd) is bound to that packet, and follows it through the
+decoder (`telemetry.video.extraction`), so that B-frames and threads cannot mix it up. What has times of its own (KLV,
+subtitles) is interpolated at the picture's time. The sources are merged field by field, the one with a position first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry.formats import srt
+from telemetry.formats.mavlink_poses import fixed_camera
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+from telemetry.video.video_file import VideoScan
+
+Array = NDArray[np.float64]
+
+_HELD_AT_ENDS_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The merged sample of a picture and where its parts come from."""
+
+    sample: Sample
+    origin: str
+
+
+class Clock:
+    """UTC of moments of a video, from pairs of both; beyond its ends it runs on at the rate of one."""
+
+    def __init__(self, video_s: Sequence[float], utc_s: Sequence[float]) -> None:
+        order = np.argsort(video_s, kind="stable")
+        self._video = np.asarray(video_s, dtype=np.float64)[order]
+        self._utc = np.asarray(utc_s, dtype=np.float64)[order]
+
+    def __len__(self) -> int:
+        return len(self._video)
+
+    def at(self, video_s: Array) -> Array:
+        """UTC epoch seconds, NaN where the moment is NaN or nothing is known."""
+        t = np.asarray(video_s, dtype=np.float64)
+        if len(self) == 0:
+            return np.full(t.shape, np.nan)
+        inside = np.clip(t, self._video[0], self._video[-1])
+        return np.asarray(np.interp(inside, self._video, self._utc) + (t - inside))
+
+    @property
+    def rate(self) -> float:
+        """Seconds of UTC per second of video; NaN where too few moments are known."""
+        if len(self) < 5 or self._video[-1] - self._video[0] < 0.2:
+            return float("nan")
+        return float(np.polyfit(self._video - self._video[0], self._utc - self._utc[0], 1)[0])
+
+
+class Poses:
+    """The pose of each picture of a video.
+
+    Attributes:
+        findings: what is odd about the video's metadata.
+    """
+
+    def __init__(self, found: VideoScan, subtitles: srt.Subtitles | None = None) -> None:
+        self._scan = found
+        self._interval = 1.0 / found.rate if found.rate else 1.0 / 30.0
+        self._djmd = sorted(found.djmd_samples, key=lambda row: row[0])
+        self._djmd_times = np.array([row[0] for row in self._djmd])
+        self._times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
+        self._trust_sei_times = True
+        self._interpolated: list[tuple[str, list[Sample]]] = []
+        self.findings: list[Finding] = []
+        cues = subtitles if subtitles is not None else found.cues
+        self._add("KLV", self._klv_rows())
+        self._add("SRT", [(c.start_s, c.sample) for c in cues.cues if c.sample is not None and c.sample.has_position])
+        self._note(cues)
+
+    def of(self, index: int) -> Pose | None:
+        """Pose of the picture of a packet (its index in `VideoScan.pictures`); None where nothing is known."""
+        note, t = self._scan.pictures[index], self._times[index]
+        parts: list[tuple[Sample, str]] = []
+        own = note.sample
+        if own is not None:
+            if own.time_s is not None and not self._trust_sei_times:
+                own = replace(own, time_s=None)
+            parts.append((own, " + ".join(note.decoders)))
+        with_packet = self._own_djmd(t)
+        if with_packet is not None:
+            parts.append((with_packet, "djmd"))
+        for name, samples in self._interpolated:
+            if samples[index].has_position or samples[index].yaw_deg is not None:
+                parts.append((samples[index], name))
+        if self._scan.created_s is not None and t == t:
+            parts.append((Sample(time_s=self._scan.created_s + float(t)), ""))
+        if not parts:
+            return None
+        # What has a position leads; a bare time stamp only says when, but that better than the others.
+        parts.sort(key=lambda part: not part[0].has_position)
+        merged = parts[0][0]
+        if own is not None and own.time_s is not None:
+            merged = replace(merged, time_s=own.time_s)
+        for sample, _ in parts[1:]:
+            merged = merged.merge(sample)
+        return Pose(merged, " + ".join(name for _, name in parts if name))
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether any source of this video knows positions."""
+        return (
+            bool(self._interpolated)
+            or any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
+            or any(sample.has_position for _, sample in self._djmd)
+        )
+
+    @property
+    def has_angles(self) -> bool:
+        """Whether any source of this video knows a camera's yaw."""
+        return (
+            any(sample.yaw_deg is not None for _, samples in self._interpolated for sample in samples)
+            or any(note.sample is not None and note.sample.yaw_deg is not None for note in self._scan.pictures)
+            or any(sample.yaw_deg is not None for _, sample in self._djmd)
+        )
+
+    def add_track(self, name: str, timeline: Timeline, offset_s: float, *, has_gimbal: bool) -> int:
+        """Add a vehicle's log as a source, behind all others; returns how many pictures it places.
+
+        Args:
+            name: origin of its fields.
+            timeline: the vehicle's poses over UTC.
+            offset_s: video time minus UTC.
+            has_gimbal: False where the camera is taken as fixed under the airframe.
+        """
+        samples = timeline.at_all(self._times - offset_s)
+        if not has_gimbal:
+            samples = [fixed_camera(sample) for sample in samples]
+        for sample in samples:
+            if sample.time_s != sample.time_s:
+                sample.time_s = None
+        self._interpolated.append((name, samples))
+        return sum(sample.has_position for sample in samples)
+
+    def track(self) -> tuple[Array, Array]:
+        """Video times (N,) and positions (N, 2), latitude and longitude in degrees, of pictures that have one."""
+        rows = [
+            (t, pose.sample.lat_deg, pose.sample.lon_deg)
+            for i, t in enumerate(self._times.tolist())
+            if t == t and (pose := self.of(i)) is not None and pose.sample.has_position
+        ]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return table[:, 0], table[:, 1:]
+
+    def _time(self, index: int) -> float:
+        """Video time of a packet's picture; NaN where it is not known."""
+        t = self._scan.pictures[index].video_s
+        if t is not None:
+            return t
+        return index * self._interval if self._scan.rate else float("nan")
+
+    def _own_djmd(self, t: float) -> Sample | None:
+        """The djmd message with the picture's own time."""
+        if not self._djmd or t != t:
+            return None
+        i = int(np.argmin(np.abs(self._djmd_times - t)))
+        return self._djmd[i][1] if abs(self._djmd_times[i] - t) < 0.51 * self._interval else None
+
+    def _add(self, name: str, rows: list[tuple[float, Sample]]) -> None:
+        """Interpolate a source with times of its own at all pictures."""
+        if not rows:
+            return
+        dated = [(t, s.time_s) for t, s in rows if s.time_s is not None]
+        utc = Clock([t for t, _ in dated], [u for _, u in dated]).at(self._times)
+        samples = _held_timeline([replace(s, time_s=t) for t, s in rows]).at_all(self._times)
+        for sample, moment in zip(samples, utc.tolist(), strict=True):
+            sample.time_s = moment if moment == moment else None
+        self._interpolated.append((name, samples))
+
+    def _sei_clock(self) -> Clock:
+        pairs = [
+            (n.video_s, n.sample.time_s)
+            for n in self._scan.pictures
+            if n.video_s is not None and n.sample is not None and n.sample.time_s is not None
+        ]
+        return Clock([t for t, _ in pairs], [u for _, u in pairs])
+
+    def _klv_rows(self) -> list[tuple[float, Sample]]:
+        """KLV poses with their video times: their own, else by UTC against the SEI times, else by their place."""
+        rows = [
+            (t, after, p.sample)
+            for t, after, p in self._scan.klv_packets
+            if p.sample is not None and p.sample.has_position
+        ]
+        if not rows:
+            return []
+        sei_clock = self._sei_clock()
+        dated = [(t, s.time_s) for t, _, s in rows if t is not None and s.time_s is not None]
+        self._compare_clocks(sei_clock, Clock([t for t, _ in dated], [u for _, u in dated]))
+        if all(t is not None for t, _, _ in rows):
+            return [(t, s) for t, _, s in rows if t is not None]
+        utc = np.array([s.time_s if s.time_s is not None else np.nan for _, _, s in rows])
+        known = ~np.isnan(self._times)
+        if len(sei_clock) > 1 and known.any():
+            # The pictures' own UTC, in order, turned round: from UTC to video time.
+            moments = np.sort(self._times[known])
+            at = sei_clock.at(moments)
+            if np.mean((utc >= at[0] - 1.0) & (utc <= at[-1] + 1.0)) > 0.5 and np.all(np.diff(at) > 0):
+                inside = np.clip(utc, at[0], at[-1])
+                times = np.interp(inside, at, moments) + (utc - inside)
+                return [(float(t), s) for t, (_, _, s) in zip(times, rows, strict=True) if t == t]
+        last = len(self._times) - 1
+        return [(float(self._times[min(after, last)]), s) for _, after, s in rows if last >= 0]
+
+    def _compare_clocks(self, sei_clock: Clock, klv_clock: Clock) -> None:
+        """SEI time stamps that contradict the KLV's are reported, and not used where they do not even run right."""
+        name = self._scan.path.name
+        ratio = sei_clock.rate / klv_clock.rate if klv_clock.rate > 0 else float("nan")
+        if ratio == ratio and not 0.8 < ratio < 1.25:
+            self._trust_sei_times = False
+            self.findings.append(
+                Finding(
+                    "sei-clock",
+                    f"the SEI time stamps of {name} run {ratio:.3g} times as fast as its KLV times; they are not used",
+                )
+            )
+        elif len(sei_clock) and len(klv_clock):
+            known = self._times[~np.isnan(self._times)]
+            offset = float(np.median(sei_clock.at(known) - klv_clock.at(known)))
+            if abs(offset) > 0.5:
+                self.findings.append(
+                    Finding(
+                        "clock-offset",
+                        f"the SEI times of {name} are {offset:+.1f} s off its KLV times; poses are bound by the "
+                        "transport's time stamps",
+                    )
+                )
+
+    def _note(self, cues: srt.Subtitles) -> None:
+        name = self._scan.path.name
+        errors: dict[str, int] = {}
+        for _, _, packet in self._scan.klv_packets:
+            if packet.error:
+                errors[packet.error] = errors.get(packet.error, 0) + 1
+        for reason, count in errors.items():
+            self.findings.append(Finding("klv-damaged", f"{plural(count, 'KLV packet')} of {name} refused: {reason}"))
+        if any(packet.kind == "EG 0104" for _, _, packet in self._scan.klv_packets):
+            text = f"the KLV of {name} is EG 0104, an older set than ST 0601"
+            self.findings.append(Finding("klv-eg0104", text, note=True))
+        self.findings += [
+            Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items() if cues.cues
+        ]
+        if not self.has_positions:
+            text = f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
+            self.findings.append(Finding("no-position", text))
+
+
+def _held_timeline(samples: list[Sample]) -> Timeline:
+    """A timeline whose ends are held for one usual interval (at most a second): pictures stand between samples."""
+    samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
+    times = np.array([s.time_s for s in samples], dtype=np.float64)
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S
+    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
+    before = replace(samples[0], time_s=float(times[0]) - usual)
+    after = replace(samples[-1], time_s=float(times[-1]) + usual)
+    return Timeline([before, *samples, after], max_gap_s=max(2.0, 4.0 * usual))

@@ -1,0 +1,197 @@
+"""Video files: all metadata that they carry.
+
+One pass over the packets, without decoding, finds all metadata: SEI of each picture, KLV, DJI's djmd track, a
+subtitle track. `telemetry.video.picture_poses` makes one pose for each picture of it.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from telemetry.formats import bitstream, djmd, klv, sei, srt
+from telemetry.formats.exif import parse_time
+from telemetry.samples.sample import Sample
+
+_MAX_PICTURES = 5_000_000
+
+
+class NotAVideo(Exception):
+    """A file with a video's suffix is none; the text is one sentence for the user."""
+
+
+@dataclass(slots=True)
+class PictureNote:
+    """What was found with one picture's packet: its time in the video, its own sample, and who understood it."""
+
+    video_s: float | None
+    sample: Sample | None = None
+    decoders: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class VideoScan:
+    """All metadata of a video file.
+
+    Attributes:
+        path: the file. codec: of the pictures. width: columns; height: rows.
+        rate: pictures a second, None if the file does not say.
+        created_s: UTC epoch seconds of the container's creation time.
+        pictures: one for each video packet, in order of the file.
+        klv_packets: video time (None if unknown), number of video packets before it, packet.
+        djmd_samples: video time and sample. cues: of a subtitle track. damaged: packets that could not be read.
+    """
+
+    path: Path
+    codec: str
+    width: int
+    height: int
+    rate: float | None = None
+    created_s: float | None = None
+    pictures: list[PictureNote] = field(default_factory=list)
+    klv_packets: list[tuple[float | None, int, klv.Packet]] = field(default_factory=list)
+    djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
+    cues: srt.Subtitles = field(default_factory=srt.Subtitles)
+    damaged: int = 0
+
+    @property
+    def sei_count(self) -> int:
+        """Pictures with a SEI message that was recognised."""
+        return sum(note.sample is not None for note in self.pictures)
+
+
+def open_video(path: Path | str, **options: Any) -> Any:
+    """Open a file or a URL with PyAV.
+
+    Raises:
+        NotAVideo: it cannot be opened or holds no video.
+    """
+    import av
+
+    try:
+        container = av.open(str(path), **options)
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        if "://" in str(path):
+            raise NotAVideo(f"the stream {path} cannot be opened ({_reason(error)}); check its address") from None
+        raise NotAVideo(
+            f"the file is no video that can be read ({_reason(error)}); check it with a player or leave it out"
+        ) from None
+    if not container.streams.video:
+        container.close()
+        raise NotAVideo("the file holds no pictures; name a video")
+    return container
+
+
+@contextmanager
+def parked(context: Any) -> Iterator[None]:
+    """Empty a decoder that carries `opaque` objects before it is freed.
+
+    PyAV frees such an object with the interpreter's lock held, in whichever thread lets go of it last, and frees a
+    decoder, which waits for the decoder's threads, holding the same lock: neither would ever end. Emptied, the threads
+    hold nothing more.
+    """
+    try:
+        yield
+    finally:
+        context.flush_buffers()
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error).lower()
+
+
+def scan(path: Path) -> VideoScan:
+    """Read all metadata of a file, without decoding pictures.
+
+    Raises:
+        NotAVideo: it is no video.
+    """
+    if path.stat().st_size == 0:
+        raise NotAVideo("the file is empty; copy it again")
+    with open_video(path) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        result = VideoScan(path, context.name, context.width, context.height)
+        result.rate = float(stream.average_rate) if stream.average_rate else None
+        created = parse_time(str(container.metadata.get("creation_time", "")))
+        result.created_s = created[0] if created is not None else None
+        _scan_packets(container, stream, result)
+    if not result.pictures:
+        raise NotAVideo("the file holds no pictures; it may be cut off")
+    return result
+
+
+def demux(container: Any, streams: list[Any]) -> Iterator[Any]:
+    """Packets of some streams; a damaged end of the file ends them instead of raising."""
+    import av
+
+    source = container.demux(*streams)
+    failures = 0
+    while True:
+        try:
+            packet = next(source)
+        except StopIteration:
+            return
+        except (av.error.FFmpegError, ValueError):
+            failures += 1
+            if failures > 100:
+                return
+            continue
+        yield packet
+
+
+def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
+    form = bitstream.StreamFormat.of(result.codec, stream.codec_context.extradata)
+    wanted = [s for s in container.streams if s is stream or s.type in ("data", "subtitle")]
+    start = stream.start_time or 0
+    base = float(stream.start_time * stream.time_base) if stream.start_time is not None else 0.0
+    texts: list[tuple[float, float, str]] = []
+    leftovers: dict[int, bytes] = {}
+    for packet in demux(container, wanted):
+        if packet.size == 0:
+            continue
+        seconds = None if packet.pts is None else float(packet.pts * packet.time_base) - base
+        if packet.stream is stream:
+            if len(result.pictures) >= _MAX_PICTURES:
+                break
+            seconds = None if packet.pts is None else float((packet.pts - start) * packet.time_base)
+            result.pictures.append(_note(bytes(packet), form, seconds))
+        elif packet.stream.type == "subtitle":
+            if seconds is not None:
+                length = float((packet.duration or 0) * packet.time_base)
+                texts.append((seconds, seconds + length, _subtitle_text(bytes(packet))))
+        else:
+            _scan_data(packet, seconds, result, leftovers)
+    if texts:
+        result.cues = srt.parse_cues(texts)
+
+
+def _note(data: bytes, form: bitstream.StreamFormat | None, seconds: float | None) -> PictureNote:
+    reading = None if form is None else sei.read(bitstream.sei_messages(data, form))
+    if reading is None:
+        return PictureNote(seconds)
+    return PictureNote(seconds, reading.sample, reading.decoders)
+
+
+def _subtitle_text(data: bytes) -> str:
+    """Text of a subtitle packet: MP4's timed text leads it with a 16-bit length."""
+    if len(data) >= 2 and int.from_bytes(data[:2], "big") <= len(data) - 2 and data[0] == 0:
+        data = data[2 : 2 + int.from_bytes(data[:2], "big")]
+    return data.decode("utf-8", "replace")
+
+
+def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers: dict[int, bytes]) -> None:
+    """KLV (also where a set is spread over packets) or djmd, by content."""
+    data = leftovers.pop(packet.stream.index, b"") + bytes(packet)
+    found = list(klv.packets(data))
+    if found:
+        if found[-1].error == "the packet is cut off" and len(data) < 1 << 16:
+            leftovers[packet.stream.index] = data[data.rfind(bytes.fromhex("060e2b3402")) :]
+            found.pop()
+        for item in found:
+            result.klv_packets.append((seconds, len(result.pictures), item))
+        return
+    sample = djmd.read_djmd(data)
+    if sample is not None and seconds is not None:
+        result.djmd_samples.append((seconds, sample))

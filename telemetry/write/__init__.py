@@ -1,0 +1,1 @@
+"""Poses written into pictures (EXIF, XMP) and video (SEI)."""

@@ -1,0 +1,410 @@
+"""The batch end to end: products and their contract, resumption, independence of workers, a full disk."""
+
+import errno
+import hashlib
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+
+from gcs_plugin.cli.main import main
+from orthoswarm.batch.pipeline import PRODUCTS, Options, run
+from orthoswarm.batch.split_legs import legs_as_vehicles
+from orthoswarm.batch.workspace import Workspace
+from orthoswarm.compute.workers import Processes, Serial
+from orthoswarm.export import cog
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.recorded_pose import recorded_cameras
+from orthoswarm.mosaic.extent import from_takeoff, ground_level, map_offset
+from orthoswarm.raster.basemap import Basemap
+from orthoswarm.report.page import write_page
+from telemetry import LoadOptions, load
+from tests.kit.scene import FOV, Scene, legs
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A scene, its shots, a folder with photos of two vehicles, and a map."""
+    folder = tmp_path_factory.mktemp("flight")
+    scene = Scene()
+    shots = legs(count=2, photos=8)
+    scene.fly(folder / "photos" / "a", shots)
+    other = [s.__class__(**{**_fields(s), "north": s.north + 80, "fov": 70.0}) for s in legs(count=2, photos=8)]
+    scene.fly(folder / "photos" / "b", other)
+    (folder / "photos" / "a" / "notes.txt").write_text("hello")
+    (folder / "photos" / "a" / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")
+    scene.basemap(folder / "map.tif")
+    return scene, {"a": shots, "b": other}, folder
+
+
+def _fields(shot):
+    return {name: getattr(shot, name) for name in shot.__dataclass_fields__}
+
+
+@pytest.fixture(scope="module")
+def mapped(flight, tmp_path_factory):
+    """The flight mapped on its map with one worker."""
+    _, _, folder = flight
+    out = tmp_path_factory.mktemp("mapped") / "out"
+    report = make(folder / "photos", out, Options(basemap=folder / "map.tif"))
+    return out, report
+
+
+def make(photos, out, options=None, workers=None, progress=lambda *_: None):
+    def read(tell):
+        return load([photos], progress=tell, options=LoadOptions(exclude=(out,)))
+
+    return run(read, out, options or Options(), workers or Serial(), progress)
+
+
+def rows_of(out):
+    return {r["image"]: r for r in map(json.loads, (out / "frames.jsonl").read_text().splitlines())}
+
+
+def content(out):
+    """What the products are, but for times."""
+    return {n: hashlib.sha256((out / n).read_bytes()).hexdigest() for n in PRODUCTS if n.endswith((".tif", ".jsonl"))}
+
+
+def test_all_products_are_there_and_nothing_else(mapped):
+    out, _ = mapped
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS)
+
+
+def test_every_picture_has_its_line_and_lies_where_it_is(flight, mapped):
+    scene, shots, _ = flight
+    rows = rows_of(mapped[0])
+    assert len(rows) == 33
+    assert rows["a/broken.jpg"]["stage"] == "rejected" and rows["a/broken.jpg"]["reason"]
+    errors = []
+    for vehicle, own in shots.items():
+        for i, shot in enumerate(own):
+            row = rows[f"{vehicle}/DJI_{i:04d}.JPG"]
+            assert row["vehicle"] == vehicle and row["stage"] == "fine" and row["epsg"] == scene.grid.epsg
+            assert row["homography"][2][2] == 1.0 and np.shape(row["homography"]) == (3, 3)
+            assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?Z", row["time"])
+            assert abs(row["fov_deg"] - shot.fov) < 3
+            assert 0 < row["sigma_m"] < 2
+            errors.append(scene.error_m(row, shot))
+    assert np.median(errors) < 0.3 and max(errors) < 1.5
+
+
+def test_pictures_are_cogs_of_drone_pixels(flight, mapped):
+    scene, _, _ = flight
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif"):
+        with rasterio.open(mapped[0] / name) as image:
+            assert image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert image.count == 4 and set(image.dtypes) == {"uint8"}
+            assert image.crs.to_epsg() == scene.grid.epsg
+            rgba = image.read()
+        assert set(np.unique(rgba[3])) <= {0, 255} and (rgba[:3, rgba[3] == 0] == 0).all()
+
+
+def test_the_orthoimage_shows_the_ground_where_it_is(flight, mapped):
+    scene, _, _ = flight
+    with rasterio.open(mapped[0] / "orthoimage.tif") as image:
+        rgba = image.read(out_dtype="float32")
+        rows, cols = np.mgrid[: image.height, : image.width] + 0.5
+        t = image.transform
+        east, north = t.c + t.a * cols, t.f + t.e * rows
+    column = np.floor((east - scene.ground.west) / scene.ground.gsd_m).astype(int)
+    row = np.floor((scene.ground.north - north) / scene.ground.gsd_m).astype(int)
+    n = scene.ground.width
+    inside = (rgba[3] > 0) & (column >= 0) & (row >= 0) & (column < n) & (row < n)
+    truth = scene.rgb[row[inside], column[inside]].astype(float)
+    assert np.abs(rgba[:3, inside].T - truth).mean() < 12
+
+
+def test_the_report_has_its_keys(mapped):
+    out, report = mapped
+    assert report == json.loads((out / "report.json").read_text())
+    assert report["frames"] == {"input": 33, "used": 32, "rejected": 1}
+    assert {v["id"] for v in report["vehicles"]} == {"a", "b"}
+    assert all({"id", "frames", "fov_deg", "fov_sigma_deg", "legs", "gsd_m"} <= set(v) for v in report["vehicles"])
+    for leg in report["legs"]:
+        assert {"vehicle", "first", "last", "state", "confidence", "sigma_m"} <= set(leg)
+        assert leg["state"] in {"matched", "carried", "failed"}
+    names = [s["name"] for s in report["stages"]]
+    heads = ("load", "realtime", "coarse", "fine", "final")
+    assert all(n.startswith(heads) for n in names) and {h for h in heads for n in names if n.startswith(h)} == set(
+        heads
+    )
+    assert all(set(s) == {"name", "wall_s", "cpu_s", "items"} for s in report["stages"])
+    assert report["wall_s"] > 0 and report["cpu_s"] > 0 and report["peak_rss_mb"] > 50
+    assert 2.0 < report["area_ha"] < 12.0 and report["covered_share"] > 0.97
+    assert math.isfinite(report["ground_z_m"]) and report["refine"] == "swarm" and isinstance(report["warnings"], list)
+
+
+def test_the_page_stands_alone_and_has_its_pictures(mapped):
+    page = (mapped[0] / "report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") >= 6
+    assert not re.search(r"""(src|href)=["']?(http|/|\w+\.)""", page)
+    assert "broken.jpg" in page and "Lies on the pre-disaster map" in page
+
+
+def test_footprints_open_as_polygons(flight, mapped):
+    import pyogrio
+    import shapely
+
+    meta, _, shapes, fields = pyogrio.raw.read(mapped[0] / "footprints.gpkg")
+    polygons = shapely.from_wkb(shapes)
+    assert len(polygons) == 32 and meta["crs"] == f"EPSG:{flight[0].grid.epsg}"
+    assert all(p.is_valid and 2000 < p.area < 40_000 for p in polygons)
+    assert list(meta["fields"])[:2] == ["image", "vehicle"] and "a/DJI_0000.JPG" in fields[0]
+
+
+def test_results_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
+    with Processes(2) as two:
+        make(flight[2] / "photos", tmp_path / "two", Options(basemap=flight[2] / "map.tif"), two)
+    assert content(tmp_path / "two") == content(mapped[0])
+
+
+@pytest.mark.parametrize("when", ["drawing realtime", "solo", "joint", "drawing orthoimage", "writing orthoimage.tif"])
+def test_an_interrupted_run_is_continued(flight, mapped, tmp_path, when):
+    photos, options = flight[2] / "photos", Options(basemap=flight[2] / "map.tif")
+    seen = []
+
+    def interrupt(what, done, total):
+        if what == when:
+            raise KeyboardInterrupt
+        seen.append(what)
+
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, options, progress=interrupt)
+    made = {p.name for p in out.iterdir()} - {".work"}
+    assert made <= set(PRODUCTS) and "report.json" not in made and "orthoimage.tif" not in made
+    for name in made:
+        with rasterio.open(out / name) as image:
+            image.read(1)
+    before = set(seen)
+    seen.clear()
+    report = make(photos, out, options, progress=lambda what, *_: seen.append(what))
+    assert content(out) == content(mapped[0])
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS)
+    if when != "drawing realtime":
+        assert "drawing realtime" in before and "drawing realtime" not in seen
+        assert any("continued" in w for w in report["warnings"])
+
+
+def test_a_refusal_leaves_an_interrupted_run_to_be_continued(flight, mapped, tmp_path):
+    def interrupt(what, done, total):
+        if what == "drawing orthoimage":
+            raise KeyboardInterrupt
+
+    photos, out, options = flight[2] / "photos", tmp_path / "out", Options(basemap=flight[2] / "map.tif")
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, options, progress=interrupt)
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
+    Scene(47.5, 8.9).basemap(tmp_path / "elsewhere.tif")
+    with pytest.raises(InputError, match="does not overlap"):
+        make(photos, out, Options(basemap=tmp_path / "elsewhere.tif"))
+    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
+    report = make(photos, out, options)
+    assert any("continued" in w for w in report["warnings"]) and content(out) == content(mapped[0])
+
+
+def test_a_map_that_was_replaced_does_not_continue_an_interrupted_run(flight, tmp_path):
+    def interrupt(what, done, total):
+        if what == "drawing orthoimage":
+            raise KeyboardInterrupt
+
+    scene, _, folder = flight
+    photos, out, options = folder / "photos" / "a", tmp_path / "out", Options(basemap=tmp_path / "map.tif")
+    scene.basemap(tmp_path / "map.tif")
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, options, progress=interrupt)
+    scene.basemap(tmp_path / "map.tif")
+    assert not any("continued" in w for w in make(photos, out, options)["warnings"])
+
+
+def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
+    def interrupt(what, done, total):
+        if what == "solo":
+            raise KeyboardInterrupt
+
+    photos, out, seen = flight[2] / "photos", tmp_path / "out", []
+    with pytest.raises(KeyboardInterrupt):
+        make(photos, out, Options(), progress=interrupt)
+    make(photos, out, Options(gsd_m=1.0, until="realtime"), progress=lambda what, *_: seen.append(what))
+    assert "drawing realtime" in seen
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+
+
+def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".orthoimage.part4711.tif").write_bytes(b"half")
+    make(flight[2] / "photos" / "a", tmp_path / "out", Options(until="realtime"))
+    assert {p.name for p in (tmp_path / "out").iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+
+
+def test_two_runs_do_not_write_to_one_folder(flight, tmp_path):
+    with Workspace(tmp_path / "out"), pytest.raises(InputError, match="another run"):
+        make(flight[2] / "photos", tmp_path / "out")
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, tmp_path, monkeypatch):
+    count = 0
+    compress = cog.isal_zlib.compress
+
+    def full(data, level):
+        nonlocal count
+        count += 1
+        if count > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return compress(data, level)
+
+    monkeypatch.setattr(cog.isal_zlib, "compress", full)
+    with pytest.raises(OrthoSwarmError, match="disk is full") as caught:
+        make(flight[2] / "photos", tmp_path / "out")
+    assert caught.value.exit_code == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, tmp_path, monkeypatch, capsys):
+    from orthoswarm.refine.strategy import swarm_refiner
+
+    def fault(*_, **__):
+        raise ZeroDivisionError("by a bug")
+
+    _, _, folder = flight
+    out = tmp_path / "out"
+    monkeypatch.setattr(swarm_refiner, "refine_all", fault)
+    for name in ("orthoimage.tif", "coarse.tif"):  # of an earlier run: they must not pass for this one's
+        out.mkdir(exist_ok=True)
+        (out / name).write_bytes(b"old")
+    command = ["mosaic", str(folder / "photos"), "--basemap", str(folder / "map.tif"), "--out", str(out), "--json"]
+    assert main([*command, "--workers", "1"]) == 1
+    told = capsys.readouterr()
+    assert "ZeroDivisionError: by a bug" in told.err and not told.out
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "coarse.tif"}
+    report = json.loads((out / "report.json").read_text())
+    assert any("ZeroDivisionError" in w for w in report["warnings"]) and report["refine"] == "none"
+    rows = rows_of(out)
+    assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"} and len(rows) == 33
+    with rasterio.open(out / "realtime.tif") as image:
+        assert image.count == 4
+
+
+def test_without_a_map_the_orthoimage_is_the_coarse_one(flight, tmp_path):
+    scene, shots, folder = flight
+    report = make(folder / "photos" / "a", tmp_path / "out")
+    assert any("no basemap" in w for w in report["warnings"])
+    rows = rows_of(tmp_path / "out")
+    assert {r["stage"] for r in rows.values()} == {"coarse", "rejected"}
+    assert (tmp_path / "out" / "coarse.tif").read_bytes() == (tmp_path / "out" / "orthoimage.tif").read_bytes()
+    errors = [scene.error_m(rows[f"DJI_{i:04d}.JPG"], shot) for i, shot in enumerate(shots["a"])]
+    assert np.median(errors) < 2.0
+
+
+def test_stopping_early_makes_what_was_asked(flight, tmp_path):
+    folder = flight[2]
+    report = make(folder / "photos" / "a", tmp_path / "r", Options(until="realtime", fov_min_deg=60, gsd_m=0.8))
+    assert {p.name for p in (tmp_path / "r").iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+    rows = rows_of(tmp_path / "r")
+    assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"}
+    assert all(r["fov_deg"] == pytest.approx(60) for r in rows.values() if "fov_deg" in r)
+    assert report["vehicles"][0]["frames"] == 16
+    with rasterio.open(tmp_path / "r" / "realtime.tif") as image:
+        assert image.res == (0.8, 0.8)
+    report = make(folder / "photos" / "a", tmp_path / "c", Options(basemap=folder / "map.tif", until="coarse"))
+    assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif"}
+    assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
+    assert abs(report["vehicles"][0]["fov_deg"] - FOV) < 4
+
+
+def test_the_output_folder_may_lie_among_the_photos(flight, tmp_path):
+    scene, shots, _ = flight
+    photos = tmp_path / "photos"
+    scene.fly(photos, shots["a"][:8])
+    for _ in range(2):
+        report = make(photos, photos / "map", Options(until="realtime"))
+        assert report["frames"] == {"input": 8, "used": 8, "rejected": 0}
+
+
+def test_legs_become_vehicles(flight, tmp_path):
+    scene, shots, _ = flight
+    scene.fly(tmp_path / "photos", shots["a"])
+    frames = load([tmp_path / "photos"]).frames
+    named = [f.vehicle for f in legs_as_vehicles(frames, scene.grid)]
+    assert named[0] == "photos/leg1" and named[-1] == "photos/leg2"
+    assert named == sorted(named) and 6 <= named.count("photos/leg1") <= 10
+    report = make(tmp_path / "photos", tmp_path / "out", Options(split_legs=True, until="realtime"))
+    assert [v["id"] for v in report["vehicles"]] == ["photos/leg1", "photos/leg2"]
+
+
+def test_ground_level_is_that_below_the_cameras(mapped):
+    assert ground_level([], None) == 0.0
+    assert abs(mapped[1]["ground_z_m"]) < 2.0
+
+
+def test_ground_is_stated_at_the_takeoff_level_and_no_picture_moves(flight):
+    scene, _, photos = flight
+    placed = recorded_cameras(load([photos / "photos"]).frames, scene.grid, None).placed
+    raised, level = from_takeoff(placed, -0.43)
+    assert level == 0.0
+    for before, after in zip(placed, raised, strict=True):
+        assert after.camera.position[2] == pytest.approx(before.camera.position[2] + 0.43)
+        np.testing.assert_allclose(after.camera.homography(level), before.camera.homography(-0.43), rtol=1e-12)
+    assert from_takeoff(placed, -12.0) == (placed, -12.0), "a valley is no lift"
+    assert from_takeoff([], 0.0) == ([], 0.0)
+
+
+def test_a_map_far_from_where_the_receivers_say_is_told(flight):
+    scene, _, photos = flight
+    recorded = recorded_cameras(load([photos / "photos"]).frames, scene.grid, None).placed
+
+    def moved(east, north, stage="fine"):
+        by = np.array([east, north, 0.0])
+        return [replace(p, camera=replace(p.camera, position=p.camera.position + by), stage=stage) for p in recorded]
+
+    (told,) = map_offset(recorded, moved(18.0, -14.0))
+    assert "23 m (+18 east, -14 north)" in told
+    assert map_offset(recorded, moved(4.0, 3.0)) == map_offset(recorded, moved(40.0, 0.0, "coarse")) == []
+
+
+def test_the_command_prints_one_json_document(flight, tmp_path, capsys):
+    photos, out = flight[2] / "photos" / "b", tmp_path / "out"
+    args = ["mosaic", str(photos), "--out", str(out), "--until", "realtime", "--workers", "1", "--json"]
+    assert main(args) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["frames"]["used"] == 16
+    assert "reading photos" in printed.err
+
+
+def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone(flight, tmp_path, monkeypatch):
+    _, _, folder = flight
+
+    def page(out, report, placed, rejected, basemap):
+        if basemap is not None:
+            raise InputError("the basemap map.tif is damaged; copy or export it again")
+        write_page(out, report, placed, rejected, None)
+
+    monkeypatch.setattr("orthoswarm.batch.pipeline.write_page", page)
+    photos, out = folder / "photos" / "b", tmp_path / "out"
+    report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
+    assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])
+    assert {p.name for p in out.iterdir()} >= {"report.html", "report.json", "frames.jsonl"}
+
+
+def test_a_large_area_is_compared_with_the_map_in_parts(flight, mapped, monkeypatch):
+    from orthoswarm.report import page
+    from orthoswarm.report.report_pictures import MapView, product_bounds, product_picture, view_grid
+
+    best = mapped[0] / "orthoimage.tif"
+    bounds = product_bounds(best)
+    basemap = Basemap.open(flight[2] / "map.tif", flight[0].grid.epsg, bounds)
+    ortho = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 400, 0.3))
+    there = MapView.read(basemap, ortho.grid)
+    whole = page._shifts(best, ortho, there, basemap, 0.3)
+    monkeypatch.setattr(page, "_FINE_M", 0.6)
+    monkeypatch.setattr(page, "_PART_PX", 160)
+    coarse = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 100, 0.3))
+    assert coarse.grid.gsd_m > 0.6
+    parts = page._shifts(best, coarse, MapView.read(basemap, coarse.grid), basemap, 0.3)
+    assert len(whole.at) > 3 and len(parts.at) > 3
+    assert np.median(parts.size_m) < np.median(whole.size_m) + 0.3

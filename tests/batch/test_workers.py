@@ -1,0 +1,142 @@
+"""Work gives the same results, in the same order, whatever the number of workers."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, single_threaded, workers
+from orthoswarm.model.errors import OrthoSwarmError
+
+
+def square(n):
+    time.sleep(0.002 * (n % 3))  # later items overtake earlier ones
+    return n * n
+
+
+def grow(numbers):
+    numbers.append(1)
+    return len(numbers) - 1
+
+
+def where(_):
+    end = time.perf_counter() + 0.05
+    while time.perf_counter() < end:
+        pass
+    return os.getpid()
+
+
+def threads(_):
+    import cv2
+
+    return os.environ["OMP_NUM_THREADS"], cv2.getNumThreads()
+
+
+def refuse(n):
+    if n == 3:
+        raise ValueError("three")
+    return n
+
+
+def die(n):
+    if n >= 0:
+        os._exit(9)
+
+
+def test_results_do_not_depend_on_the_number_of_workers():
+    items = list(range(40))
+    expected = [n * n for n in items]
+    assert list(Serial().map(square, items)) == expected
+    with Processes(3) as three:
+        assert list(three.map(square, iter(items))) == expected
+        assert list(three.map(square, [])) == []
+
+
+def test_a_function_changes_a_copy_of_its_own():
+    shared = [0]
+    for count in (1, 2):
+        with Processes(count) as some:
+            assert list(some.map(grow, [shared] * 6)) == [1] * 6
+    assert list(Serial().map(grow, [shared] * 3)) == [1] * 3 and shared == [0]
+
+
+def test_the_caller_works_too_and_the_others_are_measured():
+    with Processes(2) as two:
+        pids = set(two.map(where, range(60)))
+        used = two.usage()
+    assert os.getpid() in pids and len(pids) == 2
+    assert used.cpu_s > 0.05 and used.peak_rss_mb > 10
+
+
+def test_items_are_taken_as_they_are_needed():
+    taken = []
+
+    def items():
+        for n in range(100):
+            taken.append(n)
+            yield n
+
+    with Processes(2) as two:
+        results = two.map(square, items())
+        assert next(results) == 0
+        assert len(taken) < 20
+        results.close()
+
+
+def test_an_error_comes_at_its_items_turn():
+    with Processes(2) as two:
+        results = two.map(refuse, range(8))
+        assert [next(results) for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(ValueError, match="three"):
+            next(results)
+
+
+def test_a_killed_worker_is_one_clear_error():
+    me = os.getpid()
+    with Processes(2) as two:
+        pid = next(p for p in two.map(where, range(40)) if p != me)
+        assert pid != me
+        pool = two._started()
+        future = pool.submit(die, 1)
+        with pytest.raises(OrthoSwarmError, match="fewer --workers"):
+            two._account(future)
+
+
+def test_each_process_keeps_to_one_thread():
+    with Processes(2) as two:
+        assert {cv for _, cv in two.map(threads, range(4))} == {1}
+
+
+def test_helpers(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    single_threaded()
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert isinstance(workers(1), Serial)
+    assert workers(4).count == 4
+    assert workers().count == cores() >= 1
+    assert peak_rss_mb() > 10
+
+
+PARENT = """
+import os, sys
+from orthoswarm.workers import Processes
+from tests.test_workers import where
+pool, others = Processes(3), set()
+while not others:
+    others = set(pool.map(where, range(40))) - {os.getpid()}
+print(*others, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_workers_end_with_a_parent_that_was_killed():
+    root = Path(__file__).parents[2]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", PARENT], cwd=root, text=True, **pipes) as parent:
+        assert parent.stdout is not None and parent.stdout.readline().split()
+        parent.kill()
+        # Workers hold the other end of this pipe: it ends with the last of them, and never if they wait on.
+        assert parent.communicate(timeout=60) == ("", None)

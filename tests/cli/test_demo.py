@@ -1,0 +1,92 @@
+"""The demonstration: the whole swarm simulated, the map measured against the truth."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gcs_plugin.cli.main import main
+from gcs_plugin.demo.setting import Errors, Setting
+from gcs_plugin.demo.simulator import PacedClock
+
+
+def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert "something else" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("arguments", [["--vehicles", "0"], ["--vehicles", "99"], ["--speed", "0"]])
+def test_impossible_demonstrations_are_refused(arguments, tmp_path):
+    assert main(["demo", "--out", str(tmp_path / "d"), *arguments]) == 2
+
+
+def test_the_area_grows_with_the_swarm():
+    small, large = Setting(vehicles=1), Setting(vehicles=6)
+    assert large.extent_m[0] == 6 * small.extent_m[0]
+    across, along = large.twin.plan.extent_m
+    assert across < 0.5 * large.extent_m[0]
+    assert along < 0.5 * large.extent_m[1]
+
+
+def test_vehicles_differ_and_stay_as_they_are():
+    setting = Setting()
+    assert Errors.of(setting, 1) == Errors.of(setting, 1)
+    assert Errors.of(setting, 1) != Errors.of(setting, 2)
+
+
+def test_the_clock_runs_slower_while_cameras_are_behind(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("gcs_plugin.demo.simulator.time.monotonic", lambda: now[0])
+    clock = PacedClock()
+    now[0] += 2.0
+    assert clock() == pytest.approx(2.0)
+    clock.slow = True
+    now[0] += 2.0
+    assert 2.0 < clock() < 3.0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal to a group of processes")
+def test_a_ctrl_c_at_the_terminal_ends_all_of_it_in_a_sentence(tmp_path):
+    mark = tmp_path / "demo" / "demo.json"
+    command = [sys.executable, "-m", "gcs_plugin.cli", "demo", "--no-browser", "--out", str(mark.parent)]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it for what runs behind them
+    )  # fmt: skip
+    while not mark.exists():
+        assert process.poll() is None
+        time.sleep(0.02)
+    time.sleep(1.0)  # there is nothing to wait for: any moment of its start will do
+    os.killpg(process.pid, signal.SIGINT)
+    try:
+        _, said = process.communicate(timeout=60)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+    # Interrupted inside exec(), as imports use it, Python ends by the signal itself; a shell shows 130 in both cases.
+    assert process.returncode in (130, -signal.SIGINT)
+    assert "Traceback" not in said and "interrupted" in said
+
+
+@pytest.mark.slow
+def test_the_demonstration_maps_a_city_within_half_a_metre(tmp_path):
+    out = tmp_path / "demo"
+    assert main(["demo", "--vehicles", "2", "--out", str(out), "--median", "0.5", "--no-browser"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["frames"]["used"] == report["demo"]["pictures"]
+    completions = report["completions"]
+    assert {row["vehicle"] for row in completions} == {"v1", "v2"}
+    assert completions[0]["still_flying"]
+    for row in completions:
+        assert row["complete_s"] < row["refine_started_s"] < row["refine_ended_s"]
+        assert row["version"] > row["version_before"]
+    assert report["accuracy"]["median_m"] < 0.3 * report["accuracy_realtime"]["median_m"]
+    for name in ("orthoimage.tif", "realtime.tif", "report.html", "export/orthoimage.mbtiles", "export/orthoimage.kmz"):
+        assert (out / name).exists()

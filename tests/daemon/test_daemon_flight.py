@@ -1,0 +1,198 @@
+"""Vehicles on links: plan, upload, start over HTTP; completion starts the refinement by itself; a second mission."""
+
+import json
+import math
+import queue
+import sys
+import threading
+
+import httpx
+import pytest
+
+from gcs_plugin.sim.multirotor import Airframe
+from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from tests.kit.daemon_kit import GRID, Shot, camera_at, exported, jpeg, pose_of, serving
+from tests.kit.mosaic_scene import EAST, NORTH
+
+
+class Cameras:
+    """Take a picture of the made-up ground at each exposure and post it, with the recorded pose."""
+
+    def __init__(self):
+        self.waiting: queue.SimpleQueue = queue.SimpleQueue()
+        self.served = None
+        self.posted = 0
+        self.count = 0
+        self.over = False
+        threading.Thread(target=self.run, daemon=True).start()
+
+    def expose(self, vehicle, exposure):
+        self.count += 1
+        self.waiting.put((vehicle.system, exposure.index, exposure.pose, vehicle.utc_s(exposure.time_s)))
+
+    def run(self):
+        while True:
+            system, index, pose, time_s = self.waiting.get()
+            east, north = GRID.to_grid(pose.lat_deg, pose.lon_deg)
+            turn = float(GRID.convergence_rad(pose.lat_deg, pose.lon_deg))
+            camera = camera_at(east - EAST, north - NORTH, pose.height_m, math.degrees(pose.yaw_rad - turn))
+            name = f"{time_s:.0f}-{index}.jpg"
+            try:
+                answer = self.served.send(Shot(pose_of(camera, name, f"v{system}", time_s), jpeg(camera)))
+            except httpx.TransportError:
+                if self.over:  # the test has ended while vehicles still fly
+                    return
+                raise
+            assert answer.status_code == 201
+            self.posted += 1
+
+
+def square(side_m):
+    lat, lon = GRID.to_geographic([EAST, NORTH])
+    dlat, dlon = side_m / 111_000 / 2, side_m / 111_000 / 2 / math.cos(math.radians(lat))
+    ring = [[lon - dlon, lat - dlat], [lon + dlon, lat - dlat], [lon + dlon, lat + dlat], [lon - dlon, lat + dlat]]
+    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+
+
+@pytest.fixture
+def flown(tmp_path):
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))
+    cameras = Cameras()
+    vehicles = make_swarm(2, home=(lat, lon, 500.0), airframe=Airframe(climb_m_s=8.0), on_exposure=cameras.expose)
+    with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=6.0) as swarm:
+        links = [text for address in swarm.addresses for text in ("--link", address)]
+        with serving(tmp_path / "w", *links) as served:
+            cameras.served = served
+            yield served, cameras, tmp_path / "w"
+            cameras.over = True
+
+
+def fly(served, vehicle, plan, mission=None):
+    upload(served, vehicle, plan, mission)
+    start(served, vehicle)
+
+
+def upload(served, vehicle, plan, mission=None):
+    body = {"plan": plan, **({"mission": mission} if mission else {})}
+    answer = served.command(f"/api/missions/{vehicle}/upload", body)
+    assert answer.status_code == 200, answer.text
+
+
+def start(served, vehicle):
+    answer = served.command(f"/api/missions/{vehicle}/start")
+    assert answer.status_code == 200, answer.text
+
+
+def test_completion_starts_the_refinement_while_the_others_fly(flown):
+    served, cameras, workspace = flown
+    served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
+    body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "end": "hover", "speed_m_s": 8}
+    plan = served.command("/api/plans", body)
+    assert plan.status_code == 201, plan.text
+    number = plan.json()["id"]
+    assert served.get("/api/plans").json()[0]["covered_share"] > 0.99
+    assert served.get(f"/api/plans/{number}/map").json()["type"] == "FeatureCollection"
+    for vehicle in ("v1", "v2"):
+        upload(served, vehicle, number)
+    start(served, "v1")
+    served.until("/api/vehicles", lambda rows: any(r["id"] == "v1" and r["mission"]["item"] >= 3 for r in rows))
+    start(served, "v2")
+    jobs = served.until("/api/jobs", lambda rows: any(r["kind"] == "refine" and r["state"] == "done" for r in rows))
+    first = next(job for job in jobs if job["kind"] == "refine")
+    assert first["vehicle"] == "v1"
+    assert first["detail"]["trigger"] == "complete"
+    done = served.until("/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows))
+    assert [row["vehicle"] for row in done] == ["v1", "v2"]
+    assert done[0]["still_flying"] == ["v2"]
+    for row in done:
+        assert row["complete_s"] <= row["refine_started_s"] <= row["refine_ended_s"]
+        assert row["version"] > row["version_before"]
+    assert cameras.posted == cameras.count > 10
+    rows = served.get("/api/frames?vehicle=v1").json()
+    assert {row["stage"] for row in rows} <= {"coarse", "rejected"}
+    assert served.get("/api/legs").json()["features"]
+    served.until("/api/jobs", exported)
+    assert (workspace / "orthoimage.tif").exists()
+    products_are_written(served, workspace)
+    second_sortie(served, number)
+
+
+def products_are_written(served, workspace):
+    job = served.command("/api/export", {"formats": ["cog", "mbtiles", "kmz", "gpkg", "odm"]}).json()
+    served.until("/api/jobs", lambda rows: all(r["state"] in ("done", "failed") for r in rows))
+    done = next(r for r in served.get("/api/jobs").json() if r["id"] == job["id"])
+    assert done["state"] == "done", done["message"]
+    assert set(done["detail"]["files"]) == {"cog", "mbtiles", "kmz", "gpkg", "odm"}
+    for kind in done["detail"]["files"]:
+        answer = served.get(f"/api/export/{job['id']}/{kind}")
+        assert answer.status_code == 200
+        assert len(answer.content) > 1000
+    report = json.loads((workspace / "report.json").read_text())
+    assert report["frames"]["used"] > 10
+    assert [row["vehicle"] for row in report["completions"]] == ["v1", "v2"]
+    assert any("no basemap" in text for text in report["warnings"])
+    stages = {row["name"]: row for row in report["stages"]}
+    assert stages["realtime"]["items"] == report["frames"]["used"]
+    if sys.platform == "linux":  # elsewhere other processes are not counted
+        assert report["cpu_s"] > stages["realtime"]["cpu_s"] and report["peak_rss_mb"] > 200
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl", "footprints.gpkg", "report.html"):
+        assert (workspace / name).stat().st_size > 1000
+    assert served.command("/api/export", {"formats": ["exe"]}).status_code == 422
+    assert served.get("/api/export/9999/cog").status_code == 404
+
+
+def second_sortie(served, plan):
+    before = len(served.get("/api/jobs").json())
+    fly(served, "v1", plan)
+    served.until("/api/completions", lambda rows: len(rows) == 3 and "version" in rows[-1])
+    row = served.get("/api/completions").json()[-1]
+    assert (row["vehicle"], row["sortie"]) == ("v1", 2)
+    assert {frame["sortie"] for frame in served.get("/api/frames?vehicle=v1").json()} == {1, 2}
+    assert len([job for job in served.get("/api/jobs").json()[before:] if job["kind"] == "refine"]) == 1
+
+
+def test_commands_that_cannot_be_carried_out_say_why(flown):
+    served, _, _ = flown
+    served.until("/api/vehicles", lambda rows: len(rows) == 2)
+    assert "v9" in served.command("/api/missions/v9/start").json()["detail"]
+    assert "mission" in served.command("/api/missions/2/start").json()["detail"]  # heard, and known by its number
+    assert served.command("/api/missions/v1/explode").status_code == 404
+    assert "plan" in served.command("/api/missions/v1/upload", {"plan": "../../etc"}).json()["detail"]
+    assert "vehicles" in served.command("/api/plans", {"area": square(100)}).json()["detail"]
+    bad = {"area": {"type": "Point"}, "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65}
+    assert served.command("/api/plans", bad).status_code == 422
+
+
+def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
+    served, _, _ = flown
+    served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST - 90.0, NORTH - 90.0]))
+    body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "end": "hover", "speed_m_s": 8}
+    plan = served.command("/api/plans", body | {"starts": [[lat, lon], [lat, lon]]}).json()
+    starts = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
+    apart = max(starts.values()) - min(starts.values())
+    assert apart >= 5.0  # from one start they take off one after the other
+    later = max(starts, key=starts.get)
+    go = f"/api/plans/{plan['id']}/start"
+    upload(served, later, plan["id"])
+    refused = served.command(go)
+    assert refused.status_code == 409 and "nobody was started" in refused.json()["detail"]
+    assert ({"v1", "v2"} - {later}).pop() in refused.json()["detail"] and later not in refused.json()["detail"]
+    for vehicle in starts:
+        upload(served, vehicle, plan["id"])
+    assert served.post(go, json={}).status_code == 401  # a command
+    assert served.command(go, {"sortie": 7}).status_code == 422
+    assert "alpha" in served.command(go, {"vehicles": {later: "alpha"}}).json()["detail"]
+    answer = served.command(go)
+    assert answer.status_code == 202, answer.text
+    assert answer.json()["takeoffs_in_s"] == {
+        v: pytest.approx(t - min(starts.values()), abs=0.1) for v, t in starts.items()
+    }
+    waiting = served.until("/api/vehicles", lambda rows: [r for r in rows if "takeoff" in r])
+    assert [r["id"] for r in waiting if "takeoff" in r and r["takeoff"]["in_s"] > 1.0] == [later]
+    assert "under way" in served.command(go).json()["detail"]
+    served.until("/api/vehicles", lambda rows: sum(r["mission"]["phase"] == "active" for r in rows) == 1)
+    assert "cancelled" in served.command(f"/api/missions/{later}/rtl").json()["text"]
+    served.until("/api/completions", lambda rows: len(rows) == 1)  # and the other one stays on the ground
+    rows = {r["id"]: r for r in served.get("/api/vehicles").json()}
+    assert "takeoff" not in rows[later] and not rows[later]["armed"]

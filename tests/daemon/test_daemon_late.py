@@ -1,0 +1,130 @@
+"""Pictures that come after their vehicle was refined, and a vehicle that stood at one spot."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.solution_file import load_kept
+from gcs_plugin.daemon.settings import Settings
+from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Frames as taken, and the map's file."""
+    folder = tmp_path_factory.mktemp("flight")
+    ground = made_up_ground()
+    write_map(ground, folder / "map.tif")
+    return made_up_flight(ground, folder, "v1"), folder / "map.tif"
+
+
+@pytest.fixture
+def daemon(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.5)
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.1)
+    settings = Settings(tmp_path / "w", basemap=flight[1], coarse=False)
+    settings.workspace.mkdir()
+    with Daemon(settings) as daemon:
+        yield daemon
+
+
+def after_all(daemon):
+    """Wait until all pictures are refined; gives the refinements."""
+    end = time.monotonic() + LIMIT_S
+    while set(stages(daemon).values()) != {"fine"}:
+        assert time.monotonic() < end, [job.document() for job in daemon.jobs.all()]
+        time.sleep(0.05)
+    return after_job(daemon, 1)
+
+
+def stages(daemon):
+    return {row["image"]: row["stage"] for row in daemon.frames()}
+
+
+def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_them(daemon, flight):
+    frames, _ = flight
+    late = [frames[k] for k in (5, 15, 16)]
+    first = [f for f in frames[:20] if f not in late]
+    post(daemon, first)
+    complete(daemon)
+    (refined,) = after_job(daemon, 1)
+    assert refined.state == "done", refined.message
+    assert refined.detail["frames"] == 17
+    note = daemon.completions()
+    post(daemon, late)
+    beside = after_all(daemon)[1:]  # one job, or more where they came slowly
+    assert {(job.state, job.detail["trigger"]) for job in beside} == {("done", "late")}
+    assert sum(job.detail["beside"] for job in beside) == 3
+    assert daemon.completions() == note  # what the completion led to stays as it was
+    row = daemon.journal.one("SELECT path FROM solutions")
+    placed = {
+        p.frame.image: p for p in load_kept(daemon.settings.workspace / "solutions" / row["path"]).solution.placed
+    }
+    assert len(placed) == 20
+    for frame in late:
+        one = placed[frame.image]
+        assert np.hypot(*(one.camera.to_ground([119.5, 89.5]) - truth(frame))) < 0.5
+        assert one.sigma_m < 1.5
+        assert not one.weak
+    post(daemon, frames[20:])  # with the three they are more than a handful
+    again = after_all(daemon)[-1]
+    assert again.state == "done", again.message
+    assert "beside" not in again.detail
+    assert again.detail["frames"] == 28
+    assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+
+
+def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 3600.0)  # it ends before it has noticed
+    frames, basemap = flight
+    settings = Settings(tmp_path / "w", basemap=basemap, coarse=False)
+    settings.workspace.mkdir()
+    with Daemon(settings) as daemon:
+        post(daemon, frames[:16])
+        complete(daemon)
+        after_job(daemon, 1)
+        post(daemon, frames[16:18])
+    with Daemon(settings) as daemon:
+        _, beside = after_job(daemon, 2)
+        assert beside.detail["beside"] == 2
+    with Daemon(settings) as daemon:
+        assert len(after_job(daemon, 2)) == 2  # not again
+
+
+def test_a_vehicle_that_stood_at_one_spot_stays_as_recorded_and_says_so(daemon, flight):
+    frames, _ = flight
+    rng = np.random.default_rng(3)
+    for k in range(12):  # one view, and a receiver that wanders about it
+        post(daemon, [replace(frames[7], image=f"{k}.jpg", time_s=1e9 + k)], rng.normal(0.0, 1.0, 2))
+    complete(daemon)
+    (job,) = after_job(daemon, 1)
+    assert job.state == "done", job.message
+    assert job.attempts == 1
+    assert job.detail["warnings"] == ["v1: all pictures were taken at one spot; they are placed as recorded"]
+    assert set(stages(daemon).values()) == {"realtime"}
+    (coarse,) = [job for job in daemon.jobs.all() if job.kind == "coarse"]
+    assert "stays where its receiver says" in coarse.detail["note"]
+    assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+
+
+def test_silence_is_told_however_few_pictures_came(monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.02)
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.2)
+    asked, silent = [], []
+    watch = LegWatch(lambda *values: asked.append(values), lambda *values: silent.append(values))
+    watch.start()
+    for count in (1, 2):
+        watch.add("v1", 1, 1e9 + count, 48.0, 11.0)
+        end = time.monotonic() + 30
+        while len(silent) < count:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    time.sleep(0.3)
+    watch.close()
+    assert silent == [("v1", 1)] * 2  # once for each silence
+    assert asked == []

@@ -1,0 +1,144 @@
+"""More pictures than can be drawn: those that would show least are put off, it is said, and nothing is lost."""
+
+import threading
+import time
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
+from gcs_plugin.daemon.layers.draw_queue import Pending, Waiting
+from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Journal, add_frame
+from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
+from orthoswarm.model.frame import Fix, Frame
+from tests.kit.daemon_kit import GRID, SIZE, camera_at, jpeg, pose_of
+from tests.kit.mosaic_scene import EAST, NORTH
+
+
+def pending(seq, east, north=0.0, height=100.0):
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST + east, NORTH + north]))
+    return Pending(seq, 0.0, 1, Frame(f"{seq}.jpg", None, "v1", float(seq), Fix(lat, lon, height), *SIZE))
+
+
+def drained(queue):
+    out = []
+    while (one := queue.take()) is not None:
+        out.append(one.seq)
+    return out
+
+
+def test_while_it_keeps_up_frames_are_drawn_as_they_come():
+    queue = Waiting(100)
+    for seq in range(20):
+        queue.put(pending(seq, 4.0 * seq))
+        assert queue.take().seq == seq
+    assert len(queue) == 0
+
+
+def test_ground_that_is_empty_goes_first():
+    queue = Waiting(100)
+    queue.put(pending(0, 0.0))
+    assert queue.take().seq == 0
+    for seq, east in ((1, 3.0), (2, 6.0), (3, 400.0), (4, 20.0), (5, 403.0)):
+        queue.put(pending(seq, east))
+    order = drained(queue)
+    assert order[0] == 3
+    assert order[1] == 4
+    assert set(order[2:]) == {1, 2, 5}
+
+
+def test_the_first_few_of_a_jam_are_spread_over_its_ground():
+    """Of 400 frames along 800 m, the first 40 that are drawn leave no gap as wide as the 40 that came first would."""
+    queue = Waiting(1000)
+    for seq in range(400):
+        queue.put(pending(seq, 2.0 * seq))
+    first = sorted(2.0 * queue.take().seq for _ in range(40))
+    assert max(np.diff([0.0, *first, 800.0])) < 60.0
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.integers(0, 300), min_size=1, max_size=60), st.integers(1, 30))
+def test_nothing_disappears_from_the_queue(places, most):
+    queue, left = Waiting(most), set()
+    for seq, place in enumerate(places):
+        out = queue.put(pending(seq, float(place)))
+        if out is not None:
+            left.add(out.seq)
+        assert len(queue) <= most
+    drawn = drained(queue)
+    assert len(drawn) == len(set(drawn)) == min(most, len(places))
+    assert set(drawn) | left == set(range(len(places)))
+    assert not set(drawn) & left
+
+
+def test_a_full_queue_lets_go_of_what_shows_least():
+    queue = Waiting(3)
+    queue.put(pending(0, 0.0))
+    assert queue.take().seq == 0
+    for seq, east in ((1, 2.0), (2, 300.0), (3, 600.0)):
+        assert queue.put(pending(seq, east)) is None
+    assert queue.put(pending(4, 900.0)).seq == 1  # new ground takes the place of what is drawn nearly the same
+    assert queue.put(pending(5, 1.0)).seq == 5
+
+
+def wait_until(done):
+    end = time.monotonic() + 60
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._IN_MEMORY", 12)
+    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._LATE_S", 0.2)
+    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._LOOK_S", 0.05)
+    in_time, may_read = threading.Event(), threading.Semaphore(0)
+    read = __import__("orthoswarm.raster.picture_file", fromlist=["read_rgba"]).read_rgba
+
+    def slowly(path):
+        if not in_time.is_set():
+            assert may_read.acquire(timeout=120)
+        return read(path)
+
+    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer.read_rgba", slowly)
+    events, told = Events(), []
+    monkeypatch.setattr(events, "publish", lambda kind, /, **fields: told.append((kind, fields)))
+    journal, store, layer = Journal(tmp_path / "journal.db"), PictureStore(tmp_path / "p"), Layer("realtime")
+    (tmp_path / "layers").mkdir()
+    drawer = Drawer(journal, store, layer, tmp_path / "layers", events, gsd_m=0.5)
+    drawer.start()
+    data = jpeg(camera_at())
+    for k in range(90):  # fifteen near one another at each of six places, one place after the other
+        pose = parse_pose(pose_of(camera_at(60.0 * (k // 15), 0.4 * (k % 15)), f"{k:03d}.jpg"))
+        key = frame_key("v1", pose.image)
+        change = add_frame(key, "v1", pose.image, float(k), store.put(key, ".jpg", data), SIZE, pose.values)
+        seq, _ = journal.write(change)
+        path = store.path(journal.one("SELECT path FROM frames WHERE seq = ?", (seq,))["path"])
+        drawer.add(
+            seq, frame_of(pose.values, image=pose.image, path=path, vehicle="v1", time_s=float(k), size=SIZE),
+            time.time(), 1,
+        )  # fmt: skip
+        assert drawer.backlog <= 12
+        if k % 15 == 14:  # two of each place are drawn before those of the next come, however fast the machine is
+            may_read.release(2)
+            wait_until(lambda place=k // 15: drawer.drawn >= 2 * (place + 1))
+    may_read.release()
+    wait_until(lambda: drawer.overload or may_read.release())
+    assert "safe on the disk" in drawer.overload
+    in_time.set()
+    may_read.release(100)
+    assert drawer.wait_idle(60)
+    drawer.close()
+    rows = journal.rows("SELECT seq, drawn, reason FROM frames")
+    order = [fields["seq"] for kind, fields in told if kind == "frame"]
+    assert [(row["drawn"], row["reason"]) for row in rows] == [(1, None)] * 90
+    assert sorted(order) == sorted(row["seq"] for row in rows)  # each once
+    last_place = {seq for seq in order if (seq - min(order)) // 15 == 5}
+    assert min(order.index(seq) for seq in last_place) < 60  # not after all that came before
+    assert any(kind == "overload" and fields["put_off"] > 0 for kind, fields in told)
+    layer.close()
+    journal.close()

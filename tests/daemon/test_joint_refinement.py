@@ -1,0 +1,213 @@
+"""Overlapping neighbours are solved together once both were refined, when nothing more urgent is to be done."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
+from gcs_plugin.daemon.jobs.joint_refinement import Together
+from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.solution_file import load_kept
+from gcs_plugin.daemon.jobs.worker_tasks import without_strays
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Journal, packed
+from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.placement import PlacedFrame, Solution
+from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory):
+    """Frames of two vehicles over the same ground, and the map."""
+    folder = tmp_path_factory.mktemp("flights")
+    ground = made_up_ground()
+    write_map(ground, folder / "map.tif")
+    return {v: made_up_flight(ground, folder, v) for v in ("v1", "v2")}, folder / "map.tif"
+
+
+@pytest.fixture
+def daemon(tmp_path, flights):
+    settings = Settings(tmp_path / "w", basemap=flights[1], coarse=False)
+    settings.workspace.mkdir()
+    with Daemon(settings) as daemon:
+        yield daemon
+
+
+def solution(daemon, vehicle):
+    row = daemon.journal.one("SELECT path FROM solutions WHERE vehicle = ?", (packed(vehicle),))
+    return row["path"], load_kept(daemon.settings.workspace / "solutions" / row["path"]).solution
+
+
+def errors(found, frames):
+    """Ground under the pictures' middles against where they were taken (not against the records, which are off)."""
+    middle = [119.5, 89.5]
+    true = {frame.image: truth(frame) for frame in frames}
+    return np.array([np.hypot(*(p.camera.to_ground(middle) - true[p.frame.image])) for p in found.placed])
+
+
+def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flights, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.joint_refinement._LEAST_PX", 0.0)
+    frames, _ = flights
+    versions = []
+    for count, vehicle in enumerate(frames, 1):
+        post(daemon, frames[vehicle])
+        complete(daemon, vehicle)
+        refined = after_job(daemon, count)[-1]
+        assert refined.state == "done", refined.message
+        versions.append((solution(daemon, "v1")[0], daemon.layers["fine"].version))
+        if count == 1:
+            assert not [job for job in daemon.jobs.all() if job.kind == "together"]  # nobody is near
+    together = [job for job in daemon.jobs.all() if job.kind == "together"]
+    assert [(job.vehicle, job.state, job.detail["neighbours"]) for job in together] == [
+        ("v1", "done", 1), ("v2", "done", 1)
+    ]  # fmt: skip
+    assert all(job.started >= refined.ended for job in together)
+    assert versions[1][0] != versions[0][0]  # another solution of v1 stands
+    drawn = [job.detail["version"] for job in together]
+    assert versions[0][1] < drawn[0] < drawn[1] == versions[1][1]
+    for vehicle in frames:
+        _, found = solution(daemon, vehicle)
+        assert len(found.placed) == len(frames[vehicle])
+        assert np.median(errors(found, frames[vehicle])) < 0.3
+    assert {row["stage"] for row in daemon.frames()} == {"fine"}
+    assert {leg["properties"]["state"] for leg in daemon.legs()["features"]} == {"matched"}
+    assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+    assert sorted(path.name for path in (daemon.settings.workspace / "solutions").glob("solution*.part")) == []
+
+
+def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights, monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.joint_refinement._LEAST_PX", 1e6)
+    frames, _ = flights
+    for count, vehicle in enumerate(frames, 1):
+        post(daemon, frames[vehicle])
+        complete(daemon, vehicle)
+        after_job(daemon, count)
+        if count == 1:
+            first = solution(daemon, "v1")[0]
+    together = [job for job in daemon.jobs.all() if job.kind == "together"]
+    assert [job.detail["note"] for job in together] == ["it lies well beside its neighbours"] * 2
+    assert solution(daemon, "v1")[0] == first
+    kept = {row["path"] for t in ("solutions", "coarse") for row in daemon.journal.rows(f"SELECT path FROM {t}")}
+    assert {path.name for path in (daemon.settings.workspace / "solutions").iterdir()} == kept  # nothing is left over
+
+
+def test_pictures_that_look_far_aside_are_left_out_of_the_refined_map(flights):
+    frames, _ = flights
+    down = Camera(np.array([0.0, 0.0, 60.0]), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(240, 180, 171.0))
+    aside = replace(down, rotation=rotation_from_angles(0.0, np.radians(-40.0), 0.0))
+    placed = [PlacedFrame(f, aside if k == 5 else down, "fine", 0.1) for k, f in enumerate(frames["v1"])]
+    found = Solution("v1", placed, {"x.jpg": "damaged"}, [], 70.0, 1.0, None, warnings=["a word"])
+    left = without_strays(found)
+    assert set(left.dropped) == {"x.jpg", frames["v1"][5].image} and len(left.placed) == len(placed) - 1
+    assert len(left.warnings) == 2 and "far aside" in left.warnings[1]
+    assert without_strays(replace(found, placed=placed[:5])) == replace(found, placed=placed[:5])
+
+
+# -- the queue --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def journal(tmp_path):
+    journal = Journal(tmp_path / "journal.db")
+    yield journal
+    journal.close()
+
+
+def ended(jobs, count):
+    end = time.monotonic() + LIMIT_S
+    while sum(job.state == "done" for job in jobs.all()) < count:
+        assert time.monotonic() < end, jobs.all()
+        time.sleep(0.01)
+
+
+def test_neighbours_wait_until_no_refinement_waits_or_runs(journal):
+    going, order, beside = threading.Event(), [], []
+
+    def refine(job, tell):
+        assert going.wait(60)
+        time.sleep(0.1)  # there is a thread that could take the other job
+        order.append(job.kind)
+        return lambda db: None
+
+    def together(job, tell):
+        beside.append([other.kind for other in jobs.all() if other.state == "running"])
+        order.append(job.kind)
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), {"refine": refine, "together": together}, slots=2)
+    jobs.add("together", "v1", 1)
+    jobs.add("refine", "v2", 1)
+    jobs.add("refine", "v3", 1)
+    jobs.start()
+    going.set()
+    ended(jobs, 3)
+    jobs.close()
+    assert order == ["refine", "refine", "together"]
+    assert beside == [["together"]]
+
+
+class Rows:
+    """A journal that holds two refined sorties at the same place."""
+
+    def one(self, query, values):
+        return {"path": "a", "detail": '{"layer": "fine", "bounds": [0, 0, 9, 9]}'}
+
+    def rows(self, query):
+        return [{"vehicle": packed(v), "sortie": 1, **self.one("", ())} for v in ("v1", "v2")]
+
+
+class Taken:
+    """A crew whose process is taken away while it works."""
+
+    def __init__(self):
+        self.began, self.ends = threading.Event(), threading.Event()
+
+    def run(self, function, task):
+        task.target.write_bytes(b"half")
+        self.began.set()
+        assert self.ends.wait(60)
+        raise OrthoSwarmError("a worker process was stopped from outside")
+
+    def abandon(self):
+        self.ends.set()
+
+
+class Placed:
+    """A press of an area."""
+
+    def __init__(self, folder):
+        self.kept = folder
+
+    def area(self):
+        from gcs_plugin.daemon.layers.layers import Area
+
+        return Area(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
+
+
+def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
+    crew = Taken()
+    work = Together(Rows(), Placed(tmp_path), crew, tmp_path / "map.tif")
+    jobs = Jobs(journal, Events(), {"together": work.solve}, slots=1)
+    job = jobs.add("together", "v1", 1)
+    found = []
+
+    def run():
+        try:
+            work.solve(job, lambda share, text: None)
+        except GaveWay:
+            found.append("gave way")
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert crew.began.wait(60)
+    work.give_up()
+    thread.join(60)
+    assert found == ["gave way"]
+    assert not list(tmp_path.glob("*.pickle"))
+    work.give_up()  # nothing runs: nothing happens

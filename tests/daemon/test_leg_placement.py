@@ -1,0 +1,285 @@
+"""The coarse layer in flight: legs are noticed, placed and drawn as they finish; completion takes their place."""
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
+from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
+from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.solution_file import Kept, load_kept
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.refine.flight.finished_legs import SETTLED, ended_legs
+from tests.kit.daemon_kit import Shot, exported, line, serving
+
+GRID = LocalGrid(32631)
+
+
+def lawn(legs, per_leg=20, step=5.0, apart=40.0):
+    """Positions along legs there and back, beside each other."""
+    out = []
+    for k in range(legs):
+        along = np.arange(per_leg) * step
+        out += [(apart * k, y) for y in (along if k % 2 == 0 else along[::-1])]
+    return np.array(out)
+
+
+def frames_at(positions, first_s=1e9):
+    places = GRID.to_geographic(positions + np.array([500_000.0, 5_000_000.0]))
+    return [
+        Frame(f"{k}.jpg", None, "v1", first_s + k, Fix(float(lat), float(lon), 60.0), 160, 120)
+        for k, (lat, lon) in enumerate(places)
+    ]
+
+
+# -- noticing ---------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=30)
+@given(legs=st.integers(1, 4), per_leg=st.integers(8, 30), seen=st.integers(2, 120))
+def test_a_leg_that_is_over_stays_as_it_is(legs, per_leg, seen):
+    path = lawn(legs, per_leg)
+    early = ended_legs(path[: min(seen, len(path))])
+    assert early == ended_legs(path)[: len(early)]
+
+
+def test_the_last_leg_is_over_when_nothing_more_comes():
+    path = lawn(2)
+    assert len(ended_legs(path)) == 1
+    assert len(ended_legs(path, over=True)) == 2
+    assert len(ended_legs(path[: 20 + SETTLED], over=False)) <= 1
+
+
+def test_only_the_newest_legs_are_placed_anew():
+    frames, count = newest_legs(frames_at(lawn(12, 60)), 32631)
+    assert 2 <= count <= 3
+    assert len(frames) <= MOST
+    assert int(frames[-1].image[:-4]) >= 12 * 60 - 62 - SETTLED
+    long, _ = newest_legs(frames_at(lawn(1, 500)), 32631, over=True)
+    assert len(long) == MOST
+
+
+def test_a_watch_asks_when_a_leg_is_over_and_when_a_vehicle_falls_silent(monkeypatch):
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.02)
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 3600.0)
+    asked, heard = [], threading.Event()
+
+    def ask(*values):
+        asked.append(values)
+        heard.set()
+
+    watch = LegWatch(ask)
+    watch.start()
+    frames = frames_at(lawn(2, 20))
+    for frame in frames[:12]:
+        watch.add("v1", 1, frame.time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+    assert not heard.wait(0.2)
+    for frame in frames[12:]:
+        watch.add("v1", 1, frame.time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+    assert heard.wait(60)
+    assert asked[0] == ("v1", 1, False)
+    heard.clear()
+    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.1)
+    assert heard.wait(60)
+    assert asked[1] == ("v1", 1, True)
+    heard.clear()
+    assert not heard.wait(0.5)  # silence is told once
+    watch.close()
+
+
+# -- jobs -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def journal(tmp_path):
+    journal = Journal(tmp_path / "journal.db")
+    yield journal
+    journal.close()
+
+
+def finished(jobs, count, limit_s=120.0):
+    end = time.monotonic() + limit_s
+    while sum(job.state == "done" for job in jobs.all()) < count:
+        assert time.monotonic() < end, jobs.all()
+        time.sleep(0.01)
+    return jobs.all()
+
+
+def test_refinement_goes_before_what_is_in_the_background(journal):
+    order = []
+
+    def handler(job, tell):
+        order.append((job.kind, job.vehicle))
+        time.sleep(0.02)
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), dict.fromkeys(("refine", "coarse", "export"), handler), slots=1)
+    for vehicle in ("v1", "v2"):
+        jobs.add("coarse", vehicle, 1)
+    jobs.add("coarse", "v0", 1, after="refine")
+    jobs.add("export", formats=[])
+    jobs.add("refine", "v3", 1)
+    jobs.start()
+    finished(jobs, 5)
+    jobs.close()
+    assert order[0] == ("refine", "v3")
+    assert order[1:] == [("coarse", "v0"), ("export", None), ("coarse", "v1"), ("coarse", "v2")]
+
+
+def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
+    started, stop = threading.Event(), threading.Event()
+
+    def handler(job, tell):
+        started.set()
+        assert stop.wait(60)
+        raise OSError("its process was taken away")
+
+    jobs = Jobs(journal, Events(), {"coarse": handler}, slots=1, on_drop=lambda job: stop.set())
+    jobs.add("coarse", "v1", 1)
+    jobs.start()
+    assert started.wait(60)
+    jobs.add("coarse", "v1", 1, over=True)
+    jobs.drop("coarse", "v1", "dropped: the refinement takes its place")
+    done = finished(jobs, 2)
+    jobs.close()
+    assert [(job.state, job.message[:7]) for job in done] == [("done", "dropped")] * 2
+
+
+def test_work_that_gave_way_is_done_again(journal):
+    tries = []
+
+    def handler(job, tell):
+        tries.append(job.attempts)
+        if len(tries) == 1:
+            raise GaveWay
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), {"coarse": handler}, slots=1)
+    jobs.add("coarse", "v1", 1)
+    jobs.start()
+    finished(jobs, 1)
+    jobs.close()
+    assert tries == [1, 1]  # giving way is no failed attempt
+
+
+# -- the whole way ----------------------------------------------------------------------------------------------------
+
+
+def shots_over(ground, folder):
+    """Pictures over the map with records that are 3 m off, as a companion computer sends them."""
+    folder.mkdir()
+    shots = []
+    for frame in made_up_flight(ground, folder, "v1"):
+        place = GRID.to_grid(frame.fix.lat_deg, frame.fix.lon_deg) + np.array([2.0, -2.2])
+        lat, lon = (float(v) for v in GRID.to_geographic(place))
+        pose = {
+            "vehicle": "v1", "image": frame.image, "time": frame.time_s, "lat_deg": lat, "lon_deg": lon,
+            "height_m": frame.fix.height_m, "yaw_deg": float(np.degrees(frame.fix.yaw_rad)), "pitch_deg": -90.0,
+            "roll_deg": 0.0,
+        }  # fmt: skip
+        shots.append(Shot(pose, frame.path.read_bytes()))
+    return shots
+
+
+def layer_named(name):
+    return lambda layers: not next(row for row in layers if row["name"] == name)["empty"]
+
+
+def test_legs_are_on_the_map_before_the_refinement_and_beside_it(tmp_path):
+    ground = made_up_ground()
+    write_map(ground, tmp_path / "map.tif")
+    shots = shots_over(ground, tmp_path / "p")
+    workspace = tmp_path / "w"
+    with serving(workspace, "--basemap", str(tmp_path / "map.tif")) as served:
+        for shot in shots:
+            assert served.send(shot).status_code == 201
+        served.until("/api/layers", layer_named("coarse"))
+        rows = served.until("/api/frames", lambda rows: sum(r["stage"] == "coarse" for r in rows) >= 12)
+        assert {row["stage"] for row in rows} <= {"coarse", "realtime"}
+        assert all(row["sigma_m"] < 3.0 for row in rows if row["stage"] == "coarse")
+        legs = served.get("/api/legs").json()["features"]
+        assert {leg["properties"]["stage"] for leg in legs} == {"coarse"}
+        assert {leg["properties"]["state"] for leg in legs} == {"matched"}
+        jobs = served.get("/api/jobs").json()
+        assert {job["kind"] for job in jobs} == {"coarse"}
+        served.until("/api/jobs", lambda rows: all(r["state"] == "done" for r in rows))
+        served.command("/api/refine", {"vehicle": "v1"})
+        jobs = served.until("/api/jobs", exported)
+        assert all(job["state"] == "done" for job in jobs), jobs
+        assert {row["stage"] for row in served.get("/api/frames").json()} == {"fine"}
+        legs = served.get("/api/legs").json()["features"]
+        assert {leg["properties"]["stage"] for leg in legs} == {"fine"}
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif"):
+        assert (workspace / name).stat().st_size > 1000
+    it_is_drawn_evenly(workspace)
+    closeness_grows(workspace, ground)
+
+
+def it_is_drawn_evenly(workspace):
+    """The refined sortie was kept with a gain for each picture, near one for even pictures."""
+    kept = [load_kept(path) for path in (workspace / "solutions").glob("solution*.pickle")]
+    assert len(kept) == 1
+    gains = np.array(list(kept[0].gains.values()))
+    assert gains.shape == (28, 3)
+    assert np.abs(gains - 1.0).max() < 0.1
+
+
+def closeness_grows(workspace, ground):
+    """Each layer lies nearer to the ground's true colours than the one before."""
+    import rasterio
+
+    off = []
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif"):
+        with rasterio.open(workspace / name) as raster:
+            east, north = np.meshgrid(np.arange(-70.0, -20.0), np.arange(-40.0, 40.0))
+            place = list(zip((500_000.0 + east).ravel(), (5_000_000.0 + north).ravel(), strict=True))
+            seen = np.array(list(raster.sample(place)), float)
+        rows, cols = (210.0 - north).astype(int).ravel(), (210.0 + east).astype(int).ravel()
+        good = seen[:, 3] > 200
+        assert good.mean() > 0.9
+        off.append(np.abs(seen[good, :3] - ground[rows, cols][good]).mean())
+    assert off[1] < 0.8 * off[0]
+    assert off[2] <= 1.05 * off[1]
+
+
+def test_pictures_that_do_not_hold_together_leave_the_real_time_map_alone(tmp_path):
+    """Legs of pictures of nothing: the job ends with a note, the layer stays empty."""
+    import io
+
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGB", (160, 120), (90, 90, 90)).save(buffer, "JPEG")
+    with serving(tmp_path / "w", "--gsd", "0.5") as served:
+        back = [
+            Shot(
+                there.pose
+                | {"image": f"b{k}.jpg", "time": there.pose["time"] + 40, "lon_deg": there.pose["lon_deg"] + 4e-4},
+                b"",
+            )
+            for k, there in enumerate(reversed(line(14)))
+        ]
+        for shot in [*line(14), *back]:
+            served.send(Shot(shot.pose, buffer.getvalue()))
+        jobs = served.until("/api/jobs", lambda rows: rows and rows[-1]["state"] in ("done", "failed"))
+        assert (jobs[-1]["kind"], jobs[-1]["state"]) == ("coarse", "done")
+        assert jobs[-1]["detail"]["note"]
+        assert not layer_named("coarse")(served.get("/api/layers").json())
+
+
+def test_a_solution_of_an_earlier_version_can_be_read(tmp_path):
+    import pickle
+
+    solution = {"a": "stand-in"}
+    (tmp_path / "old.pickle").write_bytes(pickle.dumps(solution))
+    assert load_kept(tmp_path / "old.pickle") == Kept(solution)
+    assert json.dumps(load_kept(tmp_path / "old.pickle").solution) == json.dumps(solution)

@@ -1,0 +1,212 @@
+"""A daemon to test: pictures of a made-up ground with their poses, and `orthoswarm serve` as a process."""
+
+import contextlib
+import io
+import json
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.geo import LocalGrid
+from tests.kit.mosaic_scene import EAST, NORTH, picture_of
+
+GRID = LocalGrid(32648)
+FOV_DEG = 70.0
+SIZE = (160, 120)
+# One for all: each new client reads all certificates of the machine, which costs more than the daemon's answer.
+_CLIENT = httpx.Client(
+    timeout=120, verify=False, trust_env=False, limits=httpx.Limits(max_connections=None, max_keepalive_connections=0)
+)
+
+
+def camera_at(east=0.0, north=0.0, height=60.0, yaw_deg=0.0) -> Camera:
+    lens = Lens(*SIZE, focal_px(np.radians(FOV_DEG), SIZE[0]))
+    rotation = rotation_from_angles(np.radians(yaw_deg), -np.pi / 2, 0.0)
+    return Camera(np.array([EAST + east, NORTH + north, height]), rotation, lens)
+
+
+def jpeg(camera: Camera, quality=92) -> bytes:
+    import simplejpeg
+
+    return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(picture_of(camera)), quality, "RGB", "420"))
+
+
+def pose_of(camera: Camera, image: str, vehicle="v1", time_s=1_780_000_000.0) -> dict:
+    lat, lon = (float(v) for v in GRID.to_geographic(camera.position[:2]))
+    turn = float(np.degrees(GRID.convergence_rad(lat, lon)))
+    yaw = float(np.degrees(np.arctan2(-camera.rotation[0, 1], -camera.rotation[1, 1])))
+    return {
+        "vehicle": vehicle, "image": image, "time": time_s, "lat_deg": lat, "lon_deg": lon,
+        "height_m": float(camera.position[2]), "yaw_deg": yaw + turn, "pitch_deg": -90.0, "roll_deg": 0.0,
+    }  # fmt: skip
+
+
+@dataclass
+class Shot:
+    """A picture ready to be posted."""
+
+    pose: dict
+    data: bytes
+    camera: Camera | None = None
+
+
+def line(count: int, vehicle="v1", east=0.0, step_m=12.0, first=0) -> list[Shot]:
+    """Pictures along a straight leg to the north."""
+    shots = []
+    for k in range(first, first + count):
+        camera = camera_at(east, k * step_m)
+        shots.append(Shot(pose_of(camera, f"{k:04d}.jpg", vehicle, 1_780_000_000.0 + k), jpeg(camera), camera))
+    return shots
+
+
+def form(shot: Shot) -> dict:
+    return {
+        "files": {"image": ("picture.jpg", io.BytesIO(shot.data), "image/jpeg")},
+        "data": {"pose": json.dumps(shot.pose)},
+    }  # fmt: skip
+
+
+@dataclass
+class Served:
+    """A running `orthoswarm serve`."""
+
+    process: subprocess.Popen
+    url: str
+    token: str
+    said: list[str] = field(default_factory=list)
+
+    @property
+    def auth(self) -> dict:
+        return {"Authorization": f"Bearer {self.token}"}
+
+    def get(self, path: str, **options) -> httpx.Response:
+        return _CLIENT.get(self.url + path, **options)
+
+    def post(self, path: str, **options) -> httpx.Response:
+        return _CLIENT.post(self.url + path, **options)
+
+    def command(self, path: str, body: dict | None = None) -> httpx.Response:
+        return self.post(path, json=body or {}, headers=self.auth)
+
+    def send(self, shot: Shot) -> httpx.Response:
+        return self.post("/api/frames", **form(shot))
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(30)
+
+    def until(self, path: str, done, limit_s=180.0):
+        """Poll an address until something is so; gives its last JSON."""
+        end = time.monotonic() + limit_s
+        while True:
+            value = self.get(path).json()
+            if done(value):
+                return value
+            if time.monotonic() > end:
+                raise AssertionError(f"{path} is still {value}")
+            time.sleep(0.1)
+
+
+def _end_with_us() -> None:
+    """A test run that is killed leaves no daemon behind."""
+    import ctypes
+
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 120.0) -> Served:
+    """Start `orthoswarm serve` and wait until it answers."""
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "gcs_plugin.cli",
+            "serve",
+            "--workspace",
+            str(workspace),
+            "--port",
+            str(port),
+            *arguments,
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        preexec_fn=_end_with_us if sys.platform == "linux" else None,
+    )
+    said: list[str] = []
+    lines: queue.SimpleQueue = queue.SimpleQueue()
+
+    def read() -> None:
+        assert process.stdout is not None
+        for text in process.stdout:
+            said.append(text)
+            lines.put(text)
+        process.stdout.close()
+        lines.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    end = time.monotonic() + limit_s
+    url = ""
+    while not url:
+        text = lines.get(timeout=max(0.1, end - time.monotonic()))
+        if text is None:
+            process.wait()
+            raise AssertionError(f"serve ended with {process.returncode}: {''.join(said)}")
+        found = re.search(r"map: (http://\S+?)/(#|\s|$)", text)
+        url = found[1] if found else ""
+    token = (workspace / "token").read_text().strip() if (workspace / "token").exists() else ""
+    served = Served(process, url, token, said)
+    while True:
+        with contextlib.suppress(httpx.TransportError):
+            if served.get("/healthz").status_code == 200:
+                return served
+        if process.poll() is not None or time.monotonic() > end:
+            stop(served)
+            raise AssertionError(f"serve does not answer: {''.join(said)}")
+        time.sleep(0.05)
+
+
+def stop(served: Served) -> int:
+    """End it as a user does; gives its exit code."""
+    if served.process.poll() is None:
+        served.process.send_signal(signal.SIGINT)
+        try:
+            served.process.wait(60)
+        except subprocess.TimeoutExpired:
+            served.process.kill()
+            served.process.wait(30)
+    return served.process.returncode
+
+
+@contextlib.contextmanager
+def serving(workspace: Path, *arguments: str, port: int = 0):
+    served = start(workspace, *arguments, port=port)
+    try:
+        yield served
+    finally:
+        stop(served)
+
+
+def exported(jobs: list[dict]) -> bool:
+    """Whether products were written, and nothing else is to be done."""
+    wrote = any(job["kind"] == "export" and job["state"] == "done" for job in jobs)
+    return wrote and all(job["state"] in ("done", "failed") for job in jobs)
+
+
+def tile_over(camera: Camera, zoom=19) -> tuple[int, int, int]:
+    """The web tile that holds the ground below a camera."""
+    lat, lon = np.radians(GRID.to_geographic(camera.position[:2]))
+    n = 1 << zoom
+    return zoom, int((lon / np.pi + 1) / 2 * n), int((1 - np.arcsinh(np.tan(lat)) / np.pi) / 2 * n)

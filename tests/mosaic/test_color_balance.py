@@ -1,0 +1,115 @@
+"""Gains: known factors put on pictures are found again, and seams get less visible."""
+
+import numpy as np
+import pytest
+
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.render_passes import thumbnail
+from orthoswarm.mosaic.renderer import render
+from tests.kit import mosaic_scene as scene
+
+FLAT = Terrain.flat(0.0)
+
+
+def uneven_flight(seed=0):
+    """Three legs of three vehicles, 15 % apart in brightness and differently tinted, frames +-4 %."""
+    rng = np.random.default_rng(seed)
+    flight, truth = scene.Flight(), []
+    for leg, tint in enumerate(([1.15, 1.1, 1.1], [1.0, 1.0, 0.95], [0.85, 0.9, 0.9])):
+        for along in range(8):
+            gain = np.array(tint) * (1.0 + rng.normal(0, 0.04))
+            view = scene.camera(east=-60 + 60 * leg, north=-70 + 20 * along, yaw_deg=180.0 * (leg % 2))
+            flight.take(view, vehicle=f"uav{leg}", gain=0.85 * gain)
+            truth.append(np.log(gain))
+    return flight, np.array(truth)
+
+
+def thumbnails_of(flight):
+    return {name: thumbnail(picture) for name, picture in flight.pictures.items()}
+
+
+def seam_steps(canvas):
+    """Mean absolute step of colour across seams, over what the ground itself does there."""
+    image = canvas.read(0, canvas.grid.height, 0, canvas.grid.width)[..., :3].astype(float)
+    label = canvas.read_plane(0, canvas.grid.height, 0, canvas.grid.width)
+    truth = scene.colour(scene.pixel_centres(canvas.grid))
+    seam = (label[:, 1:] != label[:, :-1]) & (label[:, 1:] > 0) & (label[:, :-1] > 0)
+    ratio = image / truth
+    return np.abs(np.log(ratio[:, 1:][seam] / ratio[:, :-1][seam])).mean()
+
+
+def test_seams_get_less_visible(tmp_path):
+    flight, _ = uneven_flight()
+    steps, means = [], []
+    for name, gains in (("raw", None), ("even", estimate_gains(flight.frames, thumbnails_of(flight), FLAT))):
+        with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame") as canvas:
+            render(flight.frames, FLAT, canvas, read=flight.read, gains=gains)
+            steps.append(seam_steps(canvas))
+            image = canvas.read(0, canvas.grid.height, 0, canvas.grid.width)
+            means.append(image[image[..., 3] == 255][:, :3].mean())
+    assert steps[0] > 0.04
+    assert steps[1] < 0.4 * steps[0]
+    assert means[1] == pytest.approx(means[0], rel=0.02)  # the mosaic as a whole keeps its brightness
+
+
+def test_known_gains_are_found_up_to_a_common_one():
+    flight, truth = uneven_flight(1)
+    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT)
+    found = np.log(np.array([gains[f.frame.image] for f in flight.frames]))
+    left = found + truth - (found + truth).mean(0)
+    assert np.abs(left).mean() < 0.35 * np.abs(truth - truth.mean(0)).mean()
+    assert np.abs(left).max() < 0.1
+
+
+def test_a_vehicle_follows_those_that_are_drawn_already():
+    flight, truth = uneven_flight(2)
+    drawn = {
+        f.frame.image: np.exp(-t).astype(np.float32) for f, t in zip(flight.frames, truth) if f.frame.vehicle != "uav2"
+    }
+    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT, held=drawn)
+    assert all(gains[image] is gain for image, gain in drawn.items())
+    found = np.log([gains[f.frame.image] for f in flight.frames])
+    late = np.array([f.frame.vehicle == "uav2" for f in flight.frames])
+    assert np.abs((found + truth)[late]).mean() < 0.35 * np.abs(truth[late]).mean()  # no common factor is free now
+
+
+def test_even_pictures_are_left_alone():
+    flight = scene.survey(2)
+    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT)
+    assert np.abs(np.array(list(gains.values())) - 1.0).max() < 0.05
+
+
+def test_vignetting_is_left_alone():
+    flight = scene.survey(2, tilt_deg=1.0)
+    y, x = np.indices((120, 160)) - np.array([59.5, 79.5])[:, None, None]
+    fall = 1.0 - 0.35 * (x**2 + y**2) / 100.0**2
+    small = {name: thumbnail((p * fall[..., None]).astype(np.uint8)) for name, p in flight.pictures.items()}
+    gains = estimate_gains(flight.frames, small, FLAT)
+    assert np.abs(np.array(list(gains.values())) - 1.0).max() < 0.06
+
+
+def test_frame_without_thumbnail_gets_its_vehicles_gain():
+    flight, _ = uneven_flight()
+    small = thumbnails_of(flight)
+    missing = flight.frames[3].frame.image
+    del small[missing]
+    gains = estimate_gains(flight.frames, small, FLAT)
+    own = np.array([gains[f.frame.image] for f in flight.frames if f.frame.vehicle == "uav0"])
+    assert gains[missing] == pytest.approx(own.mean(0), abs=0.06)
+
+
+def test_dark_and_burnt_out_pictures_say_nothing():
+    flight, _ = uneven_flight()
+    small = thumbnails_of(flight)
+    for k, name in enumerate(small):
+        small[name] = np.full((12, 16, 3), 255 if k % 2 else 2, np.uint8)
+    gains = estimate_gains(flight.frames, small, FLAT)
+    assert np.array(list(gains.values())) == pytest.approx(1.0)
+
+
+def test_nothing_to_compare_gives_no_gains():
+    flight = scene.survey(0, count=1)
+    assert estimate_gains(flight.frames, thumbnails_of(flight), FLAT) == {}
+    assert estimate_gains([], {}, FLAT) == {}

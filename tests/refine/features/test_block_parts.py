@@ -1,0 +1,176 @@
+"""Legs, units, records and the placing of weak pictures."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.legs import split_legs
+from orthoswarm.model.placement import Leg, PlacedFrame, Solution
+from orthoswarm.refine.bundle.flight_records import read_records
+from orthoswarm.refine.flight.solve_units import LONGEST, merge_units, split_units
+from orthoswarm.refine.flight.weak_pictures import steady_weak
+
+
+def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):
+    given = {
+        "lat_deg": 48.0 + 1e-4 * i,
+        "lon_deg": 11.0,
+        "height_m": 100.0,
+        "yaw_rad": 0.0,
+        "pitch_rad": -np.pi / 2,
+    } | fix
+    return Frame(f"{vehicle}/{i:04d}.jpg", Path("none"), vehicle, 1.7e9 + i, Fix(**given), *size, camera=camera)
+
+
+def boustrophedon(legs=3, count=20, step=10.0, apart=60.0):
+    out = []
+    for k in range(legs):
+        y = np.arange(count) * step
+        out.append(np.c_[np.full(count, k * apart), y if k % 2 == 0 else y[::-1]])
+    return np.concatenate(out)
+
+
+def test_legs_of_a_lawnmower_flight_are_told_apart():
+    leg = split_legs(boustrophedon())
+    assert leg.max() == 2
+    assert all((leg[20 * k + 2 : 20 * k + 18] == k).all() for k in range(3))
+
+
+def test_a_straight_line_in_any_direction_is_one_leg():
+    for angle in np.linspace(0, 2 * np.pi, 13):
+        path = np.outer(np.arange(30) * 8.0, [np.sin(angle), np.cos(angle)])
+        assert (split_legs(path) == 0).all()
+
+
+def test_noise_of_a_receiver_does_not_cut_a_leg():
+    path = np.c_[np.zeros(60), np.arange(60) * 9.0] + np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    assert len(np.unique(split_legs(path)[split_legs(path) >= 0])) == 1
+
+
+def test_a_long_pause_ends_a_leg():
+    path = np.c_[np.zeros(20), np.arange(20) * 9.0]
+    time = np.arange(20.0)
+    time[10:] += 300
+    assert split_legs(path, time).max() == 1
+
+
+def test_hovering_and_tiny_flights_do_not_fail():
+    assert len(split_legs(np.zeros((15, 2)))) == 15
+    assert len(split_legs(np.zeros((1, 2)))) == 1
+    assert len(split_legs(np.zeros((0, 2)))) == 0
+
+
+def test_every_frame_is_in_exactly_one_unit_of_one_lens():
+    frames = [frame(i, camera="wide" if i < 40 else "zoom") for i in range(80)]
+    frames += [frame(100 + i, size=(480, 640)) for i in range(9)]
+    units = split_units({"a": frames, "b": [frame(i, "b") for i in range(5)]})
+    assert sorted(f.image for u in units for f in u) == sorted(
+        {f.image for f in frames} | {f"b/{i:04d}.jpg" for i in range(5)}
+    )
+    assert all(len({(f.vehicle, f.camera, f.width, f.height) for f in u}) == 1 for u in units)
+
+
+def test_a_stray_camera_name_does_not_split_a_flight():
+    frames = [frame(i, camera="odd" if i == 30 else "x") for i in range(60)]
+    (unit,) = split_units({"a": frames})
+    assert [f.image for f in unit] == [f.image for f in frames]
+
+
+def test_long_flights_are_cut_into_even_stretches():
+    units = split_units({"a": [frame(i) for i in range(LONGEST * 2 + 10)]})
+    assert len(units) == 3
+    assert max(map(len, units)) <= LONGEST
+
+
+def solution(vehicle, first, count):
+    camera = Camera(np.zeros(3), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(640, 480, 320.0))
+    placed = [PlacedFrame(frame(first + i, vehicle), camera, "fine", 0.1) for i in range(count)]
+    return Solution(vehicle, placed, {}, [Leg(vehicle, 0, count - 1, "matched")], 80.0 + first, 0.1, None, state=first)
+
+
+def test_units_of_a_vehicle_are_joined_with_their_legs_in_place():
+    joined = merge_units([solution("a", 0, 5), solution("b", 0, 2), solution("a", 10, 7)])
+    assert [s.vehicle for s in joined] == ["a", "b"]
+    a = joined[0]
+    assert [p.frame.image for p in a.placed] == [f"a/{i:04d}.jpg" for i in [*range(5), *range(10, 17)]]
+    assert [(leg.first, leg.last) for leg in a.legs] == [(0, 4), (5, 11)]
+    assert a.fov_deg == 90.0
+    assert a.state == [0, 10]
+
+
+def test_records_fill_what_is_missing_and_mark_it():
+    frames = [frame(i, height_m=None, yaw_rad=None, pitch_rad=None) for i in range(5)]
+    records = read_records(frames, LocalGrid(32632), np.zeros(2), usual_height_m=77.0)
+    assert not records.has_height.any() and not records.has_yaw.any() and not records.has_tilt.any()
+    np.testing.assert_allclose(records.position[:, 2], 77.0)
+    np.testing.assert_allclose(records.pitch, -np.pi / 2)
+    grid_north = -LocalGrid(32632).convergence_rad(48.0, 11.0)
+    np.testing.assert_allclose(records.yaw, grid_north, atol=0.01)
+
+
+def test_clocks_that_go_backwards_are_replaced_by_picture_numbers():
+    frames = [frame(i) for i in range(4)]
+    frames[2] = frame(0)
+    records = read_records(frames, LocalGrid(32632), np.zeros(2))
+    assert not records.timed
+    np.testing.assert_array_equal(records.time_s, np.arange(4.0))
+
+
+def test_steps_ignore_a_single_outlier():
+    frames = [frame(i) for i in range(12)]
+    frames[6] = frame(6, lat_deg=48.0 + 1e-4 * 6 + 2e-4)
+    steps = read_records(frames, LocalGrid(32632), np.zeros(2)).steps()
+    assert np.hypot(*steps[3:10, :2].T) == pytest.approx(11.12, abs=0.1)
+
+
+def weak_at(position, recorded, leg, weak):
+    """What placing weak pictures makes of solved positions, where nothing looked at the weak ones."""
+    n = len(position)
+    strong = np.setdiff1d(np.arange(n), weak)
+    flight = SimpleNamespace(
+        frames=range(n),
+        leg=np.asarray(leg),
+        records=SimpleNamespace(time_s=np.arange(n, dtype=float)),
+        adjustment=SimpleNamespace(
+            rig=SimpleNamespace(position=position.copy(), rotation=np.tile(np.eye(3), (n, 1, 1))),
+            priors=SimpleNamespace(position=recorded, rotation=np.tile(np.eye(3), (n, 1, 1))),
+            obs_weight=np.ones(len(strong) * 20),
+            tracks=SimpleNamespace(camera=np.repeat(strong, 20)),
+        ),
+    )
+    sigma = np.full(n, 0.1)
+    assert np.flatnonzero(steady_weak(flight, sigma)).tolist() == list(weak)
+    return flight.adjustment.rig.position, sigma
+
+
+def test_a_weak_picture_at_a_corner_follows_the_record_and_not_the_line_across_it():
+    way = np.c_[boustrophedon(2, 5), np.full(10, 100.0)]
+    placed, sigma = weak_at(way, way + np.array([3.0, -2.0, 0.0]), [0] * 5 + [1] * 5, [5])
+    np.testing.assert_allclose(placed[5], way[5], atol=1e-9)
+    assert sigma[5] < 2.0
+
+
+def test_a_weak_picture_with_an_outlier_of_a_record_stays_on_its_leg_and_says_how_far_that_is_from_it():
+    way = np.c_[np.zeros(9), 10.0 * np.arange(9), np.full(9, 100.0)]
+    recorded = way.copy()
+    recorded[4, 0] += 18.0
+    recorded[4, 2] = 5.0
+    placed, sigma = weak_at(way, recorded, [0] * 9, [4])
+    np.testing.assert_allclose(placed[4], [0.0, 40.0, 5.0], atol=1e-9)
+    assert sigma[4] == pytest.approx(9.0)
+
+
+def test_an_outlier_within_a_long_gap_is_not_followed():
+    """The line across the gap is off by as much (drift): only the records around it tell that one of them has leapt."""
+    rng = np.random.default_rng(4)
+    way = np.c_[6.0 * np.sin(np.arange(30) / 7), 10.0 * np.arange(30), np.full(30, 100.0)]
+    recorded = way + np.c_[rng.normal(0, 0.4, (30, 2)), np.zeros(30)]
+    recorded[15, :2] += [9.0, -7.0]
+    placed, sigma = weak_at(way, recorded, [0] * 30, list(range(6, 24)))
+    assert np.hypot(*(placed - way)[6:24, :2].T).max() < 2.0
+    assert 3.0 < sigma[15] < 7.0 and np.delete(sigma, 15)[6:24].max() < 2.0

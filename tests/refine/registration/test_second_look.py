@@ -1,0 +1,72 @@
+"""Flights that edges do not find on the map: learned matching asks for them in one process, then they are settled."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from orthoswarm.refine.strategy import vehicle_passes
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner, local_origin, refine_all
+from tests.kit.scenes import scene_of, tiny_twin
+from tests.refine.strategy.test_swarm_refiner import errors
+
+LOST = "uav01"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return scene_of(tiny_twin(tmp_path_factory, 5))
+
+
+@pytest.fixture
+def blind(monkeypatch):
+    """Edges do not find one vehicle, the second look does (here: edges again); gives the vehicles it was asked for."""
+    by_edges, asked = vehicle_passes.coarse_fit, []
+
+    def first(flight, basemap, origin):
+        return None if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
+
+    def second(flight, basemap, origin):
+        asked.append(flight.frames[0].vehicle)
+        return by_edges(flight, basemap, origin)
+
+    monkeypatch.setattr(vehicle_passes, "coarse_fit", first)
+    monkeypatch.setattr(vehicle_passes, "second_look", second)
+    return asked
+
+
+def through_pickle(function, items):
+    """Run tasks as processes would; one that asks the second look would show."""
+    for item in items:
+        f, i = pickle.loads(pickle.dumps((function, item)))
+        yield pickle.loads(pickle.dumps(f(i)))
+
+
+def test_a_flight_that_only_the_second_look_finds_is_mapped_as_well(scene, blind):
+    vehicles, grid, basemap, truth = scene
+    steps = []
+    refined = refine_all(
+        vehicles, basemap, grid, run=through_pickle, progress=lambda what, done, of: steps.append((what, done, of))
+    )
+    assert blind == [LOST]
+    assert ("second look", 1, 1) in steps
+    lost = next(s for s in refined.fine if s.vehicle == LOST)
+    assert any(leg.state == "matched" for leg in lost.legs)
+    assert not any("no part of this flight" in w for w in lost.warnings)
+    assert np.median(errors(lost, truth, grid)) < 0.3
+
+
+def test_a_flight_that_nothing_finds_is_told_of_once(scene, blind, monkeypatch):
+    vehicles, grid, basemap, _ = scene
+    monkeypatch.setattr(vehicle_passes, "second_look", lambda *_: None)
+    refined = refine_all({LOST: vehicles[LOST]}, basemap, grid)
+    assert sum("no part of this flight" in w for w in refined.fine[0].warnings) == 1
+    assert {leg.state for leg in refined.fine[0].legs} == {"failed"}
+
+
+def test_a_single_vehicle_asks_at_once(scene, blind):
+    vehicles, grid, basemap, truth = scene
+    origin = local_origin(grid, vehicles[LOST])
+    solution = SwarmRefiner(grid.epsg, origin).refine(vehicles[LOST], [], basemap)
+    assert blind == [LOST]
+    assert np.median(errors(solution, truth, grid)) < 0.5

@@ -1,0 +1,172 @@
+"""What keeps an adjustment from another valley: wrong tracks at a turn, a place that bends the lens, broken corners."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.jobs import kernel_warmup
+from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.raster.basemap import Basemap
+from orthoswarm.refine.bundle import height_consistency
+from orthoswarm.refine.bundle.covariance import unexplained
+from orthoswarm.refine.bundle.height_consistency import height_doubt
+from orthoswarm.refine.bundle.snapshot import Snapshot
+from orthoswarm.refine.flight.relative_block import open_flight
+from orthoswarm.refine.registration.absolute_orientation import leg_corrections
+from orthoswarm.refine.registration.tie_points import MapMatches
+from orthoswarm.refine.strategy import vehicle_passes
+from orthoswarm.refine.strategy.vehicle_passes import Options, ran_away, read_frame, relative, solo
+
+EPSG, ORIGIN = 32631, np.array([500_000.0, 5_000_000.0])
+
+
+@pytest.fixture(scope="module")
+def made_up(tmp_path_factory):
+    """28 pictures of 70 degrees in two legs, 30 m from where the warm-up has them, and their map."""
+    folder = tmp_path_factory.mktemp("flight")
+    ground = np.roll(kernel_warmup.made_up_ground(), 30, axis=0)
+    kernel_warmup.write_map(ground, folder / "map.tif")
+    return kernel_warmup.made_up_flight(ground, folder, "a"), Basemap.open(folder / "map.tif", EPSG)
+
+
+def opened(frames):
+    return open_flight(frames, LocalGrid(EPSG), ORIGIN, read_frame, float(np.radians(80.0)))
+
+
+def fov_deg(flight):
+    return float(np.degrees(fov_rad(flight.adjustment.rig.lens[0, 0], flight.pictures.size[0])))
+
+
+def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up):
+    frames, _ = made_up
+    flight = opened(frames)
+    vehicle_passes._relative(flight, Options().ground(ORIGIN), vehicle_passes.SCHEDULE)
+    assert fov_deg(flight) > 90.0 and ran_away(flight)  # two wrong tracks of ninety were enough
+    flight = opened(frames)
+    relative(flight)
+    assert not ran_away(flight)
+    assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
+
+
+def test_without_an_answer_of_the_flow_nothing_is_called_a_runaway(made_up):
+    flight = opened(made_up[0])
+    flight.adjustment.rig.lens[:, 0] *= 0.5
+    assert ran_away(flight)
+    flight.calibration = replace(flight.calibration, pairs=2)
+    assert not ran_away(flight)
+
+
+def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_up, monkeypatch):
+    frames, _ = made_up  # straight down over flat ground: without heights no focal length is better than another
+
+    def doubted(adjustment):
+        return np.array([m.height_sigma < height_consistency.FREE_SIGMA_M for m in adjustment.priors.models])
+
+    steps = vehicle_passes._steps
+
+    def wandering(flight, surface, count):
+        surface, focal_px = steps(flight, surface, count)
+        if not doubted(flight.adjustment).any():
+            flight.adjustment.rig.lens[:, 0] *= 0.7
+            focal_px = [f * 0.96**k for k, f in enumerate(focal_px)]
+        return surface, focal_px
+
+    for module in (vehicle_passes, height_consistency):
+        monkeypatch.setattr(module, "contradicted", doubted)
+    for how in (steps, wandering):  # set free it stays where it is, or comes to no rest: both contradict nothing
+        monkeypatch.setattr(vehicle_passes, "_steps", how)
+        flight = opened(frames)
+        relative(flight)
+        assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
+        assert flight.warnings == [] and flight.calibration.trusted_height
+        assert doubted(flight.adjustment).all() and height_doubt(flight.adjustment) < 0.05
+
+
+def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):
+    frames, basemap = made_up
+    settle = vehicle_passes.settle
+
+    def bent(flight, *args):
+        settled = settle(flight, *args)
+        flight.adjustment.rig.lens[:, 0] *= 0.7
+        return settled
+
+    monkeypatch.setattr(vehicle_passes, "settle", bent)
+    state = solo(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    assert not state.on_map and not len(state.matches.point)
+    assert fov_deg(state.flight) == pytest.approx(70.0, abs=0.5)
+    assert any("not believed" in warning for warning in state.flight.warnings)
+    monkeypatch.setattr(vehicle_passes, "settle", settle)
+    state = solo(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    assert state.on_map and not any("not believed" in warning for warning in state.flight.warnings)
+
+
+def test_a_snapshot_goes_back_and_stays(made_up):
+    flight = opened(made_up[0])
+    before = Snapshot.of(flight.adjustment)
+    position = flight.adjustment.rig.position.copy()
+    for _ in range(2):
+        relative(flight)
+        assert np.abs(flight.adjustment.rig.position - position).max() > 1e-3
+        flight.adjustment = before.restored()
+        np.testing.assert_array_equal(flight.adjustment.rig.position, position)
+        assert not flight.adjustment.common.any()
+
+
+def legs_and_matches(seed=0):
+    """Two legs of 20 pictures with a turn of 2 between, and 3 matches a picture, all 5 m east of where they belong."""
+    rng = np.random.default_rng(seed)
+    leg = np.r_[np.zeros(20), [-1, -1], np.ones(20)].astype(np.int32)
+    camera = np.repeat(np.flatnonzero(leg >= 0), 3).astype(np.int32)
+    shift = np.array([5.0, 0.0]) + rng.normal(0, 0.1, (len(camera), 2))
+    return leg, camera, shift, rng
+
+
+def as_matches(camera, shift):
+    n = len(camera)
+    return MapMatches(np.arange(n, dtype=np.int32), camera, shift, np.full(n, 0.5), np.full(n, 0.4))
+
+
+def test_a_leg_whose_matches_agree_on_another_line_is_moved_by_it():
+    leg, camera, shift, rng = legs_and_matches()
+    second = leg[camera] == 1
+    shift[second, 1] -= 1.5 * np.clip((32 - camera[second]) / 10.0, -1, 1)  # the corner's error runs out along the leg
+    wrong = rng.random(len(camera)) < 0.15
+    shift[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
+    out = leg_corrections(leg, as_matches(camera, shift), np.array([5.0, 0.0]))
+    np.testing.assert_allclose(out[:20], np.tile([5.0, 0.0], (20, 1)))
+    expected = -1.5 * np.clip((32 - np.arange(22, 42)) / 10.0, -1, 1)
+    assert np.abs(out[22:, 1] - expected).max() < 0.4
+    assert out[19, 1] > out[20, 1] > out[21, 1] > out[22, 1]  # the turn lies between
+
+
+def test_a_leg_that_lies_about_right_or_shows_chaos_keeps_the_common_shift():
+    leg, camera, shift, rng = legs_and_matches()
+    second = leg[camera] == 1
+    shift[second, 1] += 0.4
+    common = np.array([5.0, 0.0])
+    np.testing.assert_allclose(leg_corrections(leg, as_matches(camera, shift), common), np.tile(common, (42, 1)))
+    shift[second] = rng.uniform(-14, 14, (int(second.sum()), 2))
+    np.testing.assert_allclose(leg_corrections(leg, as_matches(camera, shift), common), np.tile(common, (42, 1)))
+    few = np.r_[np.flatnonzero(~second), np.flatnonzero(second)[:3]]
+    shift[second] = common + 3.0
+    out = leg_corrections(leg, as_matches(camera[few], shift[few]), common)
+    np.testing.assert_allclose(out, np.tile(common, (42, 1)))
+
+
+def test_ties_that_agree_beside_a_picture_tell_of_its_error_and_single_ones_do_not():
+    leg, camera, _, rng = legs_and_matches()
+    residual = rng.normal(0, 0.1, (len(camera), 2))
+    assert unexplained(leg, camera, residual).max() < 0.1
+    alone = residual.copy()
+    alone[::9] += 4.0
+    assert unexplained(leg, camera, alone).max() < 0.2
+    residual[np.isin(camera, np.arange(22, 28))] += (1.2, 0.0)
+    off = unexplained(leg, camera, residual)
+    assert off[22:26].min() > 0.8
+    assert off[:20].max() < 0.1 and off[32:].max() < 0.1  # neither the leg before the corner nor the rest of its own
+    order = rng.permutation(len(camera))
+    np.testing.assert_array_equal(unexplained(leg, camera[order], residual[order]), off)
+    assert not unexplained(leg, camera[:0], residual[:0]).any()

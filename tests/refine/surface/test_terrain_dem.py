@@ -1,0 +1,155 @@
+"""Height models from outside: any CRS, gaps, units, and files that are none."""
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.raster.height_model import check_dem, read_dem
+
+EPSG = 32632
+WEST, SOUTH = 500_000.0, 5_400_000.0
+BOUNDS = (WEST, SOUTH, WEST + 400.0, SOUTH + 300.0)
+
+
+def ground(east, north):
+    return 300.0 + 0.05 * (east - WEST) - 0.03 * (north - SOUTH) + 4.0 * np.sin((east - WEST) / 80.0)
+
+
+def write(path, z, epsg=EPSG, transform=None, unit=None, **profile):
+    profile = {"nodata": None, "dtype": z.dtype, **profile}
+    with rasterio.open(
+        path, "w", driver="GTiff", width=z.shape[1], height=z.shape[0], count=1,
+        crs=None if epsg is None else f"EPSG:{epsg}", transform=transform, **profile,
+    ) as dataset:  # fmt: skip
+        dataset.write(z, 1)
+        if unit:
+            dataset.units = [unit]
+    return path
+
+
+def utm_dem(gsd=2.0, margin=100.0, factor=1.0, dtype="float32"):
+    left, top = WEST - margin, SOUTH + 300.0 + margin
+    east = left + (np.arange(int((400 + 2 * margin) / gsd)) + 0.5) * gsd
+    north = top - (np.arange(int((300 + 2 * margin) / gsd)) + 0.5) * gsd
+    z = ground(*np.meshgrid(east, north)) * factor
+    return z.astype(dtype), from_origin(left, top, gsd, gsd)
+
+
+def probe():
+    east, north = np.meshgrid(np.arange(WEST + 5, WEST + 396, 13.0), np.arange(SOUTH + 5, SOUTH + 296, 13.0))
+    return np.stack([east, north], -1)
+
+
+def check(terrain, level, atol):
+    p = probe()
+    np.testing.assert_allclose(terrain.height(p), ground(p[..., 0], p[..., 1]) - level, atol=atol)
+
+
+def test_heights_are_relative_to_the_takeoff(tmp_path):
+    z, transform = utm_dem()
+    path = write(tmp_path / "dem.tif", z, transform=transform)
+    takeoff = np.array([WEST + 50.0, SOUTH + 60.0])
+    terrain = read_dem(path, EPSG, BOUNDS, takeoff=takeoff)
+    check(terrain, ground(*takeoff), 0.05)
+    assert terrain.height(takeoff) == pytest.approx(0.0, abs=0.02)
+    assert terrain.step_m == 2.0
+
+
+def test_a_stated_level_wins(tmp_path):
+    z, transform = utm_dem()
+    path = write(tmp_path / "dem.tif", z, transform=transform)
+    check(read_dem(path, EPSG, BOUNDS, level_m=290.0), 290.0, 0.05)
+
+
+def test_the_median_of_several_positions_is_the_datum(tmp_path):
+    z, transform = utm_dem()
+    path = write(tmp_path / "dem.tif", z, transform=transform)
+    cameras = np.array([[WEST + 50.0, SOUTH + 60.0], [WEST + 60.0, SOUTH + 60.0], [WEST + 300.0, SOUTH + 60.0]])
+    check(read_dem(path, EPSG, BOUNDS, takeoff=cameras), ground(*cameras[1]), 0.05)
+
+
+def test_geographic_coordinates_are_warped(tmp_path):
+    from pyproj import Transformer
+
+    to_utm = Transformer.from_crs(4326, EPSG, always_xy=True)
+    lon, lat = to_utm.transform(WEST, SOUTH, direction="INVERSE")
+    step = 5e-5
+    left, top = lon - 0.002, lat + 0.005
+    lons, lats = np.meshgrid(left + (np.arange(200) + 0.5) * step, top - (np.arange(150) + 0.5) * step)
+    east, north = to_utm.transform(lons, lats)
+    path = write(tmp_path / "geo.tif", ground(east, north).astype(np.float32), 4326, from_origin(left, top, step, step))
+    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.1)
+
+
+def test_a_fine_dem_is_averaged_and_a_coarse_one_interpolated(tmp_path):
+    z, transform = utm_dem(gsd=0.5)
+    noisy = (z + np.random.default_rng(0).normal(0, 1.0, z.shape)).astype(np.float32)
+    fine = read_dem(write(tmp_path / "fine.tif", noisy, transform=transform), EPSG, BOUNDS, level_m=300.0, step_m=10.0)
+    check(fine, 300.0, 0.5)
+    z, transform = utm_dem(gsd=20.0)
+    coarse = read_dem(write(tmp_path / "c.tif", z, transform=transform), EPSG, BOUNDS, level_m=300.0, step_m=5.0)
+    check(coarse, 300.0, 0.3)
+
+
+@pytest.mark.parametrize("nodata", [-9999.0, None])
+def test_gaps_are_filled_from_around(tmp_path, nodata):
+    z, transform = utm_dem()
+    z[120:140, 150:180] = -9999.0
+    path = write(tmp_path / "dem.tif", z, transform=transform, nodata=nodata)
+    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 3.0)
+
+
+def test_feet_become_metres(tmp_path):
+    z, transform = utm_dem(factor=1 / 0.3048)
+    path = write(tmp_path / "feet.tif", z, transform=transform, unit="ft")
+    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
+
+
+def test_whole_numbers_are_read(tmp_path):
+    z, transform = utm_dem(dtype="int16")
+    path = write(tmp_path / "int.tif", z, transform=transform, nodata=-32768)
+    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 1.1)
+
+
+def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path):
+    z, transform = utm_dem()
+    with pytest.raises(InputError, match="does not exist"):
+        read_dem(tmp_path / "none.tif", EPSG, BOUNDS)
+    (tmp_path / "text.tif").write_text("no picture")
+    with pytest.raises(InputError, match="no readable height model"):
+        read_dem(tmp_path / "text.tif", EPSG, BOUNDS)
+    with pytest.raises(InputError, match="no CRS"):
+        read_dem(write(tmp_path / "bare.tif", z, None, transform), EPSG, BOUNDS)
+    away = (WEST + 10_000.0, SOUTH, WEST + 10_400.0, SOUTH + 300.0)
+    with pytest.raises(InputError, match="covers"):
+        read_dem(write(tmp_path / "away.tif", z, transform=transform), EPSG, away)
+    picture = tmp_path / "rgb.tif"
+    with rasterio.open(
+        picture, "w", driver="GTiff", width=8, height=8, count=3, dtype="uint8", crs=f"EPSG:{EPSG}", transform=transform
+    ) as dataset:
+        dataset.write(np.zeros((3, 8, 8), np.uint8))
+    with pytest.raises(InputError, match="is a picture"):
+        read_dem(picture, EPSG, BOUNDS)
+
+
+def test_a_real_ground_model_is_read(real_data):
+    path = real_data("autzen") / "autzen_ground_approx_0.5m_utm10_cm.tif"
+    with rasterio.open(path) as dataset:
+        b = dataset.bounds
+    bounds = (b.left + 200, b.bottom + 300, b.right - 200, b.top - 300)
+    terrain = read_dem(path, 32610, bounds)
+    middle = terrain.height(np.array([[0.5 * (b.left + b.right), 0.5 * (b.bottom + b.top)]]))
+    assert np.isfinite(middle).all()
+    assert abs(np.median(terrain.z)) < 1e-3
+
+
+def test_a_dem_in_another_unit_is_refused_before_it_buries_cameras(tmp_path):
+    cameras = np.c_[np.random.default_rng(5).uniform(BOUNDS[:2], BOUNDS[2:], (40, 2)), np.full(40, 90.0)]
+    z, transform = utm_dem()
+    check_dem(write(tmp_path / "dem.tif", z, transform=transform), EPSG, BOUNDS, cameras)
+    steep = write(tmp_path / "steep.tif", 300.0 + 30.0 * (z - 300.0), transform=transform)
+    with pytest.raises(InputError, match=r"steep\.tif the ground lies above \d+% of the cameras"):
+        check_dem(steep, EPSG, BOUNDS, cameras)
+    check_dem(steep, EPSG, BOUNDS, [])

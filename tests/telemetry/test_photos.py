@@ -1,0 +1,259 @@
+"""Photos in: EXIF, XMP, maker notes, containers, and what is refused."""
+
+import io
+import math
+import struct
+from pathlib import Path
+
+import pytest
+import rasterio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from telemetry.formats import exif, xmp
+from telemetry.formats.makernotes import parse_dji
+from telemetry.formats.picture_container import NotAPicture, read_container
+from telemetry.photos.photo_tags import read_photo
+
+DJI_ATTRIBUTES = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description rdf:about="DJI"
+ xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+120.40"
+ drone-dji:GimbalYawDegree="-12.5" drone-dji:GimbalPitchDegree="-90.00" drone-dji:GimbalRollDegree="+0.00"
+ drone-dji:FlightYawDegree="-11.0" drone-dji:GpsLatitude="47.5" drone-dji:GpsLongtitude="8.25"
+ drone-dji:RtkFlag="50" drone-dji:RtkStdLat="0.011" drone-dji:RtkStdLon="0.014"/></rdf:RDF></x:xmpmeta>"""
+
+
+def jpeg(path: Path, *, xmp_packet: bytes = b"", exif_bytes: bytes = b"", size=(64, 48)) -> Path:
+    buffer = io.BytesIO()
+    extra = {"exif": exif_bytes} if exif_bytes else {}
+    Image.new("RGB", size, (90, 120, 60)).save(buffer, "JPEG", **extra)
+    data = buffer.getvalue()
+    if xmp_packet:
+        body = b"http://ns.adobe.com/xap/1.0/\0" + xmp_packet
+        data = data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:]
+    path.write_bytes(data)
+    return path
+
+
+def gps_exif(
+    lat=47.5, lon=8.25, *, local="2024:05:06 12:00:01", subsec="250", offset=None, gps_utc=None, make="DJI"
+) -> bytes:
+    tags = Image.Exif()
+    tags[0x010F], tags[0x0110] = make, "FC1"
+    inner = tags.get_ifd(0x8769)
+    inner[0x9003], inner[0x9291] = local, subsec
+    inner[0xA405] = 24
+    if offset:
+        inner[0x9011] = offset
+    gps = tags.get_ifd(0x8825)
+    gps[1], gps[3] = ("N" if lat >= 0 else "S"), ("E" if lon >= 0 else "W")
+    for tag, value in ((2, abs(lat)), (4, abs(lon))):
+        minutes = (value % 1) * 60
+        gps[tag] = (float(int(value)), float(int(minutes)), round((minutes % 1) * 60, 6))
+    if gps_utc:
+        gps[7], gps[29] = gps_utc
+    return tags.tobytes()
+
+
+def test_xmp_attributes_and_elements_read_alike():
+    elements = (
+        b"<x:xmpmeta><drone-dji:GimbalYawDegree>+44.20</drone-dji:GimbalYawDegree>"
+        b"<drone-dji:RelativeAltitude> +40.10 </drone-dji:RelativeAltitude>"
+    )
+    assert xmp.number(xmp.properties(elements), "drone-dji:GimbalYawDegree") == 44.2
+    assert xmp.number(xmp.properties(elements), "drone-dji:RelativeAltitude") == 40.1
+    assert xmp.number(xmp.properties(DJI_ATTRIBUTES), "drone-dji:GimbalYawDegree") == -12.5
+
+
+MAKERS = {
+    # maker: (EXIF make, XMP attributes, camera's yaw, pitch and roll, height and whether above ground, sigma)
+    "parrot-anafi": (
+        "Parrot",
+        'drone-parrot:CameraYawDegree="31.5" drone-parrot:CameraPitchDegree="-88" drone-parrot:CameraRollDegree="0.5" '
+        'drone-parrot:DroneYawDegree="30.0" drone-parrot:DronePitchDegree="-4.0" drone-parrot:DroneRollDegree="1.0" '
+        'drone-parrot:RelativeAltitude="42.5"',
+        (31.5, -88.0, 0.5), (42.5, False), None,
+    ),
+    "parrot-sequoia": (
+        "Parrot",
+        'Camera:Yaw="120.0" Camera:Pitch="2.0" Camera:Roll="-3.0" Camera:AboveGroundAltitude="61.0" '
+        'Camera:GPSXYAccuracy="1.5"',
+        (120.0, -88.0, -3.0), (61.0, True), 1.5,
+    ),
+    "autel-evo": (
+        "Autel Robotics",
+        'Camera:Yaw="-75.0" Camera:Pitch="-90.0" Camera:Roll="0.0" drone:RelativeAltitude="55.0"',
+        (-75.0, -90.0, 0.0), (55.0, False), None,
+    ),
+    "sensefly": (
+        "senseFly",
+        'Camera:Yaw="200.0" Camera:Pitch="5.0" Camera:Roll="4.0" Camera:GPSXYAccuracy="0.03"',
+        (200.0, -85.0, -4.0), (None, False), 0.03,
+    ),
+    "micasense": (
+        "MicaSense",
+        'Camera:Yaw="10.0" Camera:Pitch="-3.0" Camera:Roll="1.0" Camera:BandName="Green"',
+        (10.0, -93.0, 1.0), (None, False), None,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_attitude_height_and_accuracy_are_read_as_each_maker_writes_them(tmp_path, maker):
+    make, attributes, angles, height, sigma = MAKERS[maker]
+    packet = f"<x:xmpmeta><rdf:Description {attributes}/></x:xmpmeta>".encode()
+    photo = read_photo(jpeg(tmp_path / "a.jpg", xmp_packet=packet, exif_bytes=gps_exif(make=make)))
+    assert photo is not None
+    assert photo.camera_deg == pytest.approx(angles)
+    assert (photo.height_m, photo.height_is_ground) == height
+    assert photo.position_sigma_m == sigma
+    assert photo.band == ("Green" if maker == "micasense" else "")
+
+
+def test_position_comes_from_xmp_where_exif_has_none(tmp_path):
+    photo = read_photo(jpeg(tmp_path / "a.jpg", xmp_packet=DJI_ATTRIBUTES))
+    assert (photo.lat_deg, photo.lon_deg) == (47.5, 8.25)
+    assert photo.position_sigma_m == 0.014
+    assert photo.height_m == 120.4
+    assert photo.camera_deg == (-12.5, -90.0, 0.0)
+    assert (photo.width, photo.height) == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "expected"),
+    [
+        ({}, 1714996801.25),
+        ({"offset": "+02:00"}, 1714996801.25 - 7200),
+        ({"gps_utc": ((10.0, 0.0, 0.0), "2024:05:06")}, 1714996801.25 - 7200),
+    ],
+)
+def test_time_keeps_subseconds_and_takes_the_zone_where_it_is_known(tmp_path, kwargs, expected):
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(**kwargs)))
+    assert photo.time_s == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("lat", "lon"), [(47.5, 8.25), (-33.9, 151.2), (12.25, -70.5)])
+def test_hemispheres(tmp_path, lat, lon):
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(lat, lon)))
+    assert (photo.lat_deg, photo.lon_deg) == pytest.approx((lat, lon), abs=1e-8)
+
+
+def test_zero_zero_is_no_position(tmp_path):
+    assert read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(0.0, 0.0))).lat_deg is None
+
+
+def test_maker_note_of_sheffield_has_the_attitude(real_data):
+    photo = read_photo(real_data("sheffield_cross_800") / "DJI_0056.JPG")
+    assert photo.camera_deg == pytest.approx((90.2, -75.1, 0.0), abs=1e-3)
+    assert photo.flight_deg == pytest.approx((89.3, -2.4, 4.4), abs=1e-3)
+    assert photo.height_m is None
+    assert photo.altitude_m == pytest.approx(-5.477)
+
+
+def test_maker_note_agrees_with_xmp_where_both_are_there(real_data):
+    for path in sorted(real_data("brighton_beach_1600").glob("*.JPG")):
+        photo, note = read_photo(path), parse_dji(read_container(path).exif.exif[exif.MAKER_NOTE])
+        assert (note.camera_yaw_deg, note.camera_pitch_deg) == pytest.approx(photo.camera_deg[:2], abs=0.051)
+
+
+def test_calibrated_focal_length_and_rtk_of_mirafiori(real_data):
+    photo = read_photo(real_data("mirafiori_rtk") / "DJI_0030.JPG")
+    assert photo.fov_hint_rad == pytest.approx(2 * math.atan(800 / 1913.333374))
+    assert photo.position_sigma_m == pytest.approx(0.01481)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"", "empty"),
+        (b"hello, I am no picture at all", "content"),
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "header"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "cut off"),
+        (b"II*\0\x08\0\0\0", "cut off"),
+    ],
+)
+def test_what_is_no_picture_is_refused_with_its_reason(tmp_path, content, word):
+    path = tmp_path / "bad.jpg"
+    path.write_bytes(content)
+    with pytest.raises(NotAPicture, match=word):
+        read_photo(path)
+
+
+def test_a_truncated_jpeg_is_refused_and_trailing_data_is_not(tmp_path, real_data):
+    whole = (real_data("brighton_beach_1600") / "DJI_0018.JPG").read_bytes()
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(NotAPicture, match="cut off"):
+        read_photo(path)
+    path.write_bytes(whole + b"\0" * 3_000_000)
+    assert read_photo(path).width == 1600
+
+
+def test_a_png_under_a_jpeg_name_is_read_by_content(tmp_path):
+    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
+    path = tmp_path / "a.jpg"
+    path.write_bytes((tmp_path / "a.png").read_bytes())
+    photo = read_photo(path)
+    assert (photo.width, photo.height) == (30, 20)
+
+
+@pytest.mark.parametrize("endianness", ["LITTLE", "BIG"])
+def test_a_large_georeferenced_tiff_is_no_photo_and_a_plain_one_no_picture_of_a_camera(tmp_path, endianness):
+    path = tmp_path / "map.tif"
+    shape = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "uint8"}
+    place = {"crs": "EPSG:32632", "transform": rasterio.Affine(1, 0, 5e5, 0, -1, 5e6)}
+    with rasterio.open(path, "w", **shape, **place, BIGTIFF="YES", ENDIANNESS=endianness):
+        pass
+    assert path.read_bytes()[:4] in (b"II+\0", b"MM\0+")
+    assert read_photo(path) is None
+    data = path.read_bytes()
+    path.write_bytes(data.replace(struct.pack("<H" if endianness == "LITTLE" else ">H", 34735), b"\xf0\xf0"))
+    with pytest.raises(NotAPicture, match="BigTIFF"):
+        read_photo(path)
+
+
+def test_a_georeferenced_tiff_is_no_photo(real_data):
+    assert read_photo(real_data("brighton_derived") / "ortho_from_cloud_0.1m_utm15.tif") is None
+
+
+@pytest.mark.parametrize("format_", ["PNG", "WEBP", "TIFF", "BMP"])
+def test_sizes_of_other_formats(tmp_path, format_):
+    path = tmp_path / f"a.{format_.lower()}"
+    Image.new("RGB", (33, 21), (1, 2, 3)).save(path)
+    photo = read_photo(path)
+    assert (photo.width, photo.height) == (33, 21)
+
+
+@given(st.binary(max_size=400))
+@settings(max_examples=150, deadline=None)
+def test_parsers_survive_any_bytes(data):
+    exif.parse_tiff(data)
+    exif.parse_tiff(b"II*\0\x08\0\0\0" + data)
+    exif.parse_tiff(b"MM\0*\0\0\0\x08" + data)
+    xmp.properties(data)
+    parse_dji(data)
+    parse_dji(b"\x05\0\x01\0\x02\0\x04\0\0\0DJI\0" + data)
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_damaged_photos_are_read_or_refused_but_never_break(tmp_path_factory, data):
+    source = gps_exif()
+    path = jpeg(tmp_path_factory.mktemp("fuzz") / "a.jpg", xmp_packet=DJI_ATTRIBUTES, exif_bytes=source)
+    raw = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        raw[data.draw(st.integers(2, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))])
+    try:
+        photo = read_photo(path)
+    except NotAPicture as reason:
+        assert str(reason)
+    else:
+        assert photo.lat_deg is None or exif.is_position(photo.lat_deg, photo.lon_deg)
+
+
+def test_time_formats():
+    assert exif.parse_time("2024-05-06T12:00:01.5+02:00") == (1714996801.5 - 7200, True)
+    assert exif.parse_time("2024:05:06 12:00:01") == (1714996801.0, False)
+    assert exif.parse_time("0000:00:00 00:00:00") is None
+    assert exif.parse_offset("-05:30") == -19800.0

@@ -1,0 +1,232 @@
+"""`orthoswarm fleet` and `orthoswarm sim` against simulated vehicles on loopback."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gcs_plugin.backends.backend import late_start
+from gcs_plugin.cli.main import main
+from gcs_plugin.cli.verbs.fleet import parse_systems, read_plan_folder
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.links.transports import UdpLink
+from gcs_plugin.mission import mission_files
+from gcs_plugin.mission.exchange import Outcome
+from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from orthoswarm.model.errors import InputError
+from tests.vehicles.test_mission_builder import make_plan
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+HOME = (47.3977, 8.5456, 488.0)
+
+
+def free_port():
+    link = UdpLink("probe", "127.0.0.1", 0, listens=True)
+    port = link.port
+    link.close()
+    return port
+
+
+@pytest.fixture
+def swarm():
+    """Three simulated vehicles at forty times their speed; gives the link of a ground station."""
+    port = free_port()
+    vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
+    with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=40.0):
+        yield f"udpin:127.0.0.1:{port}"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A plan for vehicles 1 to 3 as `orthoswarm plan` writes it; they take off a second after each other."""
+    plan = make_plan()
+    sortie = plan.vehicles[0].sorties[0]
+    items = mission_files.sortie_items(plan, sortie, "ardupilot")
+    vehicles = []
+    for number in (1, 2, 3):
+        text = mission_files.plan_text(items, HOME, "ardupilot", 8.0)
+        (tmp_path / f"v{number}.plan").write_text(text)
+        (tmp_path / f"v{number}.waypoints").write_text(mission_files.waypoints_text(items, HOME))
+        files = [f"v{number}.plan", f"v{number}.waypoints"]
+        vehicles.append({"id": f"v{number}", "flights": [{"files": files, "start_s": 5.0 + 0.5 * number}]})
+    (tmp_path / "plan.json").write_text(json.dumps({"vehicles": vehicles}))
+    return tmp_path
+
+
+def fleet(capsys, *words):
+    code = main(["fleet", *map(str, words)])
+    out = capsys.readouterr().out
+    return code, json.loads(out) if "--json" in words and out else out
+
+
+def test_a_plan_is_uploaded_flown_and_watched_to_its_completion(swarm, folder, capsys):
+    code, listed = fleet(capsys, "list", "--link", swarm, "--json")
+    assert code == 0
+    assert [(v["id"], v["autopilot"]) for v in listed["vehicles"]] == [
+        ("v1", "ardupilot"),
+        ("v2", "px4"),
+        ("v3", "ardupilot"),
+    ]
+    code, uploaded = fleet(capsys, "upload", folder, "--link", swarm, "--json")
+    assert code == 0 and all(v["ok"] for v in uploaded["vehicles"])
+    assert [v["items"] for v in uploaded["vehicles"]] == [13, 12, 13]
+    code, flown = fleet(capsys, "start", "--plan", folder, "--watch", "--seconds", 60, "--link", swarm, "--json")
+    assert code == 0 and flown["ended"]
+    for vehicle in ("v1", "v2", "v3"):
+        kinds = [e["kind"] for e in flown["events"] if e["vehicle"] == vehicle]
+        assert kinds.count("complete") == 1 and kinds.count("started") == 1
+    started = [e["vehicle"] for e in flown["events"] if e["kind"] == "started"]
+    assert started == ["v1", "v2", "v3"]  # at the plan's times
+    assert all(v["photos"] > 10 for v in flown["vehicles"])
+
+
+def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plans(swarm, folder, capsys):
+    assert fleet(capsys, "upload", folder, "--link", swarm)[0] == 0
+    other = folder / "other.waypoints"
+    lines = (folder / "v2.waypoints").read_text().splitlines()
+    other.write_text("\n".join(line.replace("\t60.000\t", "\t61.000\t") for line in lines))
+    assert fleet(capsys, "upload", other, "--vehicle", "2", "--link", swarm)[0] == 0
+    code, said = fleet(capsys, "start", "--plan", folder, "--link", swarm, "--json")
+    assert code == 1 and not any(v["ok"] for v in said["vehicles"])
+    assert "does not hold v2.plan" in said["vehicles"][1]["text"] and "its height is 61" in said["vehicles"][1]["text"]
+    code, listed = fleet(capsys, "list", "--link", swarm, "--json")
+    assert not any(v["armed"] for v in listed["vehicles"])
+
+
+def test_one_vehicle_is_started_paused_resumed_and_brought_home(swarm, folder, capsys):
+    assert fleet(capsys, "upload", folder / "v1.plan", "--vehicle", "v3", "--link", swarm)[0] == 0
+    code, text = fleet(capsys, "start", "--vehicle", "3", "--link", swarm)
+    assert code == 0 and "vehicle 3 flies its mission" in text
+    for action in ("pause", "resume", "rtl"):
+        code, said = fleet(capsys, action, "--vehicle", "3", "--link", swarm, "--json")
+        assert code == 0 and said["vehicles"][0]["ok"], said
+    code, said = fleet(capsys, "start", "--vehicle", "2", "--link", swarm, "--json")
+    assert code == 1 and "no mission" in said["vehicles"][0]["text"]
+
+
+def test_a_refused_mission_is_explained_in_words_and_in_json(swarm, folder, capsys):
+    path = folder / "v1.waypoints"
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].replace("\t16\t", "\t214\t")
+    path.write_text("\n".join(lines))
+    code, said = fleet(capsys, "upload", path, "--vehicle", "1", "--link", swarm, "--json")
+    row = said["vehicles"][0]
+    assert code == 1 and not row["ok"]
+    assert row["refusal"] == {"code": 3, "item": 3, "field": "command"}
+    assert "item 3 (DO_SET_CAM_TRIGG_INTERVAL) is a command that it does not know" in row["text"]
+
+
+def test_mavsdk_flies_them_too(swarm, folder, capsys):
+    pytest.importorskip("mavsdk")
+    both = ("--vehicle", "1,2", "--link", swarm, "--backend", "mavsdk", "--json")
+    code, uploaded = fleet(capsys, "upload", folder, *both)
+    assert code == 0 and all(v["ok"] for v in uploaded["vehicles"]), uploaded
+    code, flown = fleet(capsys, "start", "--watch", "--seconds", 60, *both)
+    assert code == 0, flown
+    assert sorted(e["vehicle"] for e in flown["events"] if e["kind"] == "complete") == ["v1", "v2"]
+
+
+def test_nobody_on_the_link_is_said_with_exit_code_one(capsys):
+    code = main(["fleet", "list", "--link", f"udpin:127.0.0.1:{free_port()}", "--wait", "0.3", "--json"])
+    captured = capsys.readouterr()
+    assert code == 1
+    assert json.loads(captured.out)["vehicles"] == []
+    assert "no vehicle heard" in captured.err and "check links" in captured.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["list", "--link", "nonsense"], "is no link"),
+        (["list", "--vehicle", "x"], "is no vehicle"),
+        (["list", "--gcs-system", "300"], "1 to 255"),
+        (["list", "--wait", "-1"], "is no time"),
+        (["watch", "--seconds", "nan"], "is no time"),
+        (["upload", "absent.plan"], "does not exist"),
+        (["start", "--plan", "absent"], "holds no missions"),
+        (["list", "--signing-key", "absent"], "cannot be read"),
+        (["list", "--backend", "mavsdk", "--tlog", "x.tlog"], "use --backend pymavlink"),
+    ],
+)
+def test_wrong_arguments_get_one_sentence_and_exit_code_two(words, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["fleet", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_whose_mission_a_file_is_must_be_clear(folder, capsys):
+    one = folder / "survey.plan"
+    (folder / "v1.plan").rename(one)
+    assert main(["fleet", "upload", str(one), str(folder / "v2.plan")]) == 2
+    assert "whose mission is survey.plan" in capsys.readouterr().err
+    assert main(["fleet", "upload", str(folder), "--vehicle", "9"]) == 2
+    assert "no mission for vehicle 9" in capsys.readouterr().err
+
+
+def test_a_plans_folder_tells_files_and_times(folder):
+    flights = read_plan_folder(folder, 1)
+    assert {s: (path.name, start) for s, (path, start) in flights.items()} == {
+        1: ("v1.plan", 5.5), 2: ("v2.plan", 6.0), 3: ("v3.plan", 6.5),
+    }  # fmt: skip
+    with pytest.raises(InputError, match="no sortie 2"):
+        read_plan_folder(folder, 2)
+    (folder / "plan.json").unlink()
+    assert sorted(read_plan_folder(folder, 1)) == [1, 2, 3]
+
+
+def test_vehicles_are_named_in_any_usual_way():
+    assert parse_systems(["3", "v7,1", "3"]) == [1, 3, 7]
+    with pytest.raises(InputError):
+        parse_systems(["0"])
+
+
+def test_simulated_vehicles_run_from_the_command_line():
+    port = free_port()
+    command = [
+        sys.executable,
+        "-m",
+        "gcs_plugin.cli",
+        "sim",
+        "--vehicles",
+        "2",
+        "--autopilot",
+        "mixed",
+        "--speed",
+        "10",
+    ]
+    with subprocess.Popen([*command, "--link", f"udpout:127.0.0.1:{port}"], stderr=subprocess.PIPE) as process:
+        try:
+            from gcs_plugin.fleet.fleet import Fleet
+
+            with Fleet([f"udpin:127.0.0.1:{port}"]) as heard:
+                assert heard.run_until(lambda: len(heard.vehicles) == 2, 20.0)
+        finally:
+            process.terminate()
+
+
+def test_simulated_vehicles_end_by_themselves(capsys):
+    started = time.monotonic()
+    words = ["--vehicles", "1", "--link", f"udpout:127.0.0.1:{free_port()}", "--speed", "50", "--seconds", "20"]
+    assert main(["sim", *words, "--reboot", "1@5", "--silence", "1@10+2"]) == 0
+    assert time.monotonic() - started < 5.0
+    said = capsys.readouterr().err
+    assert "vehicle 1: reboot" in said and "vehicle 1: silence" in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--vehicles", "0"], ["--home", "x"], ["--reboot", "1"], ["--reboot", "9@1"], ["--loss", "2"], ["--speed", "0"]],
+)
+def test_impossible_simulations_are_refused(words, capsys):
+    assert main(["sim", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_start_that_came_too_late_for_its_plan_says_so():
+    flies = Outcome(True, "vehicle 2 flies its mission")
+    assert late_start(flies, 4.0) == flies
+    assert "12 s later than planned" in late_start(flies, 12.0).text and late_start(flies, 12.0).ok

@@ -1,0 +1,287 @@
+"""The same scenarios on simulated vehicles, and with `-m sitl` on real autopilots named in ORTHOSWARM_SITL.
+
+ORTHOSWARM_SITL is a comma-separated list of links, for example tcp:127.0.0.1:5760,udpin:127.0.0.1:14540. Each vehicle
+takes off, flies two legs of 40 m near where it stands, and ends as the scenario says.
+"""
+
+import math
+import os
+import time
+
+import pytest
+
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.links.transports import Link, parse_link
+from gcs_plugin.mission.items import CHANGE_SPEED, LAND, LOITER_UNLIM, RTL, TAKEOFF, TRIGGER_DISTANCE, WAYPOINT
+from gcs_plugin.mission.mission_builder import build_mission
+from gcs_plugin.mission.mission_files import MissionItem
+from gcs_plugin.sim.lossy_radio import Channel, Faults
+from gcs_plugin.sim.memory_link import World
+from gcs_plugin.sim.multirotor import Chart
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+ADDRESSES = [a.strip() for a in os.environ.get("ORTHOSWARM_SITL", "").split(",") if a.strip()]
+REAL = ADDRESSES or ["no address in ORTHOSWARM_SITL"]
+
+
+class LossyLink(Link):
+    """A link that loses, doubles and delays what passes it, both ways."""
+
+    def __init__(self, link, up, down):
+        super().__init__(link.name)
+        self.link, self.up, self.down = link, Channel(up), Channel(down)
+
+    def open(self, selector, now):
+        self.link.open(_Renamed(selector, self), now)
+
+    def close(self):
+        self.link.close()
+
+    def tick(self, now):
+        self.link.tick(now)
+        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+
+    def greet(self):
+        return self.link.greet()
+
+    @property
+    def polled(self):
+        return self  # late packets are due without new ones coming
+
+    def send(self, peer, data):
+        now = time.monotonic()
+        self.up.put((peer, data), now)
+        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+
+    def receive(self, source, events, now):
+        if source is not self:
+            for cargo in self.link.receive(source, events, now):
+                self.down.put(cargo, now)
+        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+        yield from self.down.take(now)
+
+
+class _Renamed:
+    """A selector under which a link registers its wrapper."""
+
+    def __init__(self, selector, link):
+        self._selector, self._link = selector, link
+
+    def register(self, file, events, data):
+        return self._selector.register(file, events, self._link)
+
+    def modify(self, file, events, data):
+        return self._selector.modify(file, events, self._link)
+
+    def unregister(self, file):
+        return self._selector.unregister(file)
+
+
+class Simulated:
+    """One simulated vehicle in virtual time."""
+
+    def __init__(self, autopilot, faults=None):
+        up, down = faults or (Faults(), Faults())
+        self.world = World([SimVehicle(1, autopilot, ready_s=5.0)], up, down)
+        self.fleet, self.events = self.world.fleet, self.world.events
+        self.close = self.world.fleet.close
+
+    def until(self, done, limit_s):
+        return self.world.until(done, limit_s)
+
+
+class Real:
+    """One real autopilot on a link."""
+
+    def __init__(self, address, faults=None):
+        if not ADDRESSES:
+            pytest.skip("ORTHOSWARM_SITL names no autopilot")
+        link = parse_link(address)
+        self.fleet = Fleet([LossyLink(link, *faults) if faults else link])
+        self.events = []
+        self.fleet.on_event(self.events.append)
+        self.close = self.fleet.close
+
+    def until(self, done, limit_s):
+        return self.fleet.run_until(done, limit_s)
+
+
+class Site:
+    """A vehicle that has been found, and what the scenarios ask of it."""
+
+    def __init__(self, place):
+        self.place, self.fleet = place, place.fleet
+        assert place.until(lambda: bool(self.fleet.vehicles), 60.0), "no vehicle was heard"
+        self.system = min(self.fleet.vehicles)
+        self.vehicle = self.fleet.vehicles[self.system]
+        assert place.until(lambda: self.vehicle.lat_deg and self.vehicle.landed and self.vehicle.gps_fix >= 3, 120.0)
+        self.home()
+        self.chart = Chart(self.vehicle.lat_deg, self.vehicle.lon_deg)
+        self.begun = len(place.events)
+
+    def home(self):
+        """On the ground, disarmed; what an earlier scenario left in the air is brought home."""
+        if self.vehicle.armed:
+            self.finish(self.fleet.rtl(self.system))
+            assert self.place.until(lambda: not self.vehicle.armed, 300.0)
+
+    def finish(self, dialogue, limit_s=180.0):
+        self.place.until(lambda: dialogue.outcome is not None, limit_s)
+        return dialogue.outcome
+
+    def kinds(self):
+        missions = ("started", "suspended", "resumed", "complete", "aborted")
+        return [e.kind for e in self.place.events[self.begun :] if e.system == self.system and e.kind in missions]
+
+    def mission(self, *last, height=15.0, legs=2):
+        items = [self.at(TAKEOFF, 0, 0, height), MissionItem(CHANGE_SPEED, params=(1.0, 8.0, -1.0, 0.0))]
+        for leg in range(legs):
+            ends = (5.0, 45.0) if leg % 2 == 0 else (45.0, 5.0)
+            items += [
+                self.at(WAYPOINT, ends[0], 15.0 * leg, height),
+                trigger(8.0),
+                self.at(WAYPOINT, ends[1], 15.0 * leg, height),
+            ]
+            items.append(trigger(0.0))
+        return build_mission(self.vehicle.autopilot, [*items, *last])
+
+    def at(self, command, north, east, height):
+        return MissionItem(command, 3, (0.0, 0.0, 0.0, math.nan), *self.chart.to_degrees(north, east), height)
+
+    def fly(self, *last):
+        upload = self.finish(self.fleet.upload(self.system, self.mission(*last)))
+        assert upload.ok, upload
+        start = self.finish(self.fleet.start(self.system))
+        assert start.ok, start
+
+
+def trigger(distance):
+    return MissionItem(TRIGGER_DISTANCE, params=(distance, 0.0, 1.0 if distance else 0.0, 0.0))
+
+
+PLACES = [
+    pytest.param((Simulated, AP), id="simulated-ardupilot"),
+    pytest.param((Simulated, PX4), id="simulated-px4"),
+    *[
+        pytest.param((Real, address), id=f"sitl-{number}", marks=pytest.mark.sitl)
+        for number, address in enumerate(REAL)
+    ],
+]
+
+
+@pytest.fixture(params=PLACES)
+def make_site(request):
+    opened = []
+    kind, what = request.param
+
+    def make(faults=None):
+        place = kind(what, faults)
+        opened.append(place)
+        return Site(place)
+
+    yield make
+    for place in opened:
+        place.close()
+
+
+def last_items(site, ending):
+    return {
+        "rtl": [MissionItem(RTL)],
+        "land": [site.at(LAND, 3, 3, 0.0)],
+        "waypoint": [site.at(WAYPOINT, 3, 3, 15.0)],
+        "do": [site.at(WAYPOINT, 3, 3, 15.0), trigger(0.0)],
+        "loiter": [site.at(LOITER_UNLIM, 3, 3, 15.0)],
+    }[ending]
+
+
+@pytest.mark.parametrize("ending", ["rtl", "land", "waypoint", "do"])
+def test_a_flown_mission_completes_exactly_once(make_site, ending):
+    site = make_site()
+    site.fly(*last_items(site, ending))
+    assert site.place.until(lambda: "complete" in site.kinds(), 300.0)
+    if ending in ("waypoint", "do"):
+        site.home()
+    assert site.place.until(lambda: not site.vehicle.armed, 300.0)
+    site.place.until(lambda: False, 5.0)
+    assert site.kinds().count("complete") == 1
+    assert "aborted" not in site.kinds()
+    assert site.kinds()[0] == "started"
+
+
+def test_loiter_unlimited_and_the_operators_rtl_are_no_completion(make_site):
+    site = make_site()
+    site.fly(*last_items(site, "loiter"))
+    site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq, 200.0)
+    site.place.until(lambda: False, 20.0)
+    assert site.kinds() == ["started"]
+    site.home()
+    site.place.until(lambda: "aborted" in site.kinds(), 20.0)
+    assert "complete" not in site.kinds() and site.kinds()[-1] == "aborted"
+
+
+def test_a_new_upload_after_a_flight_is_not_complete(make_site):
+    site = make_site()
+    site.fly(MissionItem(RTL))
+    assert site.place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)
+    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(RTL), height=18.0))).ok
+    site.place.until(lambda: False, 5.0)
+    assert site.kinds() == ["started", "complete"]
+
+
+def test_pause_and_resume(make_site):
+    site = make_site()
+    site.fly(MissionItem(RTL))
+    site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 100.0)
+    assert site.finish(site.fleet.pause(site.system)).ok
+    site.place.until(lambda: False, 12.0)
+    assert math.hypot(*site.vehicle.velocity_m_s[:2]) < 0.5
+    assert site.finish(site.fleet.resume(site.system)).ok
+    assert site.place.until(lambda: "complete" in site.kinds(), 300.0)
+    assert site.kinds().count("complete") == 1
+
+
+def test_streams_come_at_the_rates_asked_for(make_site):
+    site = make_site()
+    counts = {"GLOBAL_POSITION_INT": 0, "ATTITUDE": 0}
+    site.fleet.subscribe(lambda v, m, utc: counts.__setitem__(m.get_type(), counts[m.get_type()] + 1), *counts)
+    site.place.until(lambda: False, 3.0)
+    before, clock = dict(counts), site.vehicle.time_boot_s
+    site.place.until(lambda: False, 10.0)
+    seconds = site.vehicle.time_boot_s - clock  # the vehicle's, which may run fast
+    for name in counts:
+        assert (counts[name] - before[name]) / seconds == pytest.approx(10.0, rel=0.15)
+
+
+def test_an_upload_through_thirty_percent_loss_both_ways(make_site):
+    faults = (Faults(loss=0.3, duplicate=0.1, seed=1), Faults(loss=0.3, duplicate=0.1, seed=2))
+    site = make_site(faults)
+    for height in (15.0, 16.0):
+        mission = site.mission(MissionItem(RTL), height=height)
+        outcome = site.finish(site.fleet.upload(site.system, mission), 180.0)
+        assert outcome is not None and outcome.ok, outcome
+
+
+def test_a_mission_that_is_refused_names_the_item_and_leaves_no_success(make_site):
+    site = make_site()
+    good = site.mission(MissionItem(RTL))
+    assert site.finish(site.fleet.upload(site.system, good)).ok
+    items = list(good.items)
+    wrong = good.first_seq + 2
+    items[wrong] = type(items[wrong])(command=31999, frame=3, x=items[wrong].x, y=items[wrong].y, z=15.0)
+    upload = site.fleet.upload(site.system, type(good)(good.autopilot, tuple(items)))
+    outcome = site.finish(upload)
+    assert not outcome.ok
+    assert upload.refusal.item == wrong and upload.refusal.code == dialect.MAV_MISSION_UNSUPPORTED
+    assert site.finish(site.fleet.upload(site.system, good)).ok
+
+
+def test_a_vehicle_without_a_mission_is_not_armed_by_start(make_site):
+    site = make_site()
+    site.fleet._send(site.system, [dialect.MAVLink_mission_clear_all_message(site.system, 1, 0)])
+    site.place.until(lambda: False, 3.0)
+    site.vehicle.mission = None
+    outcome = site.finish(site.fleet.start(site.system))
+    assert not outcome.ok and "no mission" in outcome.text
+    assert not site.vehicle.armed

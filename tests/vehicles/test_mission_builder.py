@@ -1,0 +1,168 @@
+"""From plans and mission files to what each autopilot wants."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcs_plugin.links.mavlink import Autopilot, command_name, dialect
+from gcs_plugin.links.packets import Framer
+from gcs_plugin.mission import mission_files
+from gcs_plugin.mission.control import unflyable
+from gcs_plugin.mission.items import (
+    LAND,
+    LOITER_UNLIM,
+    RTL,
+    TAKEOFF,
+    TRIGGER_DISTANCE,
+    WAYPOINT,
+    Ending,
+    Mission,
+    MissionItem,
+)
+from gcs_plugin.mission.mission_builder import build_mission, read_mission, sortie_mission, trigger_sections
+from gcs_plugin.sim.mission_store import MissionStore
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Plan, Sortie, VehiclePlan, Waypoint
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
+
+
+def make_plan(end="rtl"):
+    points = (
+        Waypoint(47.398, 8.5456, 60.0, True),
+        Waypoint(47.400, 8.5456, 60.0, False),
+        Waypoint(47.400, 8.5460, 60.0, True),
+        Waypoint(47.398, 8.5460, 60.0, False),
+        Waypoint(47.3977, 8.5456, 65.0),
+    )
+    sortie = Sortie(47.3977, 8.5456, 65.0, points, 0.0, 100.0, 600.0, 3, 40)
+    return Plan(
+        "columns", (VehiclePlan(1, (sortie,)),), 60.0, 8.0, 12.5, 30.0, (60.0, 45.0), end, 32632, 1e4, 1.0, (), "", ()
+    )
+
+
+def commands(mission):
+    return [item.command for item in mission.items]
+
+
+@BOTH
+def test_a_sortie_takes_off_triggers_on_its_legs_and_comes_home(autopilot):
+    plan = make_plan()
+    mission = sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
+    flown = mission.items[mission.first_seq :]
+    assert [item.command for item in flown] == [
+        TAKEOFF, 178, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT,
+        TRIGGER_DISTANCE, WAYPOINT, RTL,
+    ]  # fmt: skip
+    sections = trigger_sections(mission.items)
+    assert [distance for _, _, distance in sections] == [12.5, 12.5]
+    for begin, end, _ in sections:  # right behind a leg's first waypoint, and right behind its last
+        assert commands(mission)[begin - 1] == WAYPOINT and commands(mission)[begin + 1 : end] == [WAYPOINT]
+    assert mission.ending is Ending.RTL
+    assert not unflyable(mission.items, autopilot, in_air=False)
+
+
+def test_item_zero_is_home_on_ardupilot_and_flown_on_px4():
+    plan = make_plan()
+    sortie = plan.vehicles[0].sorties[0]
+    ardupilot, px4 = (sortie_mission(plan, sortie, autopilot) for autopilot in (AP, PX4))
+    assert len(ardupilot) == len(px4) + 1
+    home = ardupilot.items[0]
+    assert (home.command, home.frame, home.lat_deg, home.lon_deg) == (WAYPOINT, 0, 47.3977, 8.5456)
+    assert commands(px4)[0] == TAKEOFF and commands(ardupilot)[1] == TAKEOFF
+    # NaN is refused by ArduPilot; 0 would turn PX4's nose north
+    assert not any(math.isnan(value) for item in ardupilot.items for value in item.params)
+    assert all(math.isnan(item.params[3]) for item in px4.items if item.command in (WAYPOINT, TAKEOFF))
+    assert unflyable(px4.items, AP, in_air=False) and unflyable(ardupilot.items, PX4, in_air=False)
+
+
+@pytest.mark.parametrize(("end", "ending"), [("rtl", Ending.RTL), ("land", Ending.LAND), ("hover", Ending.WAYPOINT)])
+@BOTH
+def test_endings_are_known(autopilot, end, ending):
+    plan = make_plan(end)
+    assert sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot).ending is ending
+
+
+def test_the_last_nav_item_decides_the_ending():
+    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(LAND), MissionItem(TRIGGER_DISTANCE))).ending is Ending.LAND
+    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(LOITER_UNLIM))).ending is Ending.NEVER
+    assert Mission(AP, (MissionItem(WAYPOINT),)).final_seq is None
+    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(WAYPOINT), MissionItem(206))).final_seq == 1
+
+
+@pytest.mark.parametrize("suffix", [".plan", ".waypoints"])
+@pytest.mark.parametrize("written_for", ["ardupilot", "px4"])
+@BOTH
+def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, written_for, suffix):
+    plan = make_plan()
+    sortie = plan.vehicles[0].sorties[0]
+    items = mission_files.sortie_items(plan, sortie, written_for)
+    home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
+    if suffix == ".plan":
+        text = mission_files.plan_text(items, home, written_for, 8.0)
+    else:
+        text = mission_files.waypoints_text(items, home)
+    path = tmp_path / f"v1{suffix}"
+    path.write_text(text)
+    read, made = read_mission(path, autopilot), sortie_mission(plan, sortie, autopilot)
+    assert repr(read.items) == repr(made.items)  # NaN equals NaN here
+
+
+@BOTH
+def test_a_vehicle_stores_what_is_built(autopilot):
+    plan = make_plan()
+    mission = sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
+    store = MissionStore(autopilot, MissionItem(WAYPOINT))
+    assert all(store._check(item, len(mission)) == 0 for item in mission.items)
+
+
+def test_what_cannot_be_flown_is_refused_before_anything_is_sent(tmp_path):
+    item = mission_files.MissionItem
+    with pytest.raises(InputError, match="no items"):
+        build_mission(PX4, [], name="empty.plan")
+    with pytest.raises(InputError, match="no place"):
+        build_mission(PX4, [item(WAYPOINT, 3, lat_deg=95.0, lon_deg=8.0, alt_m=20.0)])
+    with pytest.raises(InputError, match="height"):
+        build_mission(AP, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=2e6)])
+    with pytest.raises(InputError, match="650"):
+        build_mission(AP, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)
+    assert len(build_mission(PX4, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)) == 700
+    with pytest.raises(InputError, match="cannot be read"):
+        read_mission(tmp_path / "absent.plan", AP)
+    junk = tmp_path / "junk.plan"
+    junk.write_bytes(bytes(range(256)))
+    with pytest.raises(InputError):
+        read_mission(junk, AP)
+
+
+finite = st.floats(-1e4, 1e4, width=32)
+
+
+@given(
+    st.sampled_from([16, 17, 20, 21, 22, 178, 206, 177, 93]),
+    st.sampled_from([0, 2, 3, 6, 10]),
+    st.tuples(finite, finite, finite, st.one_of(finite, st.just(math.nan))),
+    st.integers(-900_000_000, 900_000_000),
+    st.integers(-1_800_000_000, 1_800_000_000),
+    st.floats(-1000, 9000, width=32),
+)
+@settings(max_examples=150, deadline=None)
+def test_an_item_survives_the_wire(command, frame, params, x, y, z):
+    item = MissionItem(command, frame, params, x, y, z)
+    raw = item.message(5, 1, 1).pack(dialect.MAVLink(None, 255, 190))
+    (packet,) = Framer().feed(raw)
+    assert packet.message.seq == 5
+    assert repr(MissionItem.of(packet.message)) == repr(item)
+
+
+def test_an_old_item_with_degrees_in_floats_is_understood():
+    old = dialect.MAVLink_mission_item_message(1, 1, 2, 3, 16, 0, 1, 0, 0, 0, 0, 47.5, 8.25, 30.0, 0)
+    item = MissionItem.of(old)
+    assert (item.lat_deg, item.lon_deg, item.z) == (47.5, 8.25, 30.0)
+
+
+def test_commands_have_names():
+    assert command_name(206) == "DO_SET_CAM_TRIGG_DIST" and command_name(31999) == "command 31999"
