@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import telemetry
-from gcs_plugin.cli.verbs.evaluate import read_truth
+from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.matchers.patch_registration import apply
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import LocalGrid

@@ -38,7 +38,7 @@ def run_accuracy(
 
 def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map: bool) -> dict[str, Any]:
     """One set mapped by one method and compared with the truth; a failure is a row with its message."""
-    from gcs_plugin.cli.verbs.evaluate import evaluate_poses
+    from orthoswarm.evaluation.true_cameras import evaluate_poses
     from orthoswarm.model.errors import OrthoSwarmError
 
     out = out.with_name(f"map-{folder.absolute().name}-{method}")
@@ -63,7 +63,7 @@ def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map:
 
 def judged(product: Path, folder: Path) -> dict[str, Any]:
     """The figures of `orthoswarm evaluate` for a map of a set."""
-    from gcs_plugin.cli.verbs.evaluate import evaluate_ortho
+    from orthoswarm.evaluation.orthoimage import evaluate_ortho
 
     truth = folder / "truth"
     mask = truth / "ground_mask.tif"
@@ -80,7 +80,7 @@ def true_orthoimage(folder: Path, out: Path, photos: Path | None = None) -> dict
     from time import perf_counter, process_time
 
     import telemetry
-    from gcs_plugin.cli.verbs.evaluate import read_truth
+    from orthoswarm.evaluation.true_cameras import read_truth
     from orthoswarm.model.errors import InputError
     from orthoswarm.model.placement import PlacedFrame
 

@@ -4,6 +4,7 @@ import argparse
 import importlib
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 
@@ -27,6 +28,8 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
 }
+
+_NEGATIVE = re.compile(r"-[0-9.]")
 
 
 def _overview() -> str:
@@ -58,6 +61,18 @@ def _open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def _join_negative_values(args: Sequence[str]) -> list[str]:
+    """`--start -35.36,149.17` as `--start=-35.36,149.17`: argparse takes a value with a leading minus for a flag."""
+    joined: list[str] = []
+    for argument in args:
+        flag = joined[-1] if joined else ""
+        if _NEGATIVE.match(argument) and flag.startswith("--") and "=" not in flag and flag != "--":
+            joined[-1] = f"{flag}={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code (0 made, 1 nothing could be made, 2 wrong input, 130 interrupted)."""
     _open_streams()
@@ -80,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     module.configure(parser)
     try:
-        parsed = parser.parse_args(args[1:])
+        parsed = parser.parse_args(_join_negative_values(args[1:]))
     except SystemExit as stop:
         return int(stop.code or 0)
     if getattr(parsed, "json", False) and isinstance(sys.stdout, io.TextIOWrapper):

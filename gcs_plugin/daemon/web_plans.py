@@ -12,17 +12,15 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.worker_pool import Crew
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.plans.plan_request import ENDS, METHODS, MOST_ITEMS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
-_NUMBERS: Final = {
-    "altitude_m": "--altitude", "fov_min_deg": "--fov-min", "speed_m_s": "--speed", "endurance_min": "--endurance",
-    "side_overlap": "--side-overlap", "forward_overlap": "--forward-overlap", "separation_m": "--separation",
-    "clearance_m": "--clearance",
-}  # fmt: skip
-_CHOICES: Final = {
-    "method": ("columns", "bcd", "tmstc"), "autopilot": ("ardupilot", "px4"), "end": ("rtl", "land", "hover"),
-}  # fmt: skip
+_NUMBERS: Final = (
+    "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
+    "clearance_m",
+)  # fmt: skip
+_CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS}
 
 
 class Plans:
@@ -41,7 +39,7 @@ class Plans:
         Raises:
             InputError: the area or a value is of no use.
         """
-        arguments = _arguments(body)
+        values = _values(body)
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
@@ -50,7 +48,9 @@ class Plans:
         path.mkdir(parents=True)
         try:
             (path / "area.geojson").write_text(json.dumps(area), encoding="utf-8")
-            figures: dict[str, Any] = crew.run(plan_into, (path, arguments)) | {"id": name}
+            figures: dict[str, Any] = crew.run(plan_into, PlanRequest(area=path / "area.geojson", **values)) | {
+                "id": name
+            }
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
             raise
@@ -113,50 +113,46 @@ class Plans:
         return self.folder / name
 
 
-def _arguments(body: Mapping[str, Any]) -> list[str]:
-    """The request's values as arguments of `orthoswarm plan`."""
+def _values(body: Mapping[str, Any]) -> dict[str, Any]:
+    """The request's values as fields of a PlanRequest.
+
+    Raises:
+        InputError: one is missing or of no use.
+    """
     count = body.get("vehicles")
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 250:
         raise InputError("vehicles is missing; send a number from 1 to 250")
-    arguments = ["--vehicles", str(count)]
-    for key, flag in _NUMBERS.items():
+    values: dict[str, Any] = {"vehicles": count}
+    for key in _NUMBERS:
         value = body.get(key)
         if value is None and key not in ("altitude_m", "fov_min_deg"):
             continue
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"{key} is missing or no number; send one")
-        arguments.append(f"{flag}={value!r}")
+        values[key] = float(value)
     for key, choices in _CHOICES.items():
         if key in body:
             if body[key] not in choices:
                 raise InputError(f"{key} is none of {', '.join(choices)}; choose one")
-            arguments += [f"--{key}", body[key]]
+            values[key] = body[key]
     starts = body.get("starts", [])
-    if not isinstance(starts, list):
+    if not isinstance(starts, list) or not all(_is_position(start) for start in starts):
         raise InputError("starts is no list of [latitude, longitude]; send one")
-    for start in starts:
-        good = isinstance(start, list | tuple) and len(start) == 2 and all(isinstance(v, int | float) for v in start)
-        if not good:
-            raise InputError("starts is no list of [latitude, longitude]; send one")
-        arguments.append(f"--start={float(start[0])!r},{float(start[1])!r}")
-    return arguments
+    return values | {"starts": [(float(lat), float(lon)) for lat, lon in starts]}
 
 
-def plan_into(task: tuple[Path, list[str]]) -> dict[str, Any]:
-    """Plan in a worker and write the folder; gives the figures."""
-    import argparse
+def _is_position(start: Any) -> bool:
+    return isinstance(start, list | tuple) and len(start) == 2 and all(isinstance(v, int | float) for v in start)
 
-    from gcs_plugin.cli.verbs import plan as command
+
+def plan_into(request: PlanRequest) -> dict[str, Any]:
+    """Plan in a worker and write the folder of the request's area; gives the figures."""
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
-    folder, arguments = task
-    parser = argparse.ArgumentParser(exit_on_error=False)
-    command.configure(parser)
-    args = parser.parse_args([str(folder / "area.geojson"), "--out", str(folder), *arguments])
-    plan, area = command.make_plan(args)
-    figures = report(plan, args.autopilot)
-    files: dict[str, str | bytes] = dict(mission_files(plan, args.autopilot))
+    plan, area = make_plan(request)
+    figures = report(plan, request.autopilot)
+    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilot))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
-    write_folder(folder, files)
+    write_folder(request.area.parent, files)
     return figures

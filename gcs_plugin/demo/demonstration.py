@@ -242,7 +242,7 @@ def _wait(done: Callable[[], bool], limit_s: float, what: str) -> None:
 
 def _measure(setting: Setting, out: Path, end: dict[str, Any], wall_s: float) -> dict[str, Any]:
     """Compare the orthoimages with the truth, and put the figures into the report."""
-    from gcs_plugin.cli.verbs.evaluate import evaluate_ortho, find_mask
+    from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask
     from orthoswarm.export.product_files import write_json
 
     reference = out / "twin" / "truth" / "reference.tif"

@@ -21,9 +21,9 @@ from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import Workers, trim_memory
+from orthoswarm.export.atomic_file import disk_error, written_whole
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
-from orthoswarm.model.atomic_file import disk_error, written_whole
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import GroundGrid, LocalGrid

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any, Generic, TypeVar
 
 from orthoswarm import __version__
-from orthoswarm.model.atomic_file import disk_error, written_whole
+from orthoswarm.export.atomic_file import disk_error, written_whole
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 

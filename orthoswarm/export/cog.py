@@ -21,7 +21,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
-from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.errors import InputError
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.export.atomic_file import written_whole
 
 Array = NDArray[np.float64]
 Feature = tuple[Mapping[str, Any], Array]

@@ -12,8 +12,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.mbtiles import encode_tile
-from orthoswarm.model.atomic_file import written_whole
 from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.model.atomic_file import disk_error, written_whole
+from orthoswarm.export.atomic_file import disk_error, written_whole
 from orthoswarm.model.errors import InputError
 
 

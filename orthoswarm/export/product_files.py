@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.stage_times import Stage
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.model.angles import wrap_deg
-from orthoswarm.model.atomic_file import written_whole
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid

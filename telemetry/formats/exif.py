@@ -11,6 +11,8 @@ import re
 import struct
 from dataclasses import dataclass, field
 
+from telemetry.samples.sample import is_position
+
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
 Buffer = bytes | mmap.mmap
@@ -130,17 +132,6 @@ def gps_position(gps: Tags) -> tuple[float, float] | None:
     lat = -abs(lat) if text(gps.get(1)).upper().startswith("S") else lat
     lon = -abs(lon) if text(gps.get(3)).upper().startswith("W") else lon
     return (lat, lon) if is_position(lat, lon) else None
-
-
-def is_position(lat_deg: float, lon_deg: float) -> bool:
-    """Whether a pair can be a real position: finite, in range and not 0, 0."""
-    return (
-        math.isfinite(lat_deg)
-        and math.isfinite(lon_deg)
-        and abs(lat_deg) <= 90.0
-        and abs(lon_deg) <= 180.0
-        and (abs(lat_deg) > 1e-6 or abs(lon_deg) > 1e-6)
-    )
 
 
 def _sexagesimal(value: Value | None) -> float | None:

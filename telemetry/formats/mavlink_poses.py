@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.exif import is_position
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
-from telemetry.samples.sample import Sample, checked
+from telemetry.samples.sample import Sample, checked, is_position
 
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5

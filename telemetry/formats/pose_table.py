@@ -17,6 +17,7 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from telemetry.formats import exif
+from telemetry.samples.sample import is_position
 
 _MAX_BYTES = 256 << 20
 
@@ -142,7 +143,7 @@ def _to_geographic(table: PoseTable, projection: str, path: Path) -> None:
     except ProjError as error:
         raise InputError(f"{path.name}: the projection '{projection}' is not understood ({error})") from None
     for row, x, y in zip(table.values(), lon, lat, strict=True):
-        if exif.is_position(y, x):
+        if is_position(y, x):
             row.lon_deg, row.lat_deg = float(x), float(y)
         else:
             row.lon_deg = row.lat_deg = None
@@ -209,6 +210,6 @@ def _csv_row(header: list[str], cells: list[str]) -> tuple[str, PoseRow] | None:
             continue
         if math.isfinite(value):
             setattr(row, key, value)
-    if row.lat_deg is None or row.lon_deg is None or not exif.is_position(row.lat_deg, row.lon_deg):
+    if row.lat_deg is None or row.lon_deg is None or not is_position(row.lat_deg, row.lon_deg):
         row.lat_deg = row.lon_deg = None
     return name.lower(), row

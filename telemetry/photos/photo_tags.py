@@ -14,6 +14,7 @@ from typing import Any
 from telemetry.formats import exif, xmp
 from telemetry.formats.makernotes import parse_dji
 from telemetry.formats.picture_container import Container, NotAPicture, read_container
+from telemetry.samples.sample import is_position
 
 Angles = tuple[float | None, float | None, float | None]
 """Yaw, pitch, roll in degrees, as recorded."""
@@ -133,7 +134,7 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     if position is None:
         lat = xmp.number(found, "drone-dji:GpsLatitude", "drone-dji:Latitude")
         lon = xmp.number(found, "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude")
-        if lat is not None and lon is not None and exif.is_position(lat, lon):
+        if lat is not None and lon is not None and is_position(lat, lon):
             position, source = (lat, lon), "XMP position"
     if position is not None:
         photo.lat_deg, photo.lon_deg = position

@@ -3,8 +3,6 @@
 import math
 from dataclasses import dataclass, fields
 
-from telemetry.formats.exif import is_position
-
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 
 
@@ -90,3 +88,14 @@ def checked(sample: Sample) -> Sample | None:
         sample.vehicle = "".join(c for c in sample.vehicle if c.isprintable()).strip()[:64] or None
     empty = all(getattr(sample, name) is None for name in _NAMES if name not in ("height_is_ground", "number"))
     return None if empty else sample
+
+
+def is_position(lat_deg: float, lon_deg: float) -> bool:
+    """Whether a pair can be a real position: finite, in range and not 0, 0."""
+    return (
+        math.isfinite(lat_deg)
+        and math.isfinite(lon_deg)
+        and abs(lat_deg) <= 90.0
+        and abs(lon_deg) <= 180.0
+        and (abs(lat_deg) > 1e-6 or abs(lon_deg) > 1e-6)
+    )

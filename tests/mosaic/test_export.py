@@ -15,13 +15,13 @@ from rasterio.warp import transform, transform_bounds
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export import cog
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.cog import TILE_PX, write_cog
 from orthoswarm.export.cog_conversion import convert_cog
 from orthoswarm.export.kmz import write_kmz
 from orthoswarm.export.mbtiles import write_mbtiles
 from orthoswarm.export.odm_folder import unique_names, write_odm
 from orthoswarm.export.product_files import iso_time, simple_lens
-from orthoswarm.model.atomic_file import written_whole
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.evaluate import read_truth
+from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.picture_file import read_gray

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.evaluate import evaluate_ortho, find_mask
 from gcs_plugin.demo.city_site import area_of, away_m, place_spec, read_spec
 from gcs_plugin.demo.following_camera import LATE_S, Shutter, open_outlet
 from gcs_plugin.demo.simulated_camera import VideoSender, VideoServer
@@ -26,6 +25,7 @@ from gcs_plugin.demo.simulator import PacedClock
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, utm_epsg
 from telemetry.live.live_stream import open_stream

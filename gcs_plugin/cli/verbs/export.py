@@ -97,7 +97,7 @@ def _kmz(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> 
 def _gpkg(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
     import shutil
 
-    from orthoswarm.model.atomic_file import written_whole
+    from orthoswarm.export.atomic_file import written_whole
     from orthoswarm.model.errors import InputError
 
     source = args.map / "footprints.gpkg"

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,20 +9,8 @@ from typing import TYPE_CHECKING, Any
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
+    from gcs_plugin.plans.plan_request import PlanRequest
     from orthoswarm.model.plan import Plan
-    from orthoswarm.planning.area.area import Area
-    from orthoswarm.planning.area.shape_files import Ring, Shapes
-
-_KINDS = {
-    ".geojson": "GeoJSON",
-    ".json": "GeoJSON",
-    ".kml": "KML",
-    ".kmz": "KMZ",
-    ".plan": "a mission",
-    ".waypoints": "a mission",
-}
-_LARGEST_BYTES = 50_000_000
-_MOST_ITEMS = {"ardupilot": 650, "px4": 1900}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
     add("--json", action="store_true", help="one JSON document on stdout")
     flight = parser.add_argument_group("flight")
-    start_help = "takeoff point; give it again for more (default: at each vehicle's first line; --start=-33.9,18.4)"
+    start_help = "takeoff point; give it again for more (default: at each vehicle's first line; for example -33.9,18.4)"
     flight.add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
     flight.add_argument(
         "--end", choices=["rtl", "land", "hover"], default="rtl", help="after the last line (default rtl)"
@@ -77,9 +64,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Plan, write the folder, print the figures."""
     from gcs_plugin.plans.plan_files import check_folder, geojson, mission_files, report, write_folder
+    from gcs_plugin.plans.plan_request import make_plan
 
     check_folder(args.out)
-    plan, area = make_plan(args)
+    plan, area = make_plan(_request(args), _say)
     _say("files")
     from gcs_plugin.plans.plan_picture import draw
 
@@ -99,125 +87,33 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def make_plan(args: argparse.Namespace) -> tuple["Plan", "Area | None"]:
-    """The plan that the arguments ask for, and its area (None along lines without no-fly zones)."""
-    from orthoswarm.planning.area.area import Area, make_area
-    from orthoswarm.planning.lines.line_spacing import footprint
-    from orthoswarm.planning.planner import plan_area, plan_lines
-    from orthoswarm.planning.sorties.assignment import Options
-    from orthoswarm.planning.sorties.deconfliction import Separation
-    from orthoswarm.planning.sorties.flight_time import Motion
+def _request(args: argparse.Namespace) -> "PlanRequest":
+    """The arguments as a value."""
+    from gcs_plugin.plans.plan_request import PlanRequest
 
-    foot = footprint(
-        args.altitude, math.radians(args.fov_min), _aspect(args.aspect), args.side_overlap, args.forward_overlap
-    )
-    if not 0.0 <= args.swap < math.inf:
-        raise InputError(f"the time to change a battery is {args.swap:g} min; give 0 or more")
-    ceiling = args.altitude + 4 * args.height_step if args.ceiling is None else args.ceiling
-    if not ceiling >= args.altitude:
-        raise InputError(f"the ceiling of {ceiling:g} m is below the altitude of {args.altitude:g} m; raise it")
-    layers = int(min(12.0, (ceiling - args.altitude) / args.height_step + 1e-9)) if args.height_step > 0 else 0
-    options = Options(
-        motion=Motion() if args.speed is None else Motion(speed_m_s=args.speed),
+    return PlanRequest(
+        area=args.area,
+        vehicles=args.vehicles,
+        altitude_m=args.altitude,
+        fov_min_deg=args.fov_min,
+        no_fly=args.no_fly,
+        method=args.method,
+        autopilot=args.autopilot,
         end=args.end,
         starts=[_position(text) for text in args.start],
-        endurance_s=math.inf if args.endurance is None else 60.0 * args.endurance,
-        clearance_m=args.clearance,
-        separation=Separation(args.separation, args.height_step, layers, swap_s=60.0 * args.swap),
-        most_items=_MOST_ITEMS[args.autopilot],
+        speed_m_s=args.speed,
         run_in_m=args.run_in,
+        endurance_min=args.endurance,
+        swap_min=args.swap,
+        side_overlap=args.side_overlap,
+        forward_overlap=args.forward_overlap,
+        aspect=_aspect(args.aspect),
+        clearance_m=args.clearance,
+        separation_m=args.separation,
+        height_step_m=args.height_step,
+        ceiling_m=args.ceiling,
+        follow=args.follow,
     )
-    _say("area")
-    shapes, no_fly = read_shapes(args.area)
-    for path in args.no_fly:
-        further, fences = read_shapes(path)
-        if not further.polygons and not fences:
-            raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
-        no_fly += [*(p.shell for p in further.polygons), *fences]
-    if shapes.polygons and not args.follow:
-        area = make_area(shapes.polygons, no_fly)
-        return plan_area(area, args.vehicles, args.altitude, foot, args.method, options, _say), area
-    if not shapes.lines:
-        raise InputError(f"{args.area} holds no {'line' if shapes.polygons else 'polygon and no line'}; draw one in it")
-    zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
-    return plan_lines(shapes.lines, args.vehicles, args.altitude, foot, zones, options, _say), zones
-
-
-def _zones_only(lines: "tuple[Ring, ...]", no_fly: "list[Ring]") -> "Area":
-    """An area without ground that carries the no-fly zones."""
-    import numpy as np
-    import shapely
-
-    from orthoswarm.model.geo import LocalGrid, area_epsg
-    from orthoswarm.planning.area.area import Area, make_area
-    from orthoswarm.planning.area.shape_files import Polygon
-
-    points = np.concatenate(lines)
-    grid = LocalGrid(area_epsg(points[:, 0], points[:, 1]))
-    checked = [make_area([Polygon(zone)]) for zone in no_fly]  # says what is wrong with a zone
-    zones = [shapely.transform(c.ground, lambda p, c=c: grid.to_grid(*c.grid.to_geographic(p).T)) for c in checked]
-    return Area(grid, shapely.MultiPolygon(), shapely.MultiPolygon(list(shapely.get_parts(shapely.union_all(zones)))))
-
-
-def read_shapes(path: Path) -> "tuple[Shapes, list[Ring]]":
-    """Polygons and lines of a file, and rings of its exclusion fences; what the file is decides its content.
-
-    Raises:
-        InputError: it cannot be read, or its name promises something else.
-    """
-    from gcs_plugin.mission.mission_files import parse_mission
-    from orthoswarm.planning.area.shape_files import Polygon, Shapes, parse_geojson, parse_kml, ring
-
-    text, kind = _read(path)
-    promised = _KINDS.get(path.suffix.lower(), kind)
-    if promised != kind:
-        raise InputError(f"{path} is {promised} by its name but holds {kind}; rename it or give the right file")
-    if kind == "GeoJSON":
-        return parse_geojson(text, str(path)), []
-    if kind in ("KML", "KMZ"):
-        return parse_kml(text, str(path)), []
-    mission = parse_mission(text, str(path))
-    polygons = tuple(Polygon(ring(survey, str(path))) for survey in mission.surveys)
-    lines = tuple(ring(line, str(path), 2) for line in (mission.polylines or mission.lines()))
-    return Shapes(polygons, lines), [ring(zone, str(path)) for zone in mission.no_fly]
-
-
-def _read(path: Path) -> tuple[str, str]:
-    """A file's text and what it seems to be."""
-    import zipfile
-
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise InputError(f"{path} is larger than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
-        data = path.read_bytes()
-        kmz = data.startswith(b"PK\x03\x04")
-        if kmz:
-            with zipfile.ZipFile(path) as archive:
-                inside = [i for i in archive.infolist() if i.filename.lower().endswith(".kml")]
-                if not inside or inside[0].file_size > _LARGEST_BYTES:
-                    raise InputError(f"{path} is a ZIP without a usable KML in it; export it again")
-                data = archive.read(inside[0])
-        text = data.decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
-    except (UnicodeDecodeError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
-        raise InputError(f"{path} is no text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan") from None
-    head = text.lstrip()
-    if head.startswith("QGC WPL"):
-        return text, "a mission"
-    if head.startswith("<"):
-        return text, "KMZ" if kmz else "KML"
-    if head.startswith("{"):
-        return text, "a mission" if _is_mission(text, path) else "GeoJSON"
-    raise InputError(f"{path} holds neither GeoJSON, KML, a .plan nor a .waypoints mission; export the polygon again")
-
-
-def _is_mission(text: str, path: Path) -> bool:
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON ({error}); export it again") from None
-    return isinstance(document, dict) and document.get("fileType") == "Plan"
 
 
 def _aspect(text: str) -> float:

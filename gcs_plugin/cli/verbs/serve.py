@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from gcs_plugin.daemon.settings import FILE, TEMPLATE
-    from orthoswarm.model.atomic_file import disk_error
+    from orthoswarm.export.atomic_file import disk_error
     from orthoswarm.model.errors import InputError
 
     if args.workspace.exists() and not args.workspace.is_dir():

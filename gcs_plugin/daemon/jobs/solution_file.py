@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.layers.layers import Bounds, union
-from orthoswarm.model.atomic_file import written_whole
+from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.color_balance import estimate_gains
 from orthoswarm.mosaic.footprint import footprint_boxes

@@ -85,8 +85,8 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
     """
     import shutil
 
+    from orthoswarm.export.atomic_file import written_whole
     from orthoswarm.export.cog import write_cog
-    from orthoswarm.model.atomic_file import written_whole
     from orthoswarm.mosaic.extent import drawn_window
 
     made: list[str] = []

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from orthoswarm.model.atomic_file import disk_error
+from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}

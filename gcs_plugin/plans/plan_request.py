@@ -1,0 +1,135 @@
+"""A plan from the values that a user gives, on the command line or over HTTP."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import shapely
+
+from gcs_plugin.mission.mission_files import Autopilot
+from gcs_plugin.plans.area_files import read_shapes
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.plan import End, Plan
+from orthoswarm.planning.area.area import Area, make_area
+from orthoswarm.planning.area.shape_files import Polygon, Ring
+from orthoswarm.planning.lines.candidates import Method
+from orthoswarm.planning.lines.line_spacing import footprint
+from orthoswarm.planning.planner import plan_area, plan_lines
+from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.deconfliction import Separation
+from orthoswarm.planning.sorties.flight_time import Motion
+
+MOST_ITEMS: Final[dict[Autopilot, int]] = {"ardupilot": 650, "px4": 1900}
+"""Mission items that an autopilot stores (ArduPilot: measured; PX4: its dataman's table)."""
+METHODS: Final = ("columns", "bcd", "tmstc")
+ENDS: Final = ("rtl", "land", "hover")
+_MOST_LAYERS: Final = 12.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanRequest:
+    """What a plan is made of; the defaults are those of `orthoswarm plan`.
+
+    Attributes:
+        area: file of a polygon to cover, or of a line to follow. no_fly: files of further no-fly zones.
+        vehicles: how many. altitude_m: height of the lines above takeoff. fov_min_deg: theta-hat, the smallest
+            horizontal field of view in the swarm.
+        method: how lines are laid. autopilot: whose dialect. end: what follows the last line.
+        starts: takeoff points (latitude, longitude) in degrees; none: where each vehicle's first line begins.
+        speed_m_s: ground speed, None for the default. run_in_m: straight flight before a leg's first picture.
+        endurance_min: longest flight, None without a limit. swap_min: time to change a battery.
+        side_overlap, forward_overlap: shares of a picture. aspect: a picture's width over its height.
+        clearance_m: distance to no-fly zones, None for the default. separation_m: between vehicles.
+        height_step_m: between the heights of ways out and home. ceiling_m: the highest of them, None for four steps
+            above the lines.
+        follow: follow the lines of a file that has polygons, too.
+    """
+
+    area: Path
+    vehicles: int
+    altitude_m: float
+    fov_min_deg: float
+    no_fly: Sequence[Path] = ()
+    method: Method = "bcd"
+    autopilot: Autopilot = "ardupilot"
+    end: End = "rtl"
+    starts: Sequence[tuple[float, float]] = ()
+    speed_m_s: float | None = None
+    run_in_m: float = 0.0
+    endurance_min: float | None = None
+    swap_min: float = 2.0
+    side_overlap: float = 0.4
+    forward_overlap: float = 0.8
+    aspect: float = 4.0 / 3.0
+    clearance_m: float | None = None
+    separation_m: float = 10.0
+    height_step_m: float = 5.0
+    ceiling_m: float | None = None
+    follow: bool = False
+
+    def flight_options(self) -> Options:
+        """How the flights are to be.
+
+        Raises:
+            InputError: a value means nothing.
+        """
+        if not 0.0 <= self.swap_min < math.inf:
+            raise InputError(f"the time to change a battery is {self.swap_min:g} min; give 0 or more")
+        ceiling = self.altitude_m + 4 * self.height_step_m if self.ceiling_m is None else self.ceiling_m
+        if not ceiling >= self.altitude_m:
+            raise InputError(f"the ceiling of {ceiling:g} m is below the altitude of {self.altitude_m:g} m; raise it")
+        step = self.height_step_m
+        layers = int(min(_MOST_LAYERS, (ceiling - self.altitude_m) / step + 1e-9)) if step > 0 else 0
+        return Options(
+            motion=Motion() if self.speed_m_s is None else Motion(speed_m_s=self.speed_m_s),
+            end=self.end,
+            starts=list(self.starts),
+            endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
+            clearance_m=self.clearance_m,
+            separation=Separation(self.separation_m, step, layers, swap_s=60.0 * self.swap_min),
+            most_items=MOST_ITEMS[self.autopilot],
+            run_in_m=self.run_in_m,
+        )
+
+
+def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: None) -> tuple[Plan, Area | None]:
+    """The plan that a request asks for, and its area (None along lines without no-fly zones).
+
+    Args:
+        request: what to plan. progress: called with what is being done.
+
+    Raises:
+        InputError: a file or a value is of no use.
+    """
+    fov = math.radians(request.fov_min_deg)
+    foot = footprint(request.altitude_m, fov, request.aspect, request.side_overlap, request.forward_overlap)
+    options = request.flight_options()
+    progress("area")
+    shapes, no_fly = read_shapes(request.area)
+    for path in request.no_fly:
+        further, fences = read_shapes(path)
+        if not further.polygons and not fences:
+            raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
+        no_fly += [*(p.shell for p in further.polygons), *fences]
+    if shapes.polygons and not request.follow:
+        area = make_area(shapes.polygons, no_fly)
+        plan = plan_area(area, request.vehicles, request.altitude_m, foot, request.method, options, progress)
+        return plan, area
+    if not shapes.lines:
+        what = "line" if shapes.polygons else "polygon and no line"
+        raise InputError(f"{request.area} holds no {what}; draw one in it")
+    zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
+    return plan_lines(shapes.lines, request.vehicles, request.altitude_m, foot, zones, options, progress), zones
+
+
+def _zones_only(lines: tuple[Ring, ...], no_fly: list[Ring]) -> Area:
+    """An area without ground that carries the no-fly zones."""
+    points = np.concatenate(lines)
+    grid = LocalGrid(area_epsg(points[:, 0], points[:, 1]))
+    checked = [make_area([Polygon(zone)]) for zone in no_fly]  # says what is wrong with a zone
+    zones = [shapely.transform(c.ground, lambda p, c=c: grid.to_grid(*c.grid.to_geographic(p).T)) for c in checked]
+    return Area(grid, shapely.MultiPolygon(), shapely.MultiPolygon(list(shapely.get_parts(shapely.union_all(zones)))))
