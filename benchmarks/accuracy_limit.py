@@ -16,7 +16,7 @@ from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.matchers.patch_registration import apply
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.recorded_pose import area_grid
+from orthoswarm.mosaic.recorded_pose import area_grid
 from orthoswarm.paper.leg_lines import find_legs, fit_line
 from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.strategy.swarm_refiner import local_origin

@@ -21,6 +21,7 @@ from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import Workers, trim_memory
+from orthoswarm.config import Overrides, override
 from orthoswarm.export.atomic_file import disk_error, written_whole
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
@@ -28,12 +29,12 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
-from orthoswarm.model.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
 from orthoswarm.mosaic.color_balance import estimate_gains
 from orthoswarm.mosaic.extent import drawn_window, from_takeoff, ground_level, map_offset, partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import loose, strays, told
 from orthoswarm.mosaic.realtime import mosaic
+from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
 from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem, read_dem
@@ -66,6 +67,7 @@ class Options:
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
         dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
         gains: even out brightness between pictures.
+        config: thresholds of the refiner in the place of their defaults.
     """
 
     basemap: Path | None = None
@@ -76,6 +78,7 @@ class Options:
     dem: Path | None = None
     split_legs: bool = False
     gains: bool = True
+    config: Overrides = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -133,6 +136,7 @@ class _Batch:
     def run(self, load: Load) -> dict[str, Any]:
         if self.options.basemap is not None and not self.options.basemap.exists():
             raise InputError(f"the basemap {self.options.basemap} does not exist; check the path")
+        override(self.options.config)
         with Workspace(self.out) as self.space:
             with self.clock.stage("load") as stage:
                 state = self.load(load)
@@ -488,6 +492,7 @@ class _Batch:
             "covered_share": state.drawn[1],
             "basemap": str(self.options.basemap) if state.basemap else None,
             "until": self.options.until,
+            "config": {stage: dict(values) for stage, values in self.options.config.items()},
             "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],
             "root": image_root(state.ingest.frames),
             **({"equation_5": state.equation_5} if state.equation_5 else {}),

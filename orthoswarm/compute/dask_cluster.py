@@ -19,6 +19,7 @@ from uuid import uuid4
 
 from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, single_threaded
+from orthoswarm.config import overridden, override
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Item = TypeVar("Item")
@@ -111,7 +112,7 @@ class Cluster:
         return known
 
     def _submit(self, function: Callable[[Any], Any], item: Any) -> Any:
-        payload = pickle.dumps((function, item), pickle.HIGHEST_PROTOCOL)
+        payload = pickle.dumps((function, item, overridden()), pickle.HIGHEST_PROTOCOL)
         # A name of its own, so that equal items are worked on each, as in Processes.
         return self._client.submit(_work, payload, key=f"orthoswarm-{uuid4().hex}", pure=False)
 
@@ -190,7 +191,8 @@ def _short(error: BaseException) -> str:
 def _work(payload: bytes) -> _Outcome:
     """Runs on a worker."""
     single_threaded()
-    function, item = pickle.loads(payload)
+    function, item, config = pickle.loads(payload)
+    override(config)
     raised = False
     try:
         value = pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)

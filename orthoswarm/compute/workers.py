@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
+from orthoswarm.config import Overrides, overridden, override
 from orthoswarm.model.errors import OrthoSwarmError
 
 Item = TypeVar("Item")
@@ -108,7 +109,7 @@ class Processes:
             while True:
                 while sum(not f.done() for f in queue) < self.count and len(queue) < 4 * self.count:
                     for item in source:
-                        queue.append(self._started().submit(_measured, function, item))
+                        queue.append(self._started().submit(_measured, function, item, overridden()))
                         break
                     else:
                         break
@@ -177,7 +178,8 @@ class _Outcome(Generic[Result]):
     rss_mb: float
 
 
-def _measured(function: Callable[[Item], Result], item: Item) -> _Outcome[Result]:
+def _measured(function: Callable[[Item], Result], item: Item, config: Overrides) -> _Outcome[Result]:
+    override(config)
     value = _tidily(function, item)
     return _Outcome(value, os.getpid(), time.process_time(), peak_rss_mb())
 

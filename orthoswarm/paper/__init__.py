@@ -1,6 +1,6 @@
 """The paper's own refiner, as written: lines, scale and field of view (III.C), leg patches on the map (III.D).
 
-It is here to be compared with; the default refiner (orthoswarm.swarm) is more accurate. docs/method.md tells where
+It is here to be compared with; the default refiner (orthoswarm.refine) is more accurate. docs/method.md tells where
 the paper is ambiguous and what is done about it.
 """
 

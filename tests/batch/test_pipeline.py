@@ -18,8 +18,8 @@ from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.export import cog
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.model.recorded_pose import recorded_cameras
 from orthoswarm.mosaic.extent import from_takeoff, ground_level, map_offset
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.report.page import write_page
 from telemetry import LoadOptions, load

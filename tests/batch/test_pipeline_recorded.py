@@ -9,7 +9,7 @@ import pytest
 from orthoswarm.model.camera import Camera, angles_from_rotation, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.recorded_pose import THETA_HAT_RAD, area_grid, course, recorded_cameras
+from orthoswarm.mosaic.recorded_pose import THETA_HAT_RAD, area_grid, course, recorded_cameras
 from orthoswarm.refine.flight.carried_pictures import carry, hovering, odd_ones
 
 GRID = LocalGrid(32632)

@@ -122,8 +122,8 @@ def test_helpers(monkeypatch):
 
 PARENT = """
 import os, sys
-from orthoswarm.workers import Processes
-from tests.test_workers import where
+from orthoswarm.compute.workers import Processes
+from tests.batch.test_workers import where
 pool, others = Processes(3), set()
 while not others:
     others = set(pool.map(where, range(40))) - {os.getpid()}

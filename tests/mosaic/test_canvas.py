@@ -238,9 +238,9 @@ def test_wrong_folders_are_refused_in_one_sentence(tmp_path, canvas):
 KILLED = """
 import sys
 from pathlib import Path
-from orthoswarm.mosaic.canvas import Canvas
+from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.mosaic.realtime import RealtimeMosaic
-from tests import mosaic_scene as scene
+from tests.kit import mosaic_scene as scene
 flight = scene.survey(8)
 mosaic = RealtimeMosaic(Canvas.create(Path(sys.argv[1]), scene.grid(300.0, 0.25), tile_px=256, memory_mb=1.0))
 while True:

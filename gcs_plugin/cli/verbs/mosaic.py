@@ -23,6 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--fov-min", type=float, metavar="DEG", help="field of view assumed in real time (default: photo tags, else 70)"
     )
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
+    add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
     add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
     add(
         "--every-m", type=float, metavar="M", help="of a video one picture every M metres (default: 4 %% of the height)"
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.batch import pipeline
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
+    from orthoswarm.config import read_overrides
     from orthoswarm.model.errors import InputError
     from orthoswarm.model.frame import Ingest
 
@@ -69,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
         dem=args.dem,
         split_legs=args.split == "legs",
         gains=not args.no_gains,
+        config=read_overrides(args.config) if args.config is not None else {},
     )
 
     def load(progress: pipeline.Progress) -> Ingest:

@@ -139,7 +139,7 @@ class _WithOverviews:
 
 def _placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], list[Rejection]]:
     """Each frame as it was placed last."""
-    from orthoswarm.model.recorded_pose import recorded_cameras
+    from orthoswarm.mosaic.recorded_pose import recorded_cameras
 
     best: dict[tuple[str, str], PlacedFrame] = {}
     grid = LocalGrid(task.epsg)

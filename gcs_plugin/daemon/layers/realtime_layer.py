@@ -29,9 +29,9 @@ from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid, utm_epsg
-from orthoswarm.model.recorded_pose import recorded_cameras
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
 from orthoswarm.mosaic.realtime import RealtimeMosaic
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.raster.picture_file import read_rgba
 

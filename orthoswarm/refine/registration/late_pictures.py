@@ -18,7 +18,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
-from orthoswarm.model.recorded_pose import recorded_cameras
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.bundle.covariance import RADIAL
 from orthoswarm.refine.flight.carried_pictures import carry
 

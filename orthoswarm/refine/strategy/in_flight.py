@@ -18,7 +18,7 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
-from orthoswarm.model.recorded_pose import recorded_cameras
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.carried_pictures import hovering
 from orthoswarm.refine.flight.relative_block import Flight, open_flight
 from orthoswarm.refine.flight.solve_units import merge_units, split_units

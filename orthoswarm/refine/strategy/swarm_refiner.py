@@ -17,7 +17,7 @@ from orthoswarm.model.errors import AdjustmentError, OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
-from orthoswarm.model.recorded_pose import recorded_cameras, told_of_lone_ones
+from orthoswarm.mosaic.recorded_pose import recorded_cameras, told_of_lone_ones
 from orthoswarm.refine.flight.carried_pictures import carry, follow, sort_out
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map, to_solution

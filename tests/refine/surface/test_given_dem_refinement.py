@@ -8,8 +8,8 @@ import pytest
 import rasterio
 
 from orthoswarm.model.placement import Terrain
-from orthoswarm.model.recorded_pose import recorded_cameras
 from orthoswarm.mosaic.extent import placed_bounds
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner, local_origin, refine_all
 from tests.kit.scenes import scene_of, tiny_twin

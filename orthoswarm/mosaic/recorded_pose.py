@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.frame import Frame, Ingest, Rejection
@@ -19,14 +20,11 @@ from orthoswarm.model.placement import PlacedFrame
 
 Array = NDArray[np.float64]
 
-THETA_HAT_RAD = np.radians(70.0)
-"""The field of view that is assumed where nothing is known: below that of most drones' cameras."""
 DEFAULT_HEIGHT_M = 80.0
 _HEIGHTS_M = (50.0, 150.0)
 _USUAL_OVERLAP = 0.75
 _GPS_SIGMA_M = 3.0
 _TILT_SIGMA = {True: 0.03, False: 0.1}
-_FAR_M = 20_000.0
 _TURN_RAD = np.radians(50.0)
 
 
@@ -61,7 +59,7 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
         frames: sorted by vehicle, then time.
         grid: the area's grid.
         fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' own hints, else
-            THETA_HAT_RAD.
+            the default of the configuration.
     """
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
@@ -132,7 +130,9 @@ def _lens(frame: Frame, fov_rad: float | None) -> Lens:
         return Lens(frame.width, frame.height, focal_px(frame.fov_hint_rad, frame.width))
     # theta-hat belongs to the longer side, so that a portrait picture of the same camera has the same focal length
     long_side = max(frame.width, frame.height)
-    return Lens(frame.width, frame.height, focal_px(fov_rad or THETA_HAT_RAD, long_side))
+    return Lens(
+        frame.width, frame.height, focal_px(fov_rad or float(np.radians(active().records.theta_hat_deg)), long_side)
+    )
 
 
 def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
@@ -173,7 +173,7 @@ def _sigma(frame: Frame, camera: Camera) -> float:
 def _near(ground: Array) -> NDArray[np.bool_]:
     """Which positions belong to the flight: within 20 km, or ten times the usual distance, of the middle."""
     away = np.hypot(*(ground - np.median(ground, axis=0)).T)
-    return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, 10.0 * float(np.median(away)))))
+    return np.asarray(np.isfinite(away) & (away <= max(active().records.far_m, 10.0 * float(np.median(away)))))
 
 
 def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:

@@ -1,0 +1,13 @@
+"""Every threshold of the default refiner: one frozen dataclass a stage, each field with unit, meaning and source.
+
+`active()` gives the values in force. `orthoswarm mosaic --config FILE.toml` overrides them, a table a stage:
+
+    [features]
+    corner_distance_px = 12
+
+What is a definition and no choice (a layout of arrays, a unit) stays beside its code.
+"""
+
+from orthoswarm.config.active import Config, Overrides, active, overridden, override, read_overrides
+
+__all__ = ["Config", "Overrides", "active", "overridden", "override", "read_overrides"]

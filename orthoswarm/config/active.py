@@ -1,0 +1,122 @@
+"""The configuration in force, in this process and in those that work for it."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from orthoswarm.config.bundle import BundleConfig
+from orthoswarm.config.features import FeaturesConfig
+from orthoswarm.config.flight import FlightConfig
+from orthoswarm.config.initial import InitialConfig
+from orthoswarm.config.records import RecordsConfig
+from orthoswarm.config.registration import RegistrationConfig
+from orthoswarm.config.strategy import StrategyConfig
+from orthoswarm.config.surface import SurfaceConfig
+from orthoswarm.model.errors import InputError
+
+Overrides = Mapping[str, Mapping[str, Any]]
+"""Stage -> field -> value that differs from the default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The thresholds of all stages."""
+
+    records: RecordsConfig = field(default_factory=RecordsConfig)
+    features: FeaturesConfig = field(default_factory=FeaturesConfig)
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    bundle: BundleConfig = field(default_factory=BundleConfig)
+    flight: FlightConfig = field(default_factory=FlightConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    strategy: StrategyConfig = field(default_factory=StrategyConfig)
+
+
+_DEFAULT = Config()
+_active = _DEFAULT
+_overridden: Overrides = {}
+
+
+def active() -> Config:
+    """The values in force in this process."""
+    return _active
+
+
+def overridden() -> Overrides:
+    """What differs from the defaults in this process; workers are given it with every task."""
+    return _overridden
+
+
+def override(values: Overrides) -> None:
+    """Put values in the place of defaults, in this process; an empty mapping restores the defaults.
+
+    Raises:
+        InputError: a stage or field does not exist, or a value has another kind than the default.
+    """
+    global _active, _overridden
+    if values == _overridden:
+        return
+    stages: dict[str, Any] = {}
+    for stage, changes in values.items():
+        if stage not in _names():
+            raise InputError(f"the configuration has no stage '{stage}'; choose one of: {', '.join(_names())}")
+        if not isinstance(changes, Mapping):
+            raise InputError(f"'{stage}' in the configuration is a value; write it as a table: [{stage}]")
+        default = getattr(_DEFAULT, stage)
+        stages[stage] = replace(default, **{name: _checked(stage, name, value) for name, value in changes.items()})
+    _active, _overridden = replace(_DEFAULT, **stages), values
+
+
+def read_overrides(path: Path) -> Overrides:
+    """The overrides of a TOML file.
+
+    Raises:
+        InputError: the file cannot be read, or holds something else.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path} is no TOML file ({error}); write a table for each stage, for example [features]"
+        ) from None
+    before = overridden()
+    try:
+        override(values)  # says what is wrong with it
+    finally:
+        override(before)
+    return values
+
+
+@cache
+def _names() -> tuple[str, ...]:
+    return tuple(f.name for f in fields(Config))
+
+
+def _checked(stage: str, name: str, value: Any) -> Any:
+    """A value of the kind that the default has; lists become tuples.
+
+    Raises:
+        InputError: it is of another kind, or there is no such field.
+    """
+    default_stage = getattr(_DEFAULT, stage)
+    known = [f.name for f in fields(default_stage)]
+    if name not in known:
+        raise InputError(f"[{stage}] of the configuration has no '{name}'; it has: {', '.join(known)}")
+    default = getattr(default_stage, name)
+    if isinstance(value, list):
+        value = tuple(value)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    fits = {
+        bool: isinstance(value, bool),
+        int: isinstance(value, int) and number,
+        float: number,
+        tuple: isinstance(value, tuple) and isinstance(default, tuple) and len(value) == len(default),
+    }.get(type(default), isinstance(value, type(default)))
+    if not fits:
+        raise InputError(f"[{stage}] {name} = {value!r} in the configuration is of another kind than {default!r}")
+    return float(value) if isinstance(default, float) else value

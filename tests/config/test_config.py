@@ -1,0 +1,83 @@
+"""The configuration: defaults, overrides from a file, refusals, and workers that follow it."""
+
+import dataclasses
+import json
+
+import pytest
+
+from gcs_plugin.cli.main import main
+from orthoswarm.compute.workers import Processes
+from orthoswarm.config import Config, active, overridden, override, read_overrides
+from orthoswarm.model.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def _defaults():
+    yield
+    override({})
+
+
+def theta_hat(_):
+    return active().records.theta_hat_deg
+
+
+def test_every_threshold_says_what_it_is():
+    """Each field of each stage has a docstring right below it."""
+    import ast
+    import inspect
+
+    for stage in dataclasses.fields(Config):
+        cls = type(getattr(Config(), stage.name))
+        body = ast.parse(inspect.getsource(cls)).body[0].body
+        for node, following in zip(body, [*body[1:], None]):
+            if isinstance(node, ast.AnnAssign):
+                said = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+                assert said, f"{cls.__name__}.{node.target.id} says nothing of its unit, meaning and source"
+
+
+def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
+    file = tmp_path / "config.toml"
+    file.write_text("[records]\ntheta_hat_deg = 55\n")
+    override(read_overrides(file))
+    assert active().records.theta_hat_deg == 55.0 and overridden() == {"records": {"theta_hat_deg": 55}}
+    with Processes(3) as pool:
+        assert set(pool.map(theta_hat, range(20))) == {55.0}
+    override({})
+    assert active() == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[nothing]\na = 1\n", "no stage 'nothing'"),
+        ("records = 3\n", "write it as a table"),
+        ("[records]\nnothing = 1\n", "no 'nothing'"),
+        ("[records]\ntheta_hat_deg = 'wide'\n", "another kind"),
+        ("[records\n", "no TOML file"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_path):
+    file = tmp_path / "config.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_overrides(file)
+    assert active() == Config()
+
+
+def test_mosaic_refuses_a_bad_configuration_before_it_begins(tmp_path, capsys):
+    file = tmp_path / "config.toml"
+    file.write_text("[records]\nnothing = 1\n")
+    assert main(["mosaic", str(tmp_path), "--config", str(file), "--out", str(tmp_path / "out")]) == 2
+    assert "nothing" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_the_report_says_what_was_changed(tmp_path):
+    from tests.kit.scenes import tiny_twin
+
+    folder = tiny_twin(tmp_path)
+    file = tmp_path / "config.toml"
+    file.write_text("[records]\ntheta_hat_deg = 80.0\n")
+    flags = ["--until", "realtime", "--config", str(file), "--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main(["mosaic", str(folder / "photos"), *flags]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["config"] == {"records": {"theta_hat_deg": 80.0}}
