@@ -71,10 +71,10 @@ def test_mosaic_refuses_a_bad_configuration_before_it_begins(tmp_path, capsys):
     assert "nothing" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_the_report_says_what_was_changed(tmp_path):
+def test_the_report_says_what_was_changed(tmp_path, tmp_path_factory):
     from tests.kit.scenes import tiny_twin
 
-    folder = tiny_twin(tmp_path)
+    folder = tiny_twin(tmp_path_factory, 1, every=10)
     file = tmp_path / "config.toml"
     file.write_text("[records]\ntheta_hat_deg = 80.0\n")
     flags = ["--until", "realtime", "--config", str(file), "--out", str(tmp_path / "out"), "--workers", "1"]
