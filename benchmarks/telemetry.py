@@ -38,7 +38,7 @@ def bench_video(count: int) -> None:
     import av
     from av.codec.context import Flags
 
-    from telemetry.formats import bitstream, sei
+    from telemetry.formats.video import bitstream, sei
     from telemetry.samples.sample import Sample
     from telemetry.video.extraction import extract
     from telemetry.write.sei_writer import add_sei
@@ -83,7 +83,7 @@ def bench_photos(folder: Path | None) -> None:
 
 def bench_klv() -> None:
     """ST 0601 packets."""
-    from telemetry.formats import klv
+    from telemetry.formats.video import klv
 
     body = b"\x0d\x04\x20\x00\x00\x00\x0e\x04\x05\x00\x00\x00\x0f\x02\x20\x00\x05\x02\x40\x00" + bytes.fromhex("0102")
     whole = klv.ST0601_KEY + bytes([len(body) + 2]) + body

@@ -108,7 +108,7 @@ class VideoStream:
         """Encode and send a picture, uint8 (rows, columns, 3)."""
         import av
 
-        from telemetry.formats.bitstream import StreamFormat
+        from telemetry.formats.video.bitstream import StreamFormat
         from telemetry.write.sei_writer import with_sei
 
         time_s = float(sample.time_s or 0.0)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
-from telemetry.formats import pose_table
-from telemetry.formats.picture_container import NotAPicture
+from telemetry.formats.photo.picture_container import NotAPicture
+from telemetry.formats.table import pose_table
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
 from telemetry.ingest.photo_order import in_order

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from telemetry.formats.flight_logs import FlightLog, NotALog, read_log
-from telemetry.formats.mavlink_poses import CameraEvent, fixed_camera
+from telemetry.formats.log.flight_logs import FlightLog, NotALog, read_log
+from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.discovery import Discovery
 from telemetry.ingest.event_pairing import Pairing, pair
 from telemetry.ingest.survey import SourceInfo, Survey

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthoswarm.model.frame import Rejection
-from telemetry.formats import srt
+from telemetry.formats.video import srt
 from telemetry.ingest.discovery import Discovery, Folder
 from telemetry.ingest.log_ingest import LogSource
 from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey

@@ -22,7 +22,7 @@ import numpy as np
 from dronecan.driver.common import AbstractDriver, CANFrame
 
 from orthoswarm.model.errors import InputError
-from telemetry.formats.mavlink_poses import euler_deg
+from telemetry.formats.log.mavlink_poses import euler_deg
 from telemetry.live.live_poses import LivePoses
 from telemetry.samples.rotations import camera_frame_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked

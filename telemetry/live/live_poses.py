@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from orthoswarm.model.angles import wrap_deg
-from telemetry.formats.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
+from telemetry.formats.log.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.samples.sample import Sample
 
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")

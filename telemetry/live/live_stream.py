@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.formats import bitstream, klv, sei
+from telemetry.formats.video import bitstream, klv, sei
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 from telemetry.video.extraction import to_rgb

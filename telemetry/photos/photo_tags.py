@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from telemetry.formats import exif, xmp
-from telemetry.formats.makernotes import parse_dji
-from telemetry.formats.picture_container import Container, NotAPicture, read_container
+from telemetry.formats.photo import exif, xmp
+from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
 from telemetry.samples.sample import is_position
+from telemetry.samples.times import parse_time
 
 Angles = tuple[float | None, float | None, float | None]
 """Yaw, pitch, roll in degrees, as recorded."""
@@ -170,10 +171,10 @@ def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
 
 
 def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
-    exact = exif.parse_time(found.get("drone-dji:UTCAtExposure", ""))
+    exact = parse_time(found.get("drone-dji:UTCAtExposure", ""))
     taken = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
     if taken is None:
-        written = exif.parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
+        written = parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
         if written is not None:
             taken = written[0], "XMP time" if written[1] else "XMP time without zone, taken as UTC"
     if taken is not None:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.formats import srt
-from telemetry.formats.mavlink_poses import fixed_camera
+from telemetry.formats.log.mavlink_poses import fixed_camera
+from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from telemetry.formats import bitstream, djmd, klv, sei, srt
-from telemetry.formats.exif import parse_time
+from telemetry.formats.video import bitstream, djmd, klv, sei, srt
 from telemetry.samples.sample import Sample
+from telemetry.samples.times import parse_time
 
 _MAX_PICTURES = 5_000_000
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from orthoswarm.model.errors import InputError
-from telemetry.formats import bitstream, sei
+from telemetry.formats.video import bitstream, sei
 from telemetry.samples.sample import Sample
 from telemetry.video.video_file import NotAVideo, demux, open_video
 

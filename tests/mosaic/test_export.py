@@ -25,7 +25,7 @@ from orthoswarm.export.product_files import iso_time, simple_lens
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
-from telemetry.formats.picture_container import read_container
+from telemetry.formats.photo.picture_container import read_container
 
 EPSG = 32632
 WEST, NORTH, STEP = 465_000.0, 5_250_000.0, 0.5

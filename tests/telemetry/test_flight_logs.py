@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from telemetry.formats.dataflash import read_dataflash
-from telemetry.formats.flight_logs import NotALog, read_log, read_tlog
-from telemetry.formats.mavlink_poses import MavlinkPoses, fixed_camera
+from telemetry.formats.log.dataflash import read_dataflash
+from telemetry.formats.log.flight_logs import NotALog, read_log, read_tlog
+from telemetry.formats.log.mavlink_poses import MavlinkPoses, fixed_camera
 from telemetry.ingest.clock_offset import offset_by_positions, offset_by_turning, offset_by_zone
 from telemetry.ingest.event_pairing import by_time, pair
 from telemetry.ingest.ingest import LoadOptions, load, survey

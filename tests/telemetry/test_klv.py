@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from telemetry.formats import klv
+from telemetry.formats.video import klv
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg
 
 

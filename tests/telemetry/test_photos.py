@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from telemetry.formats import exif, xmp
-from telemetry.formats.makernotes import parse_dji
-from telemetry.formats.picture_container import NotAPicture, read_container
+from telemetry.formats.photo import exif, xmp
+from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.picture_container import NotAPicture, read_container
 from telemetry.photos.photo_tags import read_photo
+from telemetry.samples.times import parse_offset, parse_time
 
 DJI_ATTRIBUTES = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description rdf:about="DJI"
  xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+120.40"
@@ -253,7 +254,7 @@ def test_damaged_photos_are_read_or_refused_but_never_break(tmp_path_factory, da
 
 
 def test_time_formats():
-    assert exif.parse_time("2024-05-06T12:00:01.5+02:00") == (1714996801.5 - 7200, True)
-    assert exif.parse_time("2024:05:06 12:00:01") == (1714996801.0, False)
-    assert exif.parse_time("0000:00:00 00:00:00") is None
-    assert exif.parse_offset("-05:30") == -19800.0
+    assert parse_time("2024-05-06T12:00:01.5+02:00") == (1714996801.5 - 7200, True)
+    assert parse_time("2024:05:06 12:00:01") == (1714996801.0, False)
+    assert parse_time("0000:00:00 00:00:00") is None
+    assert parse_offset("-05:30") == -19800.0

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from telemetry.formats import bitstream, djmd, exif, klv, pose_table, sei, srt, xmp
-from telemetry.formats.flight_logs import NotALog, read_log
-from telemetry.formats.makernotes import parse_dji
-from telemetry.formats.picture_container import NotAPicture, read_container
+from telemetry.formats.log.flight_logs import NotALog, read_log
+from telemetry.formats.photo import exif, xmp
+from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.picture_container import NotAPicture, read_container
+from telemetry.formats.table import pose_table
+from telemetry.formats.video import bitstream, djmd, klv, sei, srt
 from telemetry.photos.photo_tags import read_photo
 from tests.telemetry.test_sei import dji_payload, packet
 from tests.telemetry.test_srt import djmd as djmd_message

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from telemetry.formats import bitstream, sei
-from telemetry.formats.bitstream import StreamFormat
+from telemetry.formats.video import bitstream, sei
+from telemetry.formats.video.bitstream import StreamFormat
 from telemetry.samples.sample import Sample
 
 FORMATS = [StreamFormat("h264"), StreamFormat("hevc"), StreamFormat("h264", 4), StreamFormat("hevc", 4)]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from telemetry.formats.djmd import parse_message, read_djmd
-from telemetry.formats.srt import parse_srt, read_srt
+from telemetry.formats.video.djmd import parse_message, read_djmd
+from telemetry.formats.video.srt import parse_srt, read_srt
 
 
 def block(text: str, n: int = 1) -> str:

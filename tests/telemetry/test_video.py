@@ -91,7 +91,7 @@ def test_b_frames_are_really_out_of_order(tmp_path):
 
 
 def test_a_live_encoders_packet_gets_its_sei():
-    from telemetry.formats import bitstream, sei
+    from telemetry.formats.video import bitstream, sei
 
     form = bitstream.StreamFormat("h264")
     packet = b"\0\0\0\1\x09\xf0\0\0\0\1\x65\x11\x22\x80"

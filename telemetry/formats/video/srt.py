@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from telemetry.formats.exif import parse_time
 from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import parse_time
 
 _MAX_BYTES = 256 << 20
 _MAX_BLOCK = 4096

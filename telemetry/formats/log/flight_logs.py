@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.dataflash import read_dataflash
-from telemetry.formats.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
-from telemetry.formats.mavlink_poses import TYPES, CameraEvent, MavlinkPoses
-from telemetry.formats.ulog import read_ulog
+from telemetry.formats.log.dataflash import read_dataflash
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
+from telemetry.formats.log.mavlink_poses import TYPES, CameraEvent, MavlinkPoses
+from telemetry.formats.log.ulog import read_ulog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 

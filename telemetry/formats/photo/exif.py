@@ -4,14 +4,13 @@ Written by hand because it has to stay far below a millisecond a photo and must 
 offset is checked, every count is bounded, and nothing here raises on bad data. Source: EXIF 2.32, TIFF 6.0.
 """
 
-import calendar
 import math
 import mmap
-import re
 import struct
 from dataclasses import dataclass, field
 
 from telemetry.samples.sample import is_position
+from telemetry.samples.times import parse_offset, parse_time
 
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
@@ -161,37 +160,6 @@ def gps_time(gps: Tags) -> float | None:
         return None
     day = parse_time(text(gps.get(29)) + " 00:00:00")
     return None if day is None else day[0] + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
-
-
-_TIME = re.compile(
-    r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*(Z|[+-]\d{2}:?\d{2})?"
-)
-
-
-def parse_time(value: str) -> tuple[float, bool] | None:
-    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is taken as UTC."""
-    match = _TIME.match(value)
-    if match is None:
-        return None
-    year, month, day, hour, minute = (int(match[i]) for i in range(1, 6))
-    second = int(match[6] or 0)
-    if not (1970 <= year < 2200 and 1 <= month <= 12 and 1 <= day <= 31 and hour < 25 and minute < 60 and second < 61):
-        return None
-    seconds = calendar.timegm((year, month, day, hour, minute, second, 0, 0, 0)) + float(f"0.{match[7] or 0}")
-    zone = parse_offset(match[8] or "")
-    return (seconds, False) if zone is None else (seconds - zone, True)
-
-
-def parse_offset(value: str) -> float | None:
-    """Seconds east of UTC of "+02:00", "-0530" or "Z"; None for anything else."""
-    value = value.strip()
-    if value == "Z":
-        return 0.0
-    match = re.fullmatch(r"([+-])(\d{2}):?(\d{2})", value)
-    if match is None or int(match[2]) > 14 or int(match[3]) > 59:
-        return None
-    seconds = int(match[2]) * 3600.0 + int(match[3]) * 60.0
-    return -seconds if match[1] == "-" else seconds
 
 
 def exposure_time(exif: Exif) -> tuple[float, str] | None:

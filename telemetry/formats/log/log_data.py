@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from telemetry.formats.mavlink_poses import CameraEvent
+from telemetry.formats.log.mavlink_poses import CameraEvent
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
-from telemetry.formats.mavlink_poses import CameraEvent, euler_deg
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
+from telemetry.formats.log.mavlink_poses import CameraEvent, euler_deg
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, quaternion_ned
 from telemetry.samples.sample import Sample, checked
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
-from telemetry.formats import exif
 from telemetry.samples.sample import is_position
+from telemetry.samples.times import parse_time
 
 _MAX_BYTES = 256 << 20
 
@@ -201,7 +201,7 @@ def _csv_row(header: list[str], cells: list[str]) -> tuple[str, PoseRow] | None:
         try:
             row.time_s = float(written)
         except ValueError:
-            parsed = exif.parse_time(written)
+            parsed = parse_time(written)
             row.time_s = parsed[0] if parsed else None
     for key, cell in values.items():
         try:

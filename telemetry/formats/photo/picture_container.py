@@ -11,7 +11,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from telemetry.formats import exif, xmp
+from telemetry.formats.photo import exif, xmp
 
 _HEAD = 1 << 16
 _TAIL = 1 << 11

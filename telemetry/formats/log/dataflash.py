@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
-from telemetry.formats.mavlink_poses import CameraEvent
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
+from telemetry.formats.log.mavlink_poses import CameraEvent
 from telemetry.samples.sample import Sample, checked
 
 _MARK = b"\xa3\x95"

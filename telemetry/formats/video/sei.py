@@ -280,7 +280,7 @@ def _decode_json(body: bytes) -> Sample | None:
 def _json_number(value: object, name: str) -> float | None:
     if isinstance(value, str):
         if name == "time_s":
-            from telemetry.formats.exif import parse_time
+            from telemetry.samples.times import parse_time
 
             parsed = parse_time(value)
             if parsed is not None:

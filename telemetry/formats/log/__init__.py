@@ -1,0 +1,1 @@
+"""Flight logs: tlog, DataFlash, ULog, CAN; and MAVLink messages as poses."""

@@ -1,0 +1,1 @@
+"""Metadata inside picture files: containers, EXIF, XMP, maker notes."""

@@ -1,0 +1,1 @@
+"""Metadata inside and beside videos: SEI, KLV, djmd, subtitles."""

@@ -1,0 +1,34 @@
+"""Times written as text: EXIF and ISO 8601."""
+
+import calendar
+import re
+
+_WRITTEN = re.compile(
+    r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*(Z|[+-]\d{2}:?\d{2})?"
+)
+
+
+def parse_time(value: str) -> tuple[float, bool] | None:
+    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is taken as UTC."""
+    match = _WRITTEN.match(value)
+    if match is None:
+        return None
+    year, month, day, hour, minute = (int(match[i]) for i in range(1, 6))
+    second = int(match[6] or 0)
+    if not (1970 <= year < 2200 and 1 <= month <= 12 and 1 <= day <= 31 and hour < 25 and minute < 60 and second < 61):
+        return None
+    seconds = calendar.timegm((year, month, day, hour, minute, second, 0, 0, 0)) + float(f"0.{match[7] or 0}")
+    zone = parse_offset(match[8] or "")
+    return (seconds, False) if zone is None else (seconds - zone, True)
+
+
+def parse_offset(value: str) -> float | None:
+    """Seconds east of UTC of "+02:00", "-0530" or "Z"; None for anything else."""
+    value = value.strip()
+    if value == "Z":
+        return 0.0
+    match = re.fullmatch(r"([+-])(\d{2}):?(\d{2})", value)
+    if match is None or int(match[2]) > 14 or int(match[3]) > 59:
+        return None
+    seconds = int(match[2]) * 3600.0 + int(match[3]) * 60.0
+    return -seconds if match[1] == "-" else seconds
