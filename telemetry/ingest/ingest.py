@@ -13,7 +13,6 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
-from telemetry.formats.photo.picture_container import NotAPicture
 from telemetry.formats.table import pose_table
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
@@ -24,6 +23,7 @@ from telemetry.photos.flight_checks import flight_findings
 from telemetry.photos.photo_frames import frames_of
 from telemetry.photos.photo_tags import Angles, PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
+from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
 
@@ -40,7 +40,7 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
         options: see LoadOptions.
 
     Raises:
-        InputError: an input does not exist or is of no known kind, or a pose table is damaged.
+        InputError: an input does not exist or is of no known kind.
     """
     found = survey(inputs, progress=progress, options=options)
     findings = [*found.findings, *(f for source in found.sources for f in source.findings)]
@@ -84,14 +84,16 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, pose_tabl
     tables: list[tuple[Path, str, pose_table.PoseTable]] = []
     for folder in found.folders:
         for path in folder.tables:
+            table: pose_table.PoseTable | Unreadable | None
             if pose_table.is_geo_txt(path):
-                table: pose_table.PoseTable | None = pose_table.read_geo_txt(path)
-                kind = "geo.txt"
+                table, kind = read_or_reason(pose_table.read_geo_txt, path), "geo.txt"
             elif path.suffix.lower() == ".csv":
-                table, kind = pose_table.read_pose_csv(path), "CSV"
+                table, kind = read_or_reason(pose_table.read_pose_csv, path), "CSV"
             else:
                 continue
-            if table is not None:
+            if isinstance(table, Unreadable):
+                result.findings.append(Finding("table-unreadable", f"{found.name(path)} is not used: {table}"))
+            elif table is not None:
                 where = found.scope(path)
                 tables.append((where, kind, table))
                 source = SourceInfo(found.name(path), kind)
@@ -117,7 +119,7 @@ def _table_findings(path: Path, folder: Path, table: pose_table.PoseTable, found
 
 def _photo_folder(
     folder: Folder,
-    tags: Iterable[PhotoTags | NotAPicture | None],
+    tags: Iterable[PhotoTags | Unreadable | None],
     found: Discovery,
     tables: Sequence[tuple[Path, str, pose_table.PoseTable]],
     logs: Sequence[LogSource],
@@ -133,7 +135,7 @@ def _photo_folder(
             continue
         seen += 1
         name = found.name(path)
-        if isinstance(photo, NotAPicture):
+        if isinstance(photo, Unreadable):
             result.rejected.append(Rejection(name, str(photo), folder.vehicle))
             continue
         vehicle = _merge_tables(photo, path, tables) or folder.vehicle

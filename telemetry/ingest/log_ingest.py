@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from telemetry.formats.log.flight_logs import FlightLog, NotALog, read_log
+from telemetry.formats.log.dataflash import has_dataflash_records
+from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.discovery import Discovery
 from telemetry.ingest.event_pairing import Pairing, pair
@@ -18,6 +19,7 @@ from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
+from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 _LEAST_SHARE = 0.5
 _SAME_EXPOSURE_S = 1.0
@@ -41,12 +43,11 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
     logs: list[LogSource] = []
     for folder in found.folders:
         for path in folder.logs:
-            try:
-                vehicles = read_log(path)
-            except NotALog as reason:
-                # A .bin may be anything; only what calls itself a log is worth a word.
-                if path.suffix.lower() != ".bin":
-                    result.findings.append(Finding("not-a-log", f"{found.name(path)}: {reason}"))
+            vehicles = read_or_reason(read_log, path)
+            if isinstance(vehicles, Unreadable):
+                # A .bin without DataFlash's marks may be anything: worth a note, no warning.
+                foreign = path.suffix.lower() == ".bin" and not has_dataflash_records(path)
+                result.findings.append(Finding("not-a-log", f"{found.name(path)}: {vehicles}", note=foreign))
                 continue
             source = SourceInfo(found.name(path), vehicles[0].kind)
             result.sources.append(source)

@@ -15,9 +15,10 @@ from telemetry.ingest.video_log_match import add_log
 from telemetry.photos.photo_frames import frames_of
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
+from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
 from telemetry.video.extraction import extract
 from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import NotAVideo, VideoScan, scan
+from telemetry.video.video_file import VideoScan, scan
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
 
@@ -35,19 +36,24 @@ def read_videos(
     for path in folder.videos:
         name = found.name(path)
         subtitles = beside.pop(path.stem.lower(), None)
-        try:
-            scanned = scan(path)
-        except (NotAVideo, OSError) as reason:
-            result.rejected.append(Rejection(name, str(reason), found.videos[path]))
+        scanned = read_or_reason(scan, path)
+        if isinstance(scanned, Unreadable):
+            result.rejected.append(Rejection(name, str(scanned), found.videos[path]))
             continue
         source = SourceInfo(name, "video", Counter(frames=len(scanned.pictures)))
         source.counts["sei"] = scanned.sei_count
         source.counts["klv"] = len(scanned.klv_packets)
         result.sources.append(source)
-        poses = Poses(scanned, srt.read_srt(subtitles) if subtitles is not None else None)
+        cues = None if subtitles is None else _subtitles(subtitles, found.name(subtitles), source.findings)
+        poses = read_or_reason(Poses, scanned, cues)
+        if isinstance(poses, Unreadable):
+            result.rejected.append(Rejection(name, str(poses), found.videos[path]))
+            continue
         near = [entry for entry in logs if folder.path.is_relative_to(entry.folder)]
         if near and not (poses.has_positions and poses.has_angles):
-            poses.findings += add_log(poses, scanned, near)
+            matched = read_or_reason(add_log, poses, scanned, near)
+            unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
+            poses.findings += unmatched if isinstance(matched, Unreadable) else matched
         if options.decode:
             _take(path, name, found.videos[path], scanned, poses, options, progress, source, result)
         else:
@@ -77,17 +83,23 @@ def _take(
     if not poses.has_positions:
         result.rejected.append(Rejection(name, NO_POSITION, vehicle))
         return
-    taken = extract(
-        path,
-        name,
-        options.cache or cache_folder(result.root),
-        poses=poses,
-        every_m=options.every_m,
-        every_s=options.every_s,
-        progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
-        found=scanned,
-        vehicle=vehicle,
-    )
+    try:
+        taken = extract(
+            path,
+            name,
+            options.cache or cache_folder(result.root),
+            poses=poses,
+            every_m=options.every_m,
+            every_s=options.every_s,
+            progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
+            found=scanned,
+            vehicle=vehicle,
+        )
+    except OSError:  # the folder for the pictures cannot be written: that is no fault of this video
+        raise
+    except Exception as error:
+        result.rejected.append(Rejection(name, str(reason_of(error)), vehicle))
+        return
     source.findings += taken.findings
     for who, photos in taken.photos.items():
         source.frames += frames_of(photos, who, lambda jpeg: f"{name}#{taken.names[jpeg]:06d}", source.findings)
@@ -106,13 +118,20 @@ def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) ->
         source.tracks.setdefault(vehicle, []).append(sample)
 
 
+def _subtitles(path: Path, name: str, findings: list[Finding]) -> srt.Subtitles | None:
+    """What an SRT file says; None where it cannot be read, which becomes a finding."""
+    cues = read_or_reason(srt.read_srt, path)
+    if isinstance(cues, Unreadable):
+        findings.append(Finding("unreadable", f"{name} is not used: {cues}"))
+        return None
+    return cues
+
+
 def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source = SourceInfo(name, "srt")
     result.sources.append(source)
-    try:
-        cues = srt.read_srt(path)
-    except OSError as error:
-        source.findings.append(Finding("unreadable", f"{path.name} cannot be read ({error.strerror})"))
+    cues = _subtitles(path, name, source.findings)
+    if cues is None:
         return
     source.findings += [Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items()]
     source.findings.append(Finding("no-video", f"{path.name} has no video of its name beside it", note=True))

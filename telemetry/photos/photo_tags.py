@@ -16,6 +16,7 @@ from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
 from telemetry.samples.sample import is_position
 from telemetry.samples.times import parse_time
+from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 Angles = tuple[float | None, float | None, float | None]
 """Yaw, pitch, roll in degrees, as recorded."""
@@ -86,8 +87,8 @@ def read_photo(path: Path) -> PhotoTags | None:
 
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
-) -> Generator[PhotoTags | NotAPicture | None, None, None]:
-    """Read many photos in parallel, in order; a file that is no picture gives its exception.
+) -> Generator[PhotoTags | Unreadable | None, None, None]:
+    """Read many photos in parallel, in order; a file that cannot be read gives the reason.
 
     Args:
         paths: files.
@@ -103,15 +104,8 @@ def read_photos(
             yield from result
 
 
-def _read_chunk(paths: Sequence[Path]) -> list[PhotoTags | NotAPicture | None]:
-    return [_read_or_reason(path) for path in paths]
-
-
-def _read_or_reason(path: Path) -> PhotoTags | NotAPicture | None:
-    try:
-        return read_photo(path)
-    except NotAPicture as reason:
-        return reason
+def _read_chunk(paths: Sequence[Path]) -> list[PhotoTags | Unreadable | None]:
+    return [read_or_reason(read_photo, path) for path in paths]
 
 
 def tags_of(path: Path, container: Container) -> PhotoTags:

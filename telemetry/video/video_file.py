@@ -13,11 +13,12 @@ from typing import Any
 from telemetry.formats.video import bitstream, djmd, klv, sei, srt
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
+from telemetry.samples.unreadable import Unreadable
 
 _MAX_PICTURES = 5_000_000
 
 
-class NotAVideo(Exception):
+class NotAVideo(Unreadable):
     """A file with a video's suffix is none; the text is one sentence for the user."""
 
 
@@ -80,6 +81,9 @@ def open_video(path: Path | str, **options: Any) -> Any:
     if not container.streams.video:
         container.close()
         raise NotAVideo("the file holds no pictures; name a video")
+    if container.streams.video[0].codec_context is None:
+        container.close()
+        raise NotAVideo("its pictures are coded in a way that is not known here; convert the video to H.264 or H.265")
     return container
 
 

@@ -159,6 +159,93 @@ def test_damaged_ulogs_are_survived(tmp_path_factory, data):
         assert str(reason)
 
 
+# --- older and sparse logs ------------------------------------------------------------------------------------------
+
+
+def dataflash(path, formats, records):
+    """A DataFlash log of some record types: name -> (codes, columns); records are (name, values)."""
+    codes = {"B": "B", "H": "H", "I": "I", "L": "i", "e": "i", "E": "I", "c": "h", "C": "H", "Q": "Q", "f": "f"}
+    out, types = bytearray(), {}
+    for number, (name, (letters, columns)) in enumerate(formats.items(), 130):
+        form = struct.Struct("<" + "".join(codes[letter] for letter in letters))
+        types[name] = number, form
+        body = struct.pack("<BB4s16s64s", number, form.size + 3, name.encode(), letters.encode(), columns.encode())
+        out += b"\xa3\x95\x80" + body
+    for name, values in records:
+        number, form = types[name]
+        out += b"\xa3\x95" + bytes([number]) + form.pack(*values)
+    path.write_bytes(out)
+    return path
+
+
+WEEK, WEEK_MS = 1850, 200_000_000
+GPS_UTC_S = 315_964_800 + WEEK * 604_800 + WEEK_MS / 1000 - 18
+
+
+OLDER_GPS = {
+    # ArduCopter 3.2: TimeMS is the time of week, T since boot. 3.3 pre-releases: TimeMS is since boot.
+    "time of week": ("BIHBcLLeeEefI", "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T"),
+    "since boot": ("IBIHBcLLee", "TimeMS,Status,GMS,GWk,NSats,HDop,Lat,Lng,RelAlt,Alt"),
+}
+
+
+@pytest.mark.parametrize("kind", OLDER_GPS)
+def test_dataflash_with_milliseconds_is_read_and_placed_by_its_gps(tmp_path, kind):
+    formats = {
+        "GPS": OLDER_GPS[kind],
+        "ATT": ("IccccCC", "TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+        "CAM": ("IHLLeccC", "GPSTime,GPSWeek,Lat,Lng,Alt,Roll,Pitch,Yaw"),
+    }
+    records = []
+    for i in range(50):
+        boot, lat = 60_000 + 200 * i, 470_000_000 + 100 * i
+        if kind == "time of week":
+            gps = (3, WEEK_MS + 200 * i, WEEK, 12, 80, lat, 80_000_000, 6000, 46000, 0, 0, 0.0, boot)
+        else:
+            gps = (boot, 3, WEEK_MS + 200 * i, WEEK, 12, 80, lat, 80_000_000, 6000, 46000)
+        records += [("GPS", gps), ("ATT", (boot, 0, 100, 0, -200, 0, 9000))]
+        if i % 10 == 5:
+            records.append(("CAM", (WEEK_MS + 200 * i, WEEK, lat, 80_000_000, 46000, 100, -200, 9000)))
+    (log,) = read_log(dataflash(tmp_path / "old.BIN", formats, records))
+    assert len(log.events) == 5
+    for i, event in enumerate(log.events):
+        assert event.time_s == pytest.approx(GPS_UTC_S + 2 * i + 1.0)
+        track = log.timeline().at(event.time_s)
+        assert track.lat_deg == pytest.approx(event.sample.lat_deg, abs=1e-7)
+        assert (track.height_m, track.altitude_m) == (60.0, 460.0)
+        assert (track.flight_yaw_deg, track.flight_pitch_deg) == (90.0, -2.0)
+
+
+def test_a_dataflash_log_without_gps_time_is_named(tmp_path):
+    formats = {"ATT": ("Qcc", "TimeUS,Roll,Pitch")}
+    with pytest.raises(NotALog, match="no GPS time"):
+        read_log(dataflash(tmp_path / "bench.BIN", formats, [("ATT", (1000, 1, 1)), ("ATT", (2_000_000, 1, 1))]))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    ["int32_t lat;int32_t lon;int32_t alt;", "double latitude_deg;double longitude_deg;double altitude_msl_m;"],
+)
+def test_a_ulog_without_the_filters_position_is_placed_by_its_gps(tmp_path, fields):
+    out = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0))
+
+    def put(kind, body):
+        out.extend(struct.pack("<HB", len(body), ord(kind)) + body)
+
+    put("F", f"sensor_gps:uint64_t timestamp;uint64_t time_utc_usec;{fields}float eph;uint8_t fix_type;".encode())
+    put("A", struct.pack("<BH", 0, 0) + b"sensor_gps")
+    for i in range(20):
+        t = 1_000_000 + 200_000 * i
+        place = (470_000_000 + 10 * i, 80_000_000, 450_000) if "int32" in fields else (47.0 + i * 1e-6, 8.0, 450.0)
+        form = "<HQQiiifB" if "int32" in fields else "<HQQdddfB"
+        put("D", struct.pack(form, 0, t, 1_700_000_000_000_000 + t, *place, 0.7, 3))
+    (tmp_path / "a.ulg").write_bytes(out)
+    (log,) = read_log(tmp_path / "a.ulg")
+    sample = log.timeline().at(1_700_000_002.0)
+    assert (sample.lat_deg, sample.lon_deg, sample.altitude_m) == pytest.approx((47.000005, 8.0, 450.0), abs=1e-8)
+    assert sample.sigma_m == pytest.approx(0.7)
+
+
 # --- pairing ------------------------------------------------------------------------------------------------------
 
 

@@ -138,11 +138,12 @@ def test_geo_txt_pitch_is_understood_from_nadir_and_from_the_horizon(tmp_path, w
     assert frame.fix.position_sigma_m == pytest.approx(0.02)
 
 
-def test_geo_txt_without_projection_is_an_error_that_says_what_to_do(tmp_path):
+def test_geo_txt_without_projection_is_a_warning_that_says_what_to_do(tmp_path):
     jpeg(tmp_path / "a.jpg")
     (tmp_path / "geo.txt").write_text("a.jpg 8.25 47.5\n")
-    with pytest.raises(InputError, match="projection"):
-        load([tmp_path])
+    (warning,) = load([tmp_path]).warnings
+    assert "geo.txt is not used" in warning
+    assert "write EPSG:4326 or the projection there" in warning
 
 
 def test_lines_of_a_table_that_say_nothing_are_named(tmp_path):

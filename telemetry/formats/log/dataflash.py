@@ -2,6 +2,9 @@
 
 Each record: A3 95, type, then the columns that the type's FMT record (type 128) names. Only CAM, TRIG, POS, ATT, MNT,
 RFND, TERR, GPS and AHR2 are read. Source: ArduPilot's AP_Logger documentation.
+
+Time since boot is TimeUS (microseconds) since 2015, TimeMS (milliseconds) before; in GPS records of that time TimeMS is
+the GPS time of week and T the time since boot.
 """
 
 import mmap
@@ -58,14 +61,28 @@ def read_dataflash(path: Path) -> FlightLog:
         raise NotALog("the file holds no DataFlash record; it is no ArduPilot log")
     log = FlightLog(path, "DataFlash", path.stem)
     clock = _utc_minus_boot(rows.get("GPS", []))
-    each(rows.get("POS", []), lambda row: _position(log, row, clock))
+    if "POS" in rows:
+        each(rows["POS"], lambda row: _position(log, row, clock))
+    else:
+        each(rows.get("GPS", []), lambda row: _fix(log, row, clock))
     each(rows.get("ATT") or rows.get("AHR2", []), lambda row: _attitude(log, row, clock))
     each(rows.get("RFND", []), lambda row: _rangefinder(log, row, clock))
     each(rows.get("TERR", []), lambda row: _terrain(log, row, clock))
     each(rows.get("MNT", []), lambda row: _gimbal(log, row, clock))
     for name in ("CAM", "TRIG"):
         each(rows.get(name, []), lambda row, name=name: log.events.append(_event(row, name, clock)))  # type: ignore[misc]
+    if clock is None and not any(event.time_s is not None for event in log.events):
+        raise NotALog("the log has no GPS time, so nothing in it can be dated; log GPS records or use the tlog")
     return log
+
+
+def has_dataflash_records(path: Path) -> bool:
+    """Whether a file begins like a DataFlash log: with a record that describes a format."""
+    try:
+        with path.open("rb") as handle:
+            return _MARK + bytes([_FMT]) in handle.read(1 << 16)
+    except OSError:
+        return False
 
 
 def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
@@ -87,7 +104,7 @@ def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
             form = formats.get(kind)
             if form is not None:
                 row, rows = form.read(data, at), found.setdefault(form.name, [])
-                if form.name in _EVENTS or not rows or not 0.0 <= _boot_s(row) - _boot_s(rows[-1]) < LEAST_STEP_S:
+                if form.name in _EVENTS or not rows or _is_later(row, rows[-1]):
                     rows.append(row)
         at += length
     return found
@@ -111,30 +128,51 @@ def _learn(data: mmap.mmap, at: int, formats: dict[int, _Format | None], lengths
 
 def _utc_minus_boot(rows: list[Row]) -> float | None:
     """What to add to TimeUS for UTC, by GPS weeks and milliseconds of good fixes."""
-    offsets = [
-        _GPS_EPOCH_S + row["GWk"] * _WEEK_S + row["GMS"] * 1e-3 - _LEAP_S - row["TimeUS"] * 1e-6
-        for row in rows
-        if isinstance(row.get("GWk"), int) and row["GWk"] > 1000 and row.get("Status", 3) >= 3 and "GMS" in row
-    ]
+    offsets = []
+    for row in rows:
+        week, week_ms, boot_s = row.get("GWk", row.get("Week")), row.get("GMS", row.get("TimeMS")), _boot_s(row)
+        if isinstance(week, int) and week > 1000 and week_ms is not None and boot_s is not None and _has_fix(row):
+            offsets.append(_GPS_EPOCH_S + week * _WEEK_S + week_ms * 1e-3 - _LEAP_S - boot_s)
     # A fix is logged some time after it was measured, so the largest offsets are the best ones.
     return float(np.quantile(offsets, 0.9)) if offsets else None
 
 
-def _boot_s(row: Row) -> float:
-    return float(row.get("TimeUS", row.get("TimeMS", 0) * 1000)) * 1e-6
+def _boot_s(row: Row) -> float | None:
+    """Seconds since boot of a record, None where it has none."""
+    if "TimeUS" in row:
+        return float(row["TimeUS"]) * 1e-6
+    milliseconds = row["T"] if "T" in row and "Week" in row else row.get("TimeMS")
+    return None if milliseconds is None else float(milliseconds) * 1e-3
+
+
+def _is_later(row: Row, last: Row) -> bool:
+    """Whether a record is worth keeping after the last one that was kept."""
+    now, before = _boot_s(row), _boot_s(last)
+    return now is None or before is None or not 0.0 <= now - before < LEAST_STEP_S
+
+
+def _has_fix(row: Row) -> bool:
+    return bool(row.get("Status", 3) >= 3)
 
 
 def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:
     sample = checked(Sample(**values))
-    if sample is None or clock is None or ("lat_deg" in values and not sample.has_position):
+    boot_s = _boot_s(row)
+    if sample is None or clock is None or boot_s is None or ("lat_deg" in values and not sample.has_position):
         return
-    sample.time_s = _boot_s(row) + clock
+    sample.time_s = boot_s + clock
     log.samples.append(sample)
 
 
 def _position(log: FlightLog, row: Row, clock: float | None) -> None:
     height = row.get("RelHomeAlt", row.get("RelAlt"))
     _add(log, row, clock, lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height)
+
+
+def _fix(log: FlightLog, row: Row, clock: float | None) -> None:
+    """A receiver's position, for logs without the filter's."""
+    if _has_fix(row) and row.get("I", 0) == 0:
+        _position(log, row, clock)
 
 
 def _attitude(log: FlightLog, row: Row, clock: float | None) -> None:
@@ -173,7 +211,7 @@ def _event(row: Row, kind: str, clock: float | None) -> CameraEvent:
         flight_yaw_deg=row.get("Y", row.get("Yaw")),
     )
     boot_s = _boot_s(row)
-    time_s = None if clock is None else boot_s + clock
+    time_s = None if clock is None or boot_s is None else boot_s + clock
     if time_s is None and row.get("GPSWeek", 0) > 1000:
         time_s = _GPS_EPOCH_S + row["GPSWeek"] * _WEEK_S + row["GPSTime"] * 1e-3 - _LEAP_S
     number = row.get("Img", row.get("ImageNo"))

@@ -11,6 +11,7 @@ from telemetry.formats.log.mavlink_poses import CameraEvent
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
+from telemetry.samples.unreadable import Unreadable
 
 Row = dict[str, Any]
 """One record of a binary log."""
@@ -20,7 +21,7 @@ LEAST_STEP_S = 0.04
 """Attitude and position are kept at 25 Hz at most: more adds nothing, and a long log would fill the memory."""
 
 
-class NotALog(Exception):
+class NotALog(Unreadable):
     """A file with a log's suffix is none; the text is one sentence for the user."""
 
 

@@ -67,7 +67,21 @@ def read_ulog(path: Path) -> FlightLog:
         if found is not None:
             log.events.append(found)
 
-    each(rows.get("vehicle_global_position", []), position)
+    def fix(row: Row) -> None:
+        """A receiver's position: degrees and metres since PX4 1.14, 1e-7 degrees and millimetres before."""
+        if row.get("fix_type", 0) < 3:
+            return
+        if "latitude_deg" in row:
+            lat, lon, altitude = row["latitude_deg"], row["longitude_deg"], float(row["altitude_msl_m"])
+        else:
+            lat, lon, altitude = row["lat"] * 1e-7, row["lon"] * 1e-7, row["alt"] * 1e-3
+        height = None if home is None else altitude - home
+        _add(log, row, clock, lat_deg=lat, lon_deg=lon, altitude_m=altitude, height_m=height, sigma_m=row.get("eph"))
+
+    if "vehicle_global_position" in rows:
+        each(rows["vehicle_global_position"], position)
+    else:
+        each(fixes, fix)
     each(rows.get("vehicle_attitude", []), attitude)
     each(rows.get("distance_sensor", []), distance)
     each(rows.get("gimbal_device_attitude_status", []), lambda row: _gimbal(log, row, clock, headings))

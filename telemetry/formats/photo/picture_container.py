@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from telemetry.formats.photo import exif, xmp
+from telemetry.samples.unreadable import Unreadable
 
 _HEAD = 1 << 16
 _TAIL = 1 << 11
@@ -19,7 +20,7 @@ _MAX_SEGMENTS = 4096
 _START_OF_FRAME = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 
 
-class NotAPicture(Exception):
+class NotAPicture(Unreadable):
     """A file with a picture's suffix is none or is damaged; the text is one sentence for the user."""
 
 
