@@ -34,7 +34,7 @@ from orthoswarm.mosaic.extent import drawn_window, from_takeoff, ground_level, m
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import loose, strays, told
 from orthoswarm.mosaic.realtime import mosaic
-from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras, told_of_lone_ones
+from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, hint_lone_photos, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem, read_dem
@@ -235,7 +235,7 @@ class _Batch:
             state.basemap = None if known[0].map_lost else state.basemap
             return known[0]
         outer = Clock(self.workers.usage)
-        frames = told_of_lone_ones(by_kind.fit)
+        frames = hint_lone_photos(by_kind.fit)
         with outer.stage("refine", len(frames)) as stage:
             try:
                 refinement = self.refined(frames, state)

@@ -83,7 +83,7 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
     return Recorded(placed, rejected, warnings)
 
 
-def told_of_lone_ones(placed: Sequence[PlacedFrame]) -> list[Frame]:
+def hint_lone_photos(placed: Sequence[PlacedFrame]) -> list[Frame]:
     """Frames of recorded cameras; that of a vehicle with a single one has the assumed field of view as its hint.
 
     A flight tells its field of view by its own pictures, one photo cannot.

@@ -13,7 +13,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.paper.ground_scale import choose_pairs, estimate_fov
 from orthoswarm.paper.leg_lines import Line, find_legs, fit_line
 from orthoswarm.raster.picture_file import read_gray
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F, Ints, Rig
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
 from orthoswarm.refine.bundle.flight_records import Array, read_records
 from orthoswarm.refine.features.grey_pictures import Pictures
 
@@ -45,7 +45,7 @@ class CoarseVehicle:
 
     Attributes:
         vehicle: id. frames: in order. leg: int32 (N,), -1 in turns. lines: of each leg.
-        rig: cameras in the local frame, lens in pixels of the stored pictures; ground at height 0.
+        cameras: cameras in the local frame, lens in pixels of the stored pictures; ground at height 0.
         sigma_m: float64 (N,), own error estimates. fov_sigma_rad: of the field of view.
         damaged: index -> why its picture cannot be used. warnings: findings. cpu_s: CPU seconds.
     """
@@ -54,7 +54,7 @@ class CoarseVehicle:
     frames: list[Frame]
     leg: Ints
     lines: list[Line]
-    rig: Rig
+    cameras: CameraBlock
     sigma_m: Array
     fov_sigma_rad: float
     damaged: dict[int, str] = field(default_factory=dict)
@@ -102,8 +102,8 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     width, height = frames[0].width, frames[0].height
     lens = np.zeros((1, 8))
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height
-    rig = Rig(position, rotation, np.zeros(len(frames), np.int32), lens)
+    cameras = CameraBlock(position, rotation, np.zeros(len(frames), np.int32), lens)
     return CoarseVehicle(
-        frames[0].vehicle, list(frames), leg, lines, rig, sigma, float(fov_sigma), dict(pictures.damaged), warnings,
+        frames[0].vehicle, list(frames), leg, lines, cameras, sigma, float(fov_sigma), dict(pictures.damaged), warnings,
         process_time() - began,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.legs import split_legs
 from orthoswarm.refine.bundle.block_arrays import Ints
-from orthoswarm.refine.bundle.flight_records import Array, Records
+from orthoswarm.refine.bundle.flight_records import Array, FlightRecords
 
 HEADING_RAD = np.radians(20.0)
 SHORTEST = 3
@@ -51,7 +51,7 @@ def fit_line(position: Array) -> Line:
     return Line(middle, direction, across)
 
 
-def find_legs(records: Records) -> Ints:
+def find_legs(records: FlightRecords) -> Ints:
     """Leg of each frame, int32 (N,), -1 in turns: straight by the path flown and of one heading of the camera."""
     path = split_legs(records.position, records.time_s if records.timed else None)
     out = np.full(len(path), -1, np.int32)
@@ -64,7 +64,7 @@ def find_legs(records: Records) -> Ints:
     return _grown(out, records)
 
 
-def _grown(leg: Ints, records: Records) -> Ints:
+def _grown(leg: Ints, records: FlightRecords) -> Ints:
     """Legs extended over the frames before and after that lie on their line and look the same way.
 
     The path alone tells a turn only a few frames away from it.

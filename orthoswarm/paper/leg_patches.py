@@ -12,7 +12,7 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.picture_file import read_gray
-from orthoswarm.refine.bundle.block_arrays import WIDTH, F, Rig
+from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
@@ -30,13 +30,13 @@ class PatchTask:
     """A leg to be found on the map; small enough to be sent to another machine.
 
     Attributes:
-        vehicle: id. leg: its number. frames: the leg's frames. rig: their coarse cameras.
+        vehicle: id. leg: its number. frames: the leg's frames. cameras: their coarse cameras.
     """
 
     vehicle: str
     leg: int
     frames: list[Frame]
-    rig: Rig
+    cameras: CameraBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +91,9 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
     """Find one leg on the map."""
     began, clock = process_time(), perf_counter()
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
-    centre = task.rig.position[:, :2].mean(axis=0)
-    gsd = patch_gsd(task.rig, basemap.native_gsd_m)
-    strip = strip_mosaic(task.rig, np.arange(len(task.rig)), pictures.gray, 0.0, gsd)
+    centre = task.cameras.position[:, :2].mean(axis=0)
+    gsd = patch_gsd(task.cameras, basemap.native_gsd_m)
+    strip = strip_mosaic(task.cameras, np.arange(len(task.cameras)), pictures.gray, 0.0, gsd)
     found: Registration | None = None
     homography = None
     if strip is not None:
@@ -104,7 +104,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
             window, known, there = map_window(basemap, origin, own, reach)
             if not known.any():
                 break
-            consistent = HeightFilter(task.rig, own, there)
+            consistent = HeightFilter(task.cameras, own, there)
             matcher = map_matcher(options.matcher)
             found = register(patch, valid, window, known, reach, matcher, consistent)
             if found is not None and found.share >= options.trusted and len(found.matches) >= FEWEST_TILES:
@@ -120,11 +120,11 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
     )  # fmt: skip
 
 
-def patch_gsd(rig: Rig, map_gsd_m: float) -> float:
+def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
     """Pixel of a leg's patch: that of the coarser of pictures and map, coarser still if the leg is long."""
-    own = float(np.median(rig.position[:, 2])) / float(rig.lens[0, F])
+    own = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, F])
     gsd = float(np.clip(max(own, map_gsd_m), *_GSD_RANGE))
-    spread = np.ptp(rig.position[:, :2], axis=0) + 1.5 * own * float(rig.lens[0, WIDTH])
+    spread = np.ptp(cameras.position[:, :2], axis=0) + 1.5 * own * float(cameras.lens[0, WIDTH])
     return max(gsd, float(np.sqrt(spread[0] * spread[1] / _LARGEST_PX)))
 
 
@@ -166,10 +166,10 @@ class HeightFilter:
     height; those far from the usual one are dropped. Near the nadir points nothing leans, and all are kept.
 
     Attributes:
-        rig: the leg's cameras. own: grid of the patch. there: grid of the window.
+        cameras: the leg's cameras. own: grid of the patch. there: grid of the window.
     """
 
-    rig: Rig
+    cameras: CameraBlock
     own: GroundGrid
     there: GroundGrid
 
@@ -179,11 +179,11 @@ class HeightFilter:
             return np.zeros(0, bool)
         ground = self.own.to_ground(matches.a)
         lack = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
-        away = ground[:, None] - self.rig.position[None, :, :2]
+        away = ground[:, None] - self.cameras.position[None, :, :2]
         nearest = np.argmin((away**2).sum(-1), axis=1)
         lever = away[np.arange(len(ground)), nearest]
         rho = np.hypot(*lever.T)
-        height = np.maximum(self.rig.position[nearest, 2], 1.0)
+        height = np.maximum(self.cameras.position[nearest, 2], 1.0)
         leaning = rho > _LEVER * height
         apparent = (lack * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
         if leaning.sum() < FEWEST_TILES:

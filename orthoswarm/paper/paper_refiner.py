@@ -183,7 +183,7 @@ def _timed_coarse(
 
 def _task(vehicle: CoarseVehicle, leg: int) -> PatchTask:
     members = vehicle.members(leg)
-    return PatchTask(vehicle.vehicle, leg, [vehicle.frames[i] for i in members], vehicle.rig.take(members))
+    return PatchTask(vehicle.vehicle, leg, [vehicle.frames[i] for i in members], vehicle.cameras.take(members))
 
 
 def _solution(
@@ -207,7 +207,7 @@ def _solution(
     for i, frame in enumerate(vehicle.frames):
         if frame.image in dropped:
             continue
-        camera = vehicle.rig.camera(i, np.zeros(2))
+        camera = vehicle.cameras.camera(i, np.zeros(2))
         found = matched.get(int(vehicle.leg[i]))
         if found is not None:
             pixels = pixel_grid(camera)
@@ -233,7 +233,7 @@ def _solution(
     timings["cameras"] = process_time() - began
     return Solution(
         vehicle.vehicle, placed, dropped, _legs(vehicle, fits, sigmas, had_map, shift is not None),
-        float(np.degrees(vehicle.rig.camera(0, origin).lens.fov_rad)), float(np.degrees(vehicle.fov_sigma_rad)),
+        float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)), float(np.degrees(vehicle.fov_sigma_rad)),
         None, 0.0, (0.0, 0.0), state, warnings, timings,
     )  # fmt: skip
 
@@ -253,7 +253,7 @@ def _carried(
     if everyone:
         centre = np.array([c for c, _ in everyone])
         shifts = np.array([s for _, s in everyone])
-        away = np.hypot(*(centre - vehicle.rig.position[:, :2].mean(axis=0)).T)
+        away = np.hypot(*(centre - vehicle.cameras.position[:, :2].mean(axis=0)).T)
         nearest = np.argsort(away)[:_NEAREST]
         usual = np.median(shifts[nearest], axis=0)
         return np.tile(usual, (len(number), 1)), RECEIVER_SIGMA_M

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from orthoswarm.model.camera import rotation_from_angles
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 190.0
 TEXTURE_M = 0.4
@@ -31,18 +31,18 @@ def rig_of(legs=2, per_leg=12, spacing=18.0, tilt_deg=3.0, k1=0.0, seed=0, heigh
             rotation.append(rotation_from_angles(yaw, -np.pi / 2 + tilt[0], tilt[1]))
             leg.append(number)
     lens = np.array([[FOCAL, k1, 0, 0, 0, 0, WIDTH, HEIGHT]])
-    rig = Rig(np.array(position), np.array(rotation), np.zeros(len(leg), np.int32), lens)
-    return rig, np.array(leg)
+    cameras = CameraBlock(np.array(position), np.array(rotation), np.zeros(len(leg), np.int32), lens)
+    return cameras, np.array(leg)
 
 
-def render(rig, i, surface, picture, noise=1.5):
+def render(cameras, i, surface, picture, noise=1.5):
     """What camera i sees of a gentle surface with a texture draped over it (origin 200 m south-west of zero)."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
     uv = np.c_[columns.ravel(), rows.ravel()]
     index = np.full(len(uv), i)
     z = np.zeros(len(uv))
     for _ in range(6):
-        xy = rig.to_ground(index, uv, z)
+        xy = cameras.to_ground(index, uv, z)
         z = surface(xy)
     at = ((xy + 200.0) / TEXTURE_M).reshape(HEIGHT, WIDTH, 2).astype(np.float32)
     out = cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
@@ -52,8 +52,10 @@ def render(rig, i, surface, picture, noise=1.5):
 
 
 class Pictures:
-    def __init__(self, rig, surface, picture=None):
-        self.made = [render(rig, i, surface, texture() if picture is None else picture) for i in range(len(rig))]
+    def __init__(self, cameras, surface, picture=None):
+        self.made = [
+            render(cameras, i, surface, texture() if picture is None else picture) for i in range(len(cameras))
+        ]
         self.read = []
 
     def __call__(self, i):

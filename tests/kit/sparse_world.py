@@ -8,7 +8,7 @@ import numpy as np
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 
@@ -21,7 +21,7 @@ class World:
     """Photos, their true cameras, and matches between them."""
 
     frames: list[Frame]
-    rig: Rig
+    cameras: CameraBlock
     features: list[Features]
     pairs: list[Pair]
 
@@ -67,7 +67,7 @@ def make_world(
     z = height + rng.normal(0, 0.3, n)
     high_up = float(np.max(height))
     lens = np.array([[f, k1, 0, 0, 0, 0, w, h]], float)
-    rig = Rig(np.column_stack([xy, z]), rotation, np.zeros(n, np.int32), lens)
+    cameras = CameraBlock(np.column_stack([xy, z]), rotation, np.zeros(n, np.int32), lens)
     reach = 1.2 * high_up
     low, high = xy.min(0) - reach, xy.max(0) + reach
     count = int(np.prod(high - low) / (high_up / 12) ** 2)
@@ -76,7 +76,7 @@ def make_world(
     points = np.column_stack([ground, bumps])
     features, seen = [], []
     for i in range(n):
-        uv = rig.project(np.full(count, i), points)
+        uv = cameras.project(np.full(count, i), points)
         ok = np.isfinite(uv).all(1) & (uv > 3).all(1) & (uv < np.array([w - 4, h - 4])).all(1)
         index = np.flatnonzero(ok)
         noisy = (uv[index] + rng.normal(0, noise_px, (len(index), 2))).astype(np.float32)
@@ -91,7 +91,7 @@ def make_world(
                 keep = rng.permutation(len(a))[:80]
                 pairs.append(Pair(i, j, np.stack([a[keep], b[keep]], 1).astype(np.int32)))
     frames = _frames(xy + rng.normal(0, gps_sigma, xy.shape), z, yaw, size)
-    return World(frames, rig, features, pairs)
+    return World(frames, cameras, features, pairs)
 
 
 def _frames(xy: np.ndarray, z: np.ndarray, yaw: np.ndarray, size: tuple[int, int]) -> list[Frame]:

@@ -6,16 +6,16 @@ import numpy as np
 
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.refine.bundle.adjustment import exp_rotation
-from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
-from orthoswarm.refine.bundle.priors import GroupModel, Priors
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
+from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 
 
 @dataclass
 class Block:
-    true: Rig
+    true: CameraBlock
     points: np.ndarray
     tracks: Tracks
-    start: Rig
+    start: CameraBlock
     priors: Priors
     bias: np.ndarray
 
@@ -31,7 +31,7 @@ def make_block(seed=0, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_
         heading + 0.1 + rng.normal(0, 0.01, n), -np.pi / 2 + 0.03 + rng.normal(0, 0.01, n), rng.normal(0, 0.01, n)
     )
     zero = np.zeros(n, np.int32)
-    true = Rig(position, rotation, zero, np.array([[300.0, k1, k2, 0, 0, 0, 640, 480]]))
+    true = CameraBlock(position, rotation, zero, np.array([[300.0, k1, k2, 0, 0, 0, 640, 480]]))
     points = np.c_[
         rng.uniform(-110, 90 * legs + 20, 900), rng.uniform(-110, along[-1] + 110, 900), rng.normal(0, 0.4, 900)
     ]
@@ -61,9 +61,9 @@ def make_block(seed=0, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_
         np.full((n, 3), np.radians(0.1)),
         velocity,
         zero,
-        (GroupModel(height_sigma=0.3),),
+        (GroupPriors(height_sigma=0.3),),
         np.array([[np.log(focal_start), 0, 0, 0, 0, 0]]),
         np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
     )
-    start = Rig(fixes.copy(), recorded.copy(), zero, np.array([[focal_start, 0, 0, 0, 0, 0, 640.0, 480.0]]))
+    start = CameraBlock(fixes.copy(), recorded.copy(), zero, np.array([[focal_start, 0, 0, 0, 0, 0, 640.0, 480.0]]))
     return Block(true, points[used], tracks, start, priors, bias)

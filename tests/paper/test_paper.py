@@ -17,8 +17,8 @@ from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_lines import find_legs, fit_line
 from orthoswarm.paper.leg_patches import HeightFilter, PatchOptions
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F, Rig
-from orthoswarm.refine.bundle.flight_records import Records
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
+from orthoswarm.refine.bundle.flight_records import FlightRecords
 from orthoswarm.refine.strategy.swarm_refiner import local_origin
 from telemetry import load
 from tests.kit.scene import FOV, Scene, legs
@@ -57,7 +57,9 @@ def records_of(xy, yaw):
     flags = np.ones(n, bool)
     position = np.column_stack([xy, np.full(n, 80.0)])
     level = np.full(n, -np.pi / 2)
-    return Records(position, yaw, level, np.zeros(n), np.arange(n) * 2.0, flags, flags, flags, np.full(n, np.nan), True)
+    return FlightRecords(
+        position, yaw, level, np.zeros(n), np.arange(n) * 2.0, flags, flags, flags, np.full(n, np.nan), True
+    )
 
 
 def test_legs_end_where_the_path_or_the_heading_turns():
@@ -152,14 +154,16 @@ def test_matches_on_towers_are_rejected():
     lens = np.zeros((1, 8))
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = 400, 640, 480
     position = np.column_stack([np.arange(5) * 30.0, np.zeros(5), np.full(5, 80.0)])
-    rig = Rig(position, np.repeat(rotation_from_angles(0.0, -np.pi / 2, 0.0)[None], 5, 0), np.zeros(5, np.int32), lens)
+    cameras = CameraBlock(
+        position, np.repeat(rotation_from_angles(0.0, -np.pi / 2, 0.0)[None], 5, 0), np.zeros(5, np.int32), lens
+    )
     grid = GroundGrid(32632, -50.0, 60.0, 0.5, 440, 240)
     ground = np.column_stack([rng.uniform(-40, 160, 300), rng.uniform(-55, 55, 300)])
     tower = np.arange(300) < 40
     nearest = position[np.argmin(np.abs(ground[:, :1] - position[:, 0]), axis=1), :2]
     lean = np.where(tower, 15.0, 0.0)[:, None] / 80.0 * (ground - nearest)
     a = grid.to_pixel(ground + lean)
-    kept = HeightFilter(rig, grid, grid)(Matches(a, grid.to_pixel(ground), np.ones(300)), np.eye(3))
+    kept = HeightFilter(cameras, grid, grid)(Matches(a, grid.to_pixel(ground), np.ones(300)), np.eye(3))
     far = np.hypot(*(ground - nearest).T) > 15
     assert kept[~tower].all() and not kept[tower & far].any()
 

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.refine.bundle import normal_equations
-from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, F, Ints, Rig, Tracks
+from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, CameraBlock, F, Ints, Tracks
 from orthoswarm.refine.bundle.priors import Layout, Priors
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 
 @dataclass(frozen=True, slots=True)
-class Ties:
+class MapTies:
     """Points of which the map says where they lie.
 
     What was compared is ground, which a map shows where it is, however much its roofs lean.
@@ -38,13 +38,13 @@ class Ties:
     sigma_m: Array
 
     @classmethod
-    def none(cls) -> "Ties":
+    def none(cls) -> "MapTies":
         """No ties."""
         return cls(np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class HeightPrior:
     """What is believed of the points' heights.
 
     Attributes:
@@ -63,7 +63,7 @@ class Adjustment:
     """State of an adjustment; `step` improves it in place.
 
     Attributes:
-        rig: cameras now. points: float64 (P, 3). common: float64 (layout.size,) values of the common unknowns (the
+        cameras: cameras now. points: float64 (P, 3). common: float64 (layout.size,) values of the common unknowns (the
             lens columns hold differences to the prior's start). tracks: observations sorted by point.
         obs_weight: float64 (M,) robust weights of the last step. point_inverse: float64 (P, 3, 3), inverse of each
             point's own block (its covariance with the cameras held).
@@ -71,7 +71,7 @@ class Adjustment:
             covariance of the common unknowns at the last step (empty before it).
     """
 
-    rig: Rig
+    cameras: CameraBlock
     tracks: Tracks
     priors: Priors
     points: Array
@@ -90,17 +90,19 @@ class Adjustment:
 
     @classmethod
     def begin(
-        cls, rig: Rig, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
+        cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
     ) -> "Adjustment":
         """Set up; observations are sorted by point, cameras are ordered for a narrow band."""
         order = np.lexsort((tracks.camera, tracks.point))
         tracks = Tracks(tracks.camera[order], tracks.point[order], tracks.uv[order], tracks.sigma_px[order])
         start = np.searchsorted(tracks.point, np.arange(len(points) + 1))
-        free = np.ones(len(rig), bool) if free is None else free
-        slot, width = _order(tracks, len(points), len(rig), free)
+        free = np.ones(len(cameras), bool) if free is None else free
+        slot, width = _order(tracks, len(points), len(cameras), free)
         layout = Layout.of(priors)
         return cls(
-            replace(rig, position=rig.position.copy(), rotation=rig.rotation.copy(), lens=rig.lens.copy()),
+            replace(
+                cameras, position=cameras.position.copy(), rotation=cameras.rotation.copy(), lens=cameras.lens.copy()
+            ),
             tracks,
             priors,
             np.array(points, float),
@@ -115,14 +117,14 @@ class Adjustment:
         )
 
     def step(
-        self, c: float, ground: Ground, ties: Ties | None = None, tie_c: float = 9.0, damping: float = 1e-6
+        self, c: float, ground: HeightPrior, ties: MapTies | None = None, tie_c: float = 9.0, damping: float = 1e-6
     ) -> float:
         """One Gauss-Newton step with robust scale c (squared sigmas); returns the largest camera move in metres.
 
         Raises:
             AdjustmentError: if the system is singular even with its priors (NaN in the input).
         """
-        system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
+        system = self._assemble(c, ground, MapTies.none() if ties is None else ties, tie_c)
         system.band[0] *= 1.0 + damping
         step_camera, step_common, self.information = _solve(system)
         self._move(step_camera, step_common)
@@ -142,32 +144,37 @@ class Adjustment:
         return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if len(step_camera) else 0.0
 
     def covariance(
-        self, cameras: NDArray[np.integer], c: float, ground: Ground, ties: Ties | None = None, tie_c: float = 9.0
+        self,
+        chosen: NDArray[np.integer],
+        c: float,
+        ground: HeightPrior,
+        ties: MapTies | None = None,
+        tie_c: float = 9.0,
     ) -> tuple[Array, Array]:
         """Covariances at the present state; the points are eliminated, not held.
 
         Args:
-            cameras: (K,) free cameras. c, ground, ties, tie_c: as for `step`.
+            chosen: (K,) free cameras. c, ground, ties, tie_c: as for `step`.
 
         Returns:
             float64 (K, 6, 6) of position and rotation about the camera's axes, and (size, size) of the common unknowns.
         """
-        system = self._assemble(c, ground, Ties.none() if ties is None else ties, tie_c)
+        system = self._assemble(c, ground, MapTies.none() if ties is None else ties, tie_c)
         factor = _factor(system.band)
         y = _back(factor, system.side)
         inverse = np.linalg.inv(system.corner - system.side.T @ y)
-        rows = (6 * self.slot[cameras][:, None] + np.arange(6)).ravel()
+        rows = (6 * self.slot[chosen][:, None] + np.arange(6)).ravel()
         unit = np.zeros((system.band.shape[1], len(rows)), order="F")
         unit[rows, np.arange(len(rows))] = 1.0
         solved = _back(factor, unit)
-        out = np.empty((len(cameras), 6, 6))
-        for k in range(len(cameras)):
+        out = np.empty((len(chosen), 6, 6))
+        for k in range(len(chosen)):
             own = rows[6 * k : 6 * k + 6]
             out[k] = solved[own, 6 * k : 6 * k + 6] + y[own] @ inverse @ y[own].T
         return out, np.asarray(inverse, np.float64)
 
-    def _assemble(self, c: float, ground: Ground, ties: Ties, tie_c: float) -> "_System":
-        n, size, lenses = int(self.free.sum()), self.layout.size, len(self.rig.lens)
+    def _assemble(self, c: float, ground: HeightPrior, ties: MapTies, tie_c: float) -> "_System":
+        n, size, lenses = int(self.free.sum()), self.layout.size, len(self.cameras.lens)
         k, points = 6 * lenses, len(self.points)
         system = _System.empty(n, size, lenses, points, len(self.tracks.point), self.bandwidth)
         lens_side, lens_corner, rhs_lens = np.zeros((6 * n, k)), np.zeros((k, k)), np.zeros(k)
@@ -175,10 +182,10 @@ class Adjustment:
         tie_of_point[ties.point] = np.arange(len(ties.point), dtype=np.int32)
         self.tie_residual = np.zeros((len(ties.point), 2))
         self.cost, _ = normal_equations.build(
-            self.rig.position,
-            self.rig.rotation,
-            self.rig.lens_id,
-            self.rig.lens,
+            self.cameras.position,
+            self.cameras.rotation,
+            self.cameras.lens_id,
+            self.cameras.lens,
             self.points,
             self.start,
             self.tracks.camera,
@@ -214,10 +221,10 @@ class Adjustment:
         """Reprojection residuals (M, 2) in pixels now."""
         out = np.empty((len(self.tracks.point), 2))
         normal_equations.residuals(
-            self.rig.position,
-            self.rig.rotation,
-            self.rig.lens_id,
-            self.rig.lens,
+            self.cameras.position,
+            self.cameras.rotation,
+            self.cameras.lens_id,
+            self.cameras.lens,
             self.points,
             self.tracks.point,
             self.tracks.camera,
@@ -235,21 +242,21 @@ class Adjustment:
         """Cameras minus records, drift, lag and height offset taken off, metres (N, 3)."""
         p, lay = self.priors, self.layout
         base = np.asarray(lay.offset)[p.group]
-        out = self.rig.position - p.position
+        out = self.cameras.position - p.position
         out[:, :2] -= lay.drift(self.common, p.group) + self.common[base + 4][:, None] * p.velocity
         out[:, 2] -= self.common[base + 3]
         return np.asarray(out)
 
     def _move(self, step_camera: Array, step_common: Array) -> None:
-        moves = np.zeros((len(self.rig), 6))
+        moves = np.zeros((len(self.cameras), 6))
         index = np.flatnonzero(self.free)
         moves[index] = step_camera.reshape(-1, 6)[self.slot[index]]
-        self.rig.position[:] += moves[:, :3]
-        self.rig.rotation[index] = self.rig.rotation[index] @ exp_rotation(moves[index, 3:])
+        self.cameras.position[:] += moves[:, :3]
+        self.cameras.rotation[index] = self.cameras.rotation[index] @ exp_rotation(moves[index, 3:])
         self.common += step_common
         lens = self.priors.lens + self.common[: self.layout.lens_columns].reshape(-1, 6)
-        self.rig.lens[:, F] = np.exp(lens[:, 0])
-        self.rig.lens[:, _LENS_COLUMNS[1:]] = lens[:, 1:]
+        self.cameras.lens[:, F] = np.exp(lens[:, 0])
+        self.cameras.lens[:, _LENS_COLUMNS[1:]] = lens[:, 1:]
 
     def _add_priors(self, band: Array, side: Array, corner: Array, rhs: Array, rhs_common: Array) -> None:
         p, lay = self.priors, self.layout
@@ -263,7 +270,7 @@ class Adjustment:
         base = np.asarray(lay.offset)[group]
         # attitude: log(R_recorded^T R) - bias
         bias = self.common[base[:, None] + np.arange(3)]
-        r = log_rotation(np.swapaxes(p.rotation[i], 1, 2) @ self.rig.rotation[i]) - bias
+        r = log_rotation(np.swapaxes(p.rotation[i], 1, 2) @ self.cameras.rotation[i]) - bias
         w = _weights(p.rotation_sigma[i])
         e2 = (r * r * w).sum(1)
         w = w * (1.0 / (1.0 + e2 / 25.0) ** 2)[:, None]
@@ -295,7 +302,7 @@ class Adjustment:
         w = _weights(p.position_sigma[i])
         e2 = (xy * xy * w[:, :2]).sum(1)
         robust = 1.0 / (1.0 + e2 / p.position_c) ** 2
-        self.gps_weight = np.ones(len(self.rig))
+        self.gps_weight = np.ones(len(self.cameras))
         self.gps_weight[i] = robust
         w[:, :2] *= robust[:, None]
         left = lay.knot_left[i]
@@ -415,12 +422,12 @@ def _solve(system: _System) -> tuple[Array, Array, Array]:
     return np.asarray(x - y @ common), np.asarray(common), np.asarray(information)
 
 
-def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
+def _order(tracks: Tracks, points: int, count: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
     """Place of each free camera in the band (-1 if held) and the band's width in cameras, as narrow as it goes."""
     index = np.flatnonzero(free)
     if len(index) == 0:
-        return np.full(cameras, -1, np.int32), 0
-    local = np.full(cameras, -1, np.int64)
+        return np.full(count, -1, np.int32), 0
+    local = np.full(count, -1, np.int64)
     local[index] = np.arange(len(index))
     use = free[tracks.camera]
     cam, pt = local[tracks.camera[use]], tracks.point[use]
@@ -433,7 +440,7 @@ def _order(tracks: Tracks, points: int, cameras: int, free: NDArray[np.bool_]) -
         width = int(np.abs(place[graph.row] - place[graph.col]).max()) if graph.nnz else 0
         if width < best[0]:
             best = (width, place)
-    slot = np.full(cameras, -1, np.int32)
+    slot = np.full(count, -1, np.int32)
     slot[index] = best[1]
     return slot, min(best[0], max(len(index) - 1, 0))
 

@@ -12,11 +12,11 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
-"""Columns of Rig.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
+"""Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class CameraBlock:
     """Cameras of one or several vehicles in a local frame (east, north, up about a common origin, metres).
 
     Attributes:
@@ -34,8 +34,8 @@ class Rig:
     def __len__(self) -> int:
         return len(self.position)
 
-    def take(self, index: NDArray[np.integer] | slice) -> "Rig":
-        """The rig of some of the cameras (lenses are shared)."""
+    def take(self, index: NDArray[np.integer] | slice) -> "CameraBlock":
+        """Some of the cameras (lenses are shared)."""
         return replace(self, position=self.position[index], rotation=self.rotation[index], lens_id=self.lens_id[index])
 
     def camera(self, i: int, origin: Array) -> Camera:
@@ -79,7 +79,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """What the cameras of a rig saw: points followed or matched through pictures.
+    """Observations of tie points in pictures: corners followed or features matched.
 
     Attributes:
         camera: int32 (M,), index of the camera of each observation.

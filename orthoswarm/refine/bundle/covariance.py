@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.refine.bundle.adjustment import Adjustment, Ground, Ties
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 
 Array = NDArray[np.float64]
@@ -28,24 +28,24 @@ HELD_SHARE = 0.8
 
 
 def frame_sigmas(
-    adjustment: Adjustment, c: float, ground: Ground, ties: Ties | None, tie_c: float, floor_m: float
+    adjustment: Adjustment, c: float, ground: HeightPrior, ties: MapTies | None, tie_c: float, floor_m: float
 ) -> tuple[Array, float]:
     """Ground error of each picture's centre (N,), metres (see RADIAL), and the sigma of the FoV in degrees."""
-    n = len(adjustment.rig)
+    n = len(adjustment.cameras)
     free = np.flatnonzero(adjustment.free)
     chosen = np.unique(np.r_[free[::EVERY], free[-1]])
     covariance, common = adjustment.covariance(chosen, c, ground, ties, tie_c)
     variance = np.array([_ground_variance(adjustment, int(i), q) for i, q in zip(chosen, covariance)])
     share = 1.0 if ties is None else HELD_SHARE
     sigma = np.hypot(share * np.sqrt(np.interp(np.arange(n), chosen, variance)), floor_m)
-    lens = adjustment.rig.lens[0]
+    lens = adjustment.cameras.lens[0]
     spread = float(np.sqrt(max(common[0, 0], 0.0)))
     f, width = float(lens[F]), int(lens[WIDTH])
     fov_sigma = abs(fov_rad(f * (1 + spread), width) - fov_rad(f * (1 - spread), width)) / 2
     return RADIAL * sigma, float(np.degrees(fov_sigma))
 
 
-def map_doubt(residual: Array, sigma_m: Array, gsd_m: float) -> float:
+def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     """How far a whole picture may be off by what its ties have in common, one sigma of an axis, metres.
 
     A map that suits the pictures badly (old, coarse, blurred) scatters ties and displaces all of them: the shift that
@@ -64,7 +64,7 @@ def map_doubt(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     return float(np.hypot(floor, TIE_SHARE * scatter))
 
 
-def unexplained(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array, near: int = 4) -> Array:
+def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array, near: int = 4) -> Array:
     """How far the map is from each picture where its ties agree on that and were not followed, float64 (N,), metres.
 
     A few ties that are off alone are wrong matches, or ground that changed; if most of those around a picture are
@@ -93,7 +93,7 @@ def unexplained(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: A
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
     """Mean variance of one axis of where the picture's centre ray meets the ground."""
-    rotation, height = adjustment.rig.rotation[i], max(float(adjustment.rig.position[i, 2]), 1.0)
+    rotation, height = adjustment.cameras.rotation[i], max(float(adjustment.cameras.position[i, 2]), 1.0)
     ray = rotation[:, 2]
     if ray[2] > -0.2:
         return height**2

@@ -16,7 +16,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Records:
+class FlightRecords:
     """Records of N frames in order of time.
 
     Attributes:
@@ -66,12 +66,14 @@ class Records:
         usual = float(np.median(speed)) if n else 0.0
         return np.asarray(np.where((speed > 3 * usual + 1)[:, None], 0.0, v))
 
-    def with_yaw(self, yaw: Array) -> "Records":
+    def with_yaw(self, yaw: Array) -> "FlightRecords":
         """The same with other headings."""
         return replace(self, yaw=yaw)
 
 
-def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_height_m: float = 100.0) -> Records:
+def read_records(
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_height_m: float = 100.0
+) -> FlightRecords:
     """Records of frames (in order); heights are `usual_height_m` where unknown."""
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
@@ -84,7 +86,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_
     position = np.column_stack([xy, np.where(has_height, height, filled)])
     time, timed = _times(frames)
     course = _course(xy)
-    return Records(
+    return FlightRecords(
         position,
         wrap_rad(np.where(has_yaw, yaw, course)),
         np.where(has_tilt, pitch, -np.pi / 2),

@@ -24,7 +24,7 @@ too (measured: 10 % on a lens of k1 = -0.4 seen straight down)."""
 _AGREES_SIGMAS = 2.0
 
 
-def unbelieved_offsets(adjustment: Adjustment) -> tuple[Array, Array]:
+def offsets_without_height_prior(adjustment: Adjustment) -> tuple[Array, Array]:
     """Offsets of the recorded heights by the pictures alone, after a step: metres and one sigma, float64 (G,) both.
 
     The reduced normal equations of the common unknowns without the belief in the heights give, with that belief P
@@ -43,12 +43,12 @@ def unbelieved_offsets(adjustment: Adjustment) -> tuple[Array, Array]:
     return np.asarray(offset[at]), np.sqrt(np.maximum(np.diag(inverse)[at], 0.0))
 
 
-def contradicted(adjustment: Adjustment) -> Flags:
+def contradicted_heights(adjustment: Adjustment) -> Flags:
     """Groups whose recorded heights the pictures contradict beyond doubt, bool (G,)."""
     sigma = np.array([m.height_sigma for m in adjustment.priors.models])
     if (sigma >= FREE_SIGMA_M).all() or not adjustment.information.size:
         return np.zeros(len(sigma), bool)
-    offset, doubt = unbelieved_offsets(adjustment)
+    offset, doubt = offsets_without_height_prior(adjustment)
     total = np.hypot(doubt, sigma)
     far = np.abs(offset) > np.maximum(_SIGMAS * total, _SHARE * _height(adjustment))
     return np.asarray(far & (sigma < FREE_SIGMA_M), np.bool_)
@@ -60,7 +60,7 @@ def release_heights(adjustment: Adjustment) -> Flags:
     Returns:
         bool (G,), groups whose heights were believed until now.
     """
-    wrong = contradicted(adjustment)
+    wrong = contradicted_heights(adjustment)
     if wrong.any():
         p = adjustment.priors
         models = [replace(m, height_sigma=FREE_SIGMA_M) if w else m for m, w in zip(p.models, wrong, strict=True)]
@@ -68,13 +68,13 @@ def release_heights(adjustment: Adjustment) -> Flags:
     return wrong
 
 
-def height_doubt(adjustment: Adjustment) -> float:
+def height_disagreement(adjustment: Adjustment) -> float:
     """How far heights that are believed disagree with the pictures, as a share of the height; 0 where they agree."""
     sigma = np.array([m.height_sigma for m in adjustment.priors.models])
     believed = sigma < FREE_SIGMA_M
     if not believed.any() or not adjustment.information.size:
         return 0.0
-    offset, doubt = unbelieved_offsets(adjustment)
+    offset, doubt = offsets_without_height_prior(adjustment)
     beyond = np.abs(offset) - _AGREES_SIGMAS * np.hypot(doubt, sigma)
     return float(np.maximum(beyond[believed], 0.0).max()) / _height(adjustment)
 
@@ -82,11 +82,11 @@ def height_doubt(adjustment: Adjustment) -> float:
 def log_focal_sigmas(adjustment: Adjustment) -> Array:
     """One sigma of the log of each lens's focal length at the last step, float64 (L,); infinite before one."""
     if not adjustment.information.size:
-        return np.full(len(adjustment.rig.lens), np.inf)
+        return np.full(len(adjustment.cameras.lens), np.inf)
     variance = np.diag(np.linalg.inv(adjustment.information))[: adjustment.layout.lens_columns : 6]
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _height(adjustment: Adjustment) -> float:
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    return max(float(np.median(adjustment.rig.position[:, 2])) - ground, 1.0)
+    return max(float(np.median(adjustment.cameras.position[:, 2])) - ground, 1.0)

@@ -118,7 +118,7 @@ def build(  # type: ignore[no-untyped-def]
     """Accumulate the reduced normal equations of all points.
 
     Args (P points, M observations sorted by point, N cameras, n free ones, L lenses):
-        position, rotation, lens_id, lens: the rig. points: (P, 3). start: (P + 1,), first observation of a point.
+        position, rotation, lens_id, lens: the cameras. points: (P, 3). start: (P + 1,), first observation of a point.
         camera, uv, weight: (M,), (M, 2), (M,) 1 / sigma^2. slot: (N,) place of a free camera in the band, -1 if held.
         c: robust scale of reprojection. height, height_weight: (P,) prior on Z, robust with height_c, plus a
             constant weight height_soft that is not robust.

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
-class Sights:
+class BestViews:
     """For each point the observation nearest its camera's nadir, and how well the point is known.
 
     Attributes (P points): camera: int32, -1 where there is none. count: observations with weight > 0.5.
@@ -25,10 +25,12 @@ class Sights:
     off_nadir: Array
 
 
-def sights(rig: Rig, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None) -> Sights:
+def best_views(
+    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None
+) -> BestViews:
     """Summaries of the points' observations; `own` (N,) limits the choice of camera."""
     n = len(points)
-    distance = np.hypot(*(rig.position[tracks.camera, :2] - points[tracks.point, :2]).T)
+    distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
     usable = obs_weight > 0.5
     if own is not None:
         usable &= own[tracks.camera]
@@ -40,7 +42,7 @@ def sights(rig: Rig, tracks: Tracks, points: Array, obs_weight: Array, own: NDAr
     total = np.bincount(tracks.point, minlength=n)
     weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
     count = np.bincount(tracks.point[obs_weight > 0.5], minlength=n)
-    return Sights(
+    return BestViews(
         np.where(ok, tracks.camera[best], -1).astype(np.int32),
         count.astype(np.int32),
         weight,

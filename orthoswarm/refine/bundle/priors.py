@@ -10,7 +10,7 @@ Ints = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True)
-class GroupModel:
+class GroupPriors:
     """Sigmas of what the frames of one group (a vehicle's sortie) have in common; SI and radians.
 
     Attributes:
@@ -33,7 +33,7 @@ class Priors:
     """Records of N cameras in G groups, and of L lenses.
 
     Attributes:
-        position: float64 (N, 3), recorded position in the rig's frame (heights already with a sensible level).
+        position: float64 (N, 3), recorded position in the block's frame (heights already with a sensible level).
         position_sigma: float64 (N, 3), infinite where unknown.
         rotation: float64 (N, 3, 3), recorded attitude. rotation_sigma: float64 (N, 3) about the camera's axes.
         velocity: float64 (N, 2), ground velocity in m/s for the lag; zeros where time is unknown.
@@ -48,7 +48,7 @@ class Priors:
     rotation_sigma: Array
     velocity: Array
     group: Ints
-    models: tuple[GroupModel, ...]
+    models: tuple[GroupPriors, ...]
     lens: Array
     lens_sigma: Array
     position_c: float = 9.0

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.refine.bundle.adjustment import Adjustment
-from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 from orthoswarm.refine.bundle.priors import Priors
 
 Array = NDArray[np.float64]
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 class Snapshot:
     """What steps change in an adjustment (see Adjustment for the attributes); its order is found again when needed."""
 
-    rig: Rig
+    cameras: CameraBlock
     tracks: Tracks
     priors: Priors
     points: Array
@@ -28,17 +28,20 @@ class Snapshot:
     @classmethod
     def of(cls, adj: Adjustment) -> "Snapshot":
         """An adjustment as it is."""
-        rig = replace(
-            adj.rig, position=adj.rig.position.copy(), rotation=adj.rig.rotation.copy(), lens=adj.rig.lens.copy()
+        cameras = replace(
+            adj.cameras,
+            position=adj.cameras.position.copy(),
+            rotation=adj.cameras.rotation.copy(),
+            lens=adj.cameras.lens.copy(),
         )
         return cls(
-            rig, adj.tracks, adj.priors, adj.points.copy(), adj.free, adj.common.copy(), adj.obs_weight.copy(),
+            cameras, adj.tracks, adj.priors, adj.points.copy(), adj.free, adj.common.copy(), adj.obs_weight.copy(),
             adj.point_inverse.copy(),
         )  # fmt: skip
 
     def restored(self) -> Adjustment:
         """The adjustment as it was; the snapshot stays as it is."""
-        out = Adjustment.begin(self.rig, self.tracks, self.priors, self.points, self.free)
+        out = Adjustment.begin(self.cameras, self.tracks, self.priors, self.points, self.free)
         out.common[:] = self.common
         out.obs_weight[:] = self.obs_weight
         out.point_inverse[:] = self.point_inverse

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.refine.bundle.flight_records import Records
+from orthoswarm.refine.bundle.flight_records import FlightRecords
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -49,7 +49,7 @@ class Calibration:
 
 
 def calibrate(
-    records: Records, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
+    records: FlightRecords, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
 ) -> Calibration:
     """Compare the flow of picture pairs along each leg with what the records predict.
 
@@ -102,7 +102,7 @@ def _with_scale(
 
 
 def _heading(
-    records: Records, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
+    records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
 ) -> tuple[Array, list[str]]:
     """Offset of the recorded yaw for each frame: whole legs that are turned round, or headings from the course."""
     offset = np.zeros(len(leg))
@@ -139,7 +139,7 @@ def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
 
 
 def _pairs(
-    records: Records, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
+    records: FlightRecords, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
 ) -> list[tuple[int, int]]:
     """Pairs along a leg whose expected flow is a fifth of the picture."""
     if len(members) < 2:

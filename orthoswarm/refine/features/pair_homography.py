@@ -14,7 +14,7 @@ TURNED_CORNERS, TURNED_LEAST, TURNED_SHARE = 1000, 30, 0.25
 """Corners that are described, the fewest pairs that must agree, and the share of them."""
 
 
-def seen_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
+def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
     """The homography that flow over several octaves shows, whatever was recorded; None where it shows none.
 
     For angles that are wrong by degrees, or that nobody recorded of a camera that sways. Begun from the prediction

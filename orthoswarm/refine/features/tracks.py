@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
-from orthoswarm.refine.features.pair_homography import apply_homography, is_inside, seen_homography, shifted_prediction
+from orthoswarm.refine.features.pair_homography import (
+    apply_homography,
+    is_inside,
+    measured_homography,
+    shifted_prediction,
+)
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -113,7 +118,7 @@ class Tracker:
             if shifted is not None:
                 good, found, predicted = self._better(gray, half, shifted, (good, found, predicted))
         if good.sum() < MISSED * inside.sum():
-            seen = seen_homography(self._gray, gray, live.uv, predicted)
+            seen = measured_homography(self._gray, gray, live.uv, predicted)
             if seen is not None:
                 good, found, predicted = self._better(gray, half, seen, (good, found, predicted))
                 self._chain[-1] = predicted @ self._chain[-2]

@@ -9,8 +9,8 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.initial.heading import tag_yaw
-from orthoswarm.refine.initial.initial_orientation import Start2D
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Records
+from orthoswarm.refine.initial.initial_orientation import InitialOrientation
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecords
 
 _FLIP = float(np.radians(150.0))
 _HEADING_OFFSET_DEG = 5.0
@@ -24,7 +24,7 @@ _LAG_M = 1.0
 _LISTED = 3
 
 
-def flipped_yaw(records: Records, start: Start2D) -> Flags:
+def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
     """Photos whose recorded yaw is turned by 180 degrees against the picture's, bool (N,)."""
     flipped = np.zeros(len(records), bool)
     for v, tag in enumerate(start.tags):
@@ -35,7 +35,7 @@ def flipped_yaw(records: Records, start: Start2D) -> Flags:
     return flipped
 
 
-def findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     """Sentences on everything in the records that the pictures contradict, but heights: those are told in the end."""
     found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
     found += _position_findings(frames, records, start)
@@ -44,7 +44,7 @@ def findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[
 
 
 def unplaced_reasons(
-    frames: Sequence[Frame], records: Records, placed: Flags, damaged: Mapping[int, str]
+    frames: Sequence[Frame], records: PhotoRecords, placed: Flags, damaged: Mapping[int, str]
 ) -> dict[int, str]:
     """Why photos that no other holds could not be placed by pictures."""
     reasons = dict(damaged)
@@ -70,11 +70,11 @@ def runs(names: Sequence[str], flags: Flags) -> str:
     return text if len(parts) <= _LISTED else f"{text} and {len(parts) - _LISTED} more runs"
 
 
-def _name(frames: Sequence[Frame], records: Records, vehicle: int) -> str:
+def _name(frames: Sequence[Frame], records: PhotoRecords, vehicle: int) -> str:
     return frames[int(np.argmax(records.vehicle == vehicle))].vehicle
 
 
-def _yaw_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+def _yaw_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     names = [f.image for f in frames]
     found = []
     flips = flipped_yaw(records, start)
@@ -97,7 +97,7 @@ def tilt_of(level: Array) -> Array:
     return np.asarray(np.arccos(np.clip(level[:, 2, 2], -1.0, 1.0)))
 
 
-def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     found = []
     tagged = records.tag_level()
     between = np.degrees(tilt_of(np.asarray(start.level @ np.swapaxes(tagged, 1, 2))))
@@ -119,7 +119,9 @@ def _tilt_findings(frames: Sequence[Frame], records: Records, start: Start2D) ->
     return found
 
 
-def height_findings(frames: Sequence[Frame], records: Records, start: Start2D, adjustment: Adjustment) -> list[str]:
+def height_findings(
+    frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation, adjustment: Adjustment
+) -> list[str]:
     """Sentences on recorded heights that the adjusted pictures contradict, and on heights that are not recorded.
 
     Metres per pixel come from the way flown, so that a height is known as well as the focal length.
@@ -130,8 +132,8 @@ def height_findings(frames: Sequence[Frame], records: Records, start: Start2D, a
     """
     found, without = [], []
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    height = adjustment.rig.position[:, 2] - ground
-    doubt = log_focal_sigmas(adjustment)[adjustment.rig.lens_id]
+    height = adjustment.cameras.position[:, 2] - ground
+    doubt = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
     for v in range(len(start.tags)):
         rows = records.vehicle == v
         who = _name(frames, records, v)
@@ -157,7 +159,7 @@ def contradiction(who: str, said_m: float, seen_m: float) -> str:
     return f"{who}: the recorded height of {said_m:.0f} m contradicts the pictures, which say {seen_m:.0f} m"
 
 
-def _position_findings(frames: Sequence[Frame], records: Records, start: Start2D) -> list[str]:
+def _position_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     found = []
     off = ~start.gps_ok
     if off.any():
@@ -174,7 +176,7 @@ def _position_findings(frames: Sequence[Frame], records: Records, start: Start2D
     return found
 
 
-def _overlap_findings(records: Records, start: Start2D) -> list[str]:
+def _overlap_findings(records: PhotoRecords, start: InitialOrientation) -> list[str]:
     sizes = np.bincount(start.component)
     if len(records) < 2 or (sizes > 1).sum() <= 1:
         return []

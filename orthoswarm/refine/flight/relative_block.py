@@ -13,11 +13,11 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way, split_legs
 from orthoswarm.oldpickles import set_fields
 from orthoswarm.refine.bundle.adjustment import Adjustment, log_rotation
-from orthoswarm.refine.bundle.block_arrays import K1, Rig, Tracks
-from orthoswarm.refine.bundle.flight_records import Records, read_records
+from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
+from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.height_consistency import FREE_SIGMA_M
-from orthoswarm.refine.bundle.observation_selection import Sights, sights
-from orthoswarm.refine.bundle.priors import GroupModel, Priors
+from orthoswarm.refine.bundle.observation_selection import BestViews, best_views
+from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.features.tracks import CELL_PX, follow, predicted_homography
@@ -54,7 +54,7 @@ class Flight:
     """
 
     frames: Sequence[Frame]
-    records: Records
+    records: FlightRecords
     leg: NDArray[np.int32]
     pictures: Pictures
     calibration: Calibration
@@ -68,16 +68,16 @@ class Flight:
         """From a pickle, perhaps of an earlier version."""
         set_fields(self, state)
 
-    def rig(self) -> Rig:
+    def cameras(self) -> CameraBlock:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
-        return self.adjustment.rig.take(slice(0, len(self.frames)))
+        return self.adjustment.cameras.take(slice(0, len(self.frames)))
 
-    def sights(self, some: NDArray[np.bool_] | None = None) -> Sights:
+    def best_views(self, some: NDArray[np.bool_] | None = None) -> BestViews:
         """Summaries of the points' observations; pictures are chosen among the vehicle's own, or some (N,) of them."""
         adj = self.adjustment
-        own = np.zeros(len(adj.rig), bool)
+        own = np.zeros(len(adj.cameras), bool)
         own[: len(self.frames)] = True if some is None else some
-        return sights(adj.rig, adj.tracks, adj.points, adj.obs_weight, own)
+        return best_views(adj.cameras, adj.tracks, adj.points, adj.obs_weight, own)
 
 
 def open_flight(
@@ -119,8 +119,8 @@ def weigh_records(flight: Flight) -> None:
     """
     adj = flight.adjustment
     p = adj.priors
-    height = adj.rig.position[:, 2] - p.position[:, 2]
-    attitude = log_rotation(np.swapaxes(p.rotation, 1, 2) @ adj.rig.rotation)
+    height = adj.cameras.position[:, 2] - p.position[:, 2]
+    attitude = log_rotation(np.swapaxes(p.rotation, 1, 2) @ adj.cameras.rotation)
     z = float(np.clip(_jitter(height[:, None])[0], *HEIGHT_SIGMA_M))
     turn = np.clip(_jitter(attitude), *ATTITUDE_SIGMA_RAD)
     sigma = p.position_sigma.copy()
@@ -134,7 +134,7 @@ def weigh_records(flight: Flight) -> None:
 
 def strong_lens(flight: Flight) -> bool:
     """True if the lens distorts so much that two parameters do not describe it."""
-    return bool(np.abs(flight.adjustment.rig.lens[:, K1]).max() >= STRONG_K1)
+    return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= STRONG_K1)
 
 
 def free_strong_lens(flight: Flight) -> bool:
@@ -147,7 +147,7 @@ def free_strong_lens(flight: Flight) -> bool:
     if not strong_lens(flight):
         return False
     width = flight.pictures.size[0]
-    sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.rig.lens), 1))
+    sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.cameras.lens), 1))
     adj.priors = replace(adj.priors, lens_sigma=sigma)
     return True
 
@@ -158,7 +158,7 @@ def _jitter(values: Array) -> Array:
     return np.asarray(1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0) / np.sqrt(2.0))
 
 
-def _track(records: Records, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:
+def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:
     rotation, steps = records.rotation(), records.steps()
     width, height = pictures.size
     f = calibration.focal_px
@@ -175,18 +175,18 @@ def _track(records: Records, pictures: Pictures, calibration: Calibration) -> tu
     return follow(len(rotation), pictures.gray, prediction, cell_px=CELL_PX // 2 if few else CELL_PX)
 
 
-def _begin(records: Records, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
+def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
     n = len(records.position)
     width, height = pictures.size
     position = records.position.copy()
     position[:, 2], z_sigma = _height_prior(records, calibration)
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
-    rig = Rig(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
+    cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
     horizontal = np.where(np.isfinite(records.position_sigma), np.maximum(records.position_sigma, 0.02), 1.5)
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
-    model = GroupModel(
+    model = GroupPriors(
         height_sigma=1.0 if calibration.trusted_height else FREE_SIGMA_M,
         lag_sigma=0.5 if records.timed else 0.3,
         drift_sigma=15.0 if not np.isfinite(records.position_sigma).all() else 0.0,
@@ -202,19 +202,19 @@ def _begin(records: Records, pictures: Pictures, calibration: Calibration, track
         np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
         np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
     )
-    return Adjustment.begin(rig, tracks, priors, first_points(rig, tracks))
+    return Adjustment.begin(cameras, tracks, priors, first_points(cameras, tracks))
 
 
-def first_points(rig: Rig, tracks: Tracks) -> Array:
+def first_points(cameras: CameraBlock, tracks: Tracks) -> Array:
     """Where the rays of each track meet the level ground, averaged: float64 (P, 3)."""
-    ground = rig.to_ground(tracks.camera, tracks.uv, np.zeros(len(tracks.camera)))
+    ground = cameras.to_ground(tracks.camera, tracks.uv, np.zeros(len(tracks.camera)))
     ok = np.isfinite(ground).all(1)
     count = np.maximum(np.bincount(tracks.point[ok], minlength=tracks.count), 1)
     xy = [np.bincount(tracks.point[ok], ground[ok, a], minlength=tracks.count) / count for a in range(2)]
     return np.column_stack([*xy, np.zeros(tracks.count)])
 
 
-def _height_prior(records: Records, calibration: Calibration) -> tuple[Array, Array]:
+def _height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Array, Array]:
     """Heights over the ground as recorded and their sigmas; one height where the record cannot be trusted.
 
     A height that leaves those around it may be a spike, or the climb after the takeoff: the height of the others is
@@ -231,4 +231,4 @@ def _height_prior(records: Records, calibration: Calibration) -> tuple[Array, Ar
 
 def fov_deg(flight: Flight) -> float:
     """The vehicle's field of view now, degrees."""
-    return float(np.degrees(fov_rad(float(flight.adjustment.rig.lens[0, 0]), flight.pictures.size[0])))
+    return float(np.degrees(fov_rad(float(flight.adjustment.cameras.lens[0, 0]), flight.pictures.size[0])))

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.refine.bundle.adjustment import Adjustment, Ground, log_rotation
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, log_rotation
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
 from orthoswarm.refine.bundle.height_consistency import FREE_SIGMA_M, release_heights
-from orthoswarm.refine.bundle.priors import GroupModel, Priors
+from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.flight.relative_block import first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
 from orthoswarm.refine.initial.planar_similarity import Array
@@ -61,8 +61,8 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True, schedule: Sequen
     Returns:
         The adjustment, its observations' sigmas scaled to what is left of them, its attitude priors to their scatter.
     """
-    rig, tracks = start.rig, start.tracks
-    adjustment = Adjustment.begin(rig, tracks, _priors(start), first_points(rig, tracks))
+    cameras, tracks = start.cameras, start.tracks
+    adjustment = Adjustment.begin(cameras, tracks, _priors(start), first_points(cameras, tracks))
     for k, stage in enumerate(schedule):
         if k == 1:
             _free_lens(adjustment, start, full=False)
@@ -93,16 +93,16 @@ def believed_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.b
 
 def _settled_m(adjustment: Adjustment) -> float:
     """A step that moves no camera farther than this is the last one."""
-    return 2e-4 * float(np.median(np.abs(adjustment.rig.position[:, 2])))
+    return 2e-4 * float(np.median(np.abs(adjustment.cameras.position[:, 2])))
 
 
-def plane(adjustment: Adjustment) -> Ground:
+def plane(adjustment: Adjustment) -> HeightPrior:
     """Belief that all points lie near height 0."""
     zero = np.zeros(len(adjustment.points))
-    return Ground(zero, _PLANE_SIGMA_M, 20.0, c=1e3)
+    return HeightPrior(zero, _PLANE_SIGMA_M, 20.0, c=1e3)
 
 
-def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_SIGMA_M) -> Ground:
+def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_SIGMA_M) -> HeightPrior:
     """Belief that the median of all points lies at a height; it says nothing of how they scatter about it.
 
     Each point is asked to move as the median must, all of them together with the weight of one observation.
@@ -110,18 +110,18 @@ def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_
     z = adjustment.points[:, 2]
     middle = float(np.median(z)) if len(z) else 0.0
     soft = sigma_m * float(np.sqrt(max(len(z), 1)))
-    return Ground(z - middle + level_m, 1e6, soft)
+    return HeightPrior(z - middle + level_m, 1e6, soft)
 
 
 def _priors(start: SparseStart) -> Priors:
-    n, lenses = len(start.rig), len(start.rig.lens)
+    n, lenses = len(start.cameras), len(start.cameras.lens)
     lens = np.zeros((lenses, 6))
-    lens[:, 0], lens[:, 1] = np.log(start.rig.lens[:, F]), start.rig.lens[:, K1]
+    lens[:, 0], lens[:, 1] = np.log(start.cameras.lens[:, F]), start.cameras.lens[:, K1]
     held = np.tile([_HELD, _HELD, 0.0, 0.0, 0.0, 0.0], (lenses, 1))
     return Priors(
         position=start.position_prior,
         position_sigma=start.position_sigma,
-        rotation=start.rig.rotation.copy(),
+        rotation=start.cameras.rotation.copy(),
         rotation_sigma=np.full((n, 3), _FIRST_ATTITUDE_SIGMA),
         velocity=start.velocity,
         group=start.segment,
@@ -131,13 +131,13 @@ def _priors(start: SparseStart) -> Priors:
     )
 
 
-def _models(start: SparseStart) -> tuple[GroupModel, ...]:
+def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
     models = []
     for s in range(int(start.segment.max()) + 1):
         rows = start.segment == s
         stated = np.isfinite(start.records.position_sigma[rows]).mean() > 0.5
         models.append(
-            GroupModel(
+            GroupPriors(
                 bias_sigma=_BIAS_SIGMA,
                 height_sigma=(0.1 if stated else 1.0) if start.height_known[rows].mean() > 0.5 else FREE_SIGMA_M,
                 lag_sigma=0.2 if stated else 0.5,
@@ -152,11 +152,11 @@ def _models(start: SparseStart) -> tuple[GroupModel, ...]:
 def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> None:
     """Priors of the lens about what tags say of the focal length and about no distortion."""
     p = adjustment.priors
-    lenses = len(start.rig.lens)
-    seen = np.bincount(start.rig.lens_id[adjustment.tracks.camera], minlength=lenses)
-    photos = np.bincount(start.rig.lens_id, minlength=lenses)
+    lenses = len(start.cameras.lens)
+    seen = np.bincount(start.cameras.lens_id[adjustment.tracks.camera], minlength=lenses)
+    photos = np.bincount(start.cameras.lens_id, minlength=lenses)
     rich = (seen >= _FULL_LENS_OBSERVATIONS) & (photos >= 8) & full
-    width = start.rig.lens[:, WIDTH]
+    width = start.cameras.lens[:, WIDTH]
     lens = np.zeros((lenses, 6))
     lens[:, 0] = start.log_focal
     sigma = np.zeros((lenses, 6))
@@ -186,7 +186,7 @@ def _attitude_from_scatter(adjustment: Adjustment) -> None:
     for g in range(len(p.models)):
         rows = np.flatnonzero(p.group == g)
         bias = adjustment.group_values(g)[0]
-        off = log_rotation(np.swapaxes(p.rotation[rows], 1, 2) @ adjustment.rig.rotation[rows]) - bias
+        off = log_rotation(np.swapaxes(p.rotation[rows], 1, 2) @ adjustment.cameras.rotation[rows]) - bias
         scatter = 1.4826 * np.median(np.abs(off), axis=0)
         sigma[rows] = np.clip(_SCATTERS * scatter, *_ATTITUDE_RANGE)
     adjustment.priors = replace(p, rotation_sigma=sigma)
@@ -200,7 +200,7 @@ def _rescale_sigmas(adjustment: Adjustment) -> None:
     seen = off[np.isfinite(off)]
     if len(seen) < 20:
         return
-    unknowns = 3 * len(adjustment.points) + 6 * len(adjustment.rig)
+    unknowns = 3 * len(adjustment.points) + 6 * len(adjustment.cameras)
     freedom = max(1.0 - unknowns / (2.0 * len(off)), 0.2)
     scale = float(np.median(seen)) / (1.1774 * np.sqrt(freedom))
     sigma = np.maximum(tracks.sigma_px * np.float32(scale), np.float32(_SMALLEST_SIGMA_PX))
@@ -210,4 +210,4 @@ def _rescale_sigmas(adjustment: Adjustment) -> None:
 def heights_above_ground(adjustment: Adjustment) -> Array:
     """Height of each camera over the median of the points, float64 (N,)."""
     level = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    return np.asarray(adjustment.rig.position[:, 2] - level)
+    return np.asarray(adjustment.cameras.position[:, 2] - level)

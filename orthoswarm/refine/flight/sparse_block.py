@@ -85,7 +85,7 @@ def flight_of(
     yaw = wrap_rad(start.plane.yaw[rows])
     mine = list(warnings)
     calibration = Calibration(
-        float(adjustment.rig.lens[0, F]),
+        float(adjustment.cameras.lens[0, F]),
         float(np.median(heights_above_ground(adjustment))),
         wrap_rad(yaw - records.yaw),
         bool(believed[rows].any()),
@@ -102,8 +102,8 @@ def flight_of(
 
 def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
     """The same in pixels of pictures reduced `step` times to a size (columns, rows), its weights computed anew."""
-    rig, t, p = adjustment.rig, adjustment.tracks, adjustment.priors
-    lens, lens_prior, lens_sigma = rig.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
+    cameras, t, p = adjustment.cameras, adjustment.tracks, adjustment.priors
+    lens, lens_prior, lens_sigma = cameras.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
     lens[:, [F, CX, CY]] /= step
     lens[:, WIDTH], lens[:, HEIGHT] = size
     lens_prior[:, 0] -= np.log(step)
@@ -111,7 +111,7 @@ def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjus
     lens_sigma[:, 4:] /= step
     tracks = Tracks(t.camera, t.point, (t.uv + 0.5) / step - 0.5, (t.sigma_px / np.float32(step)).astype(np.float32))
     priors = replace(p, lens=lens_prior, lens_sigma=lens_sigma)
-    out = Adjustment.begin(replace(rig, lens=lens), tracks, priors, adjustment.points)
+    out = Adjustment.begin(replace(cameras, lens=lens), tracks, priors, adjustment.points)
     out.common[:] = adjustment.common
     common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
     common_lens[:, 4:] /= step

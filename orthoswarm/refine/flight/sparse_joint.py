@@ -16,7 +16,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
-from orthoswarm.refine.bundle.priors import GroupModel, Priors
+from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_adjustment import believed_heights, datum, solve_sparse
@@ -33,7 +33,7 @@ _OWN_CENTRE_SHARE = 0.004
 _HELD_POSITION_M = 0.3
 _HELD_ATTITUDE = float(np.radians(0.3))
 _HELD_LENS = 0.003
-_MOVABLE = GroupModel(
+_MOVABLE = GroupPriors(
     bias_sigma=(_HELD_ATTITUDE, _HELD_ATTITUDE, _HELD_ATTITUDE), height_sigma=1.0, lag_sigma=0.0, drift_sigma=15.0,
     drift_bend=0.5, knot_every=60,
 )  # fmt: skip
@@ -69,10 +69,10 @@ def open_sparse_flights(
     start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
     believed = believed_heights(adjustment, start)
-    focal_sigma = log_focal_sigmas(adjustment)[adjustment.rig.lens_id]
+    focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
     if int(records.vehicle.max()) < _MOST_LENSES:
         adjustment = own_lenses(adjustment, start)
-        focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.rig.lens_id])
+        focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
     found = height_findings(frames, start.records, start.plane, adjustment)
     told = _told([*start.warnings, *found], [part[0].vehicle for part in units])
     flights, first = [], 0
@@ -98,15 +98,15 @@ def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
     """Let every vehicle have its own lens, close to the one that it shared, and adjust on."""
     vehicle = start.records.vehicle
     first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
-    lens = adjustment.rig.lens[adjustment.rig.lens_id[first]].copy()
+    lens = adjustment.cameras.lens[adjustment.cameras.lens_id[first]].copy()
     p = adjustment.priors
     sigma = np.empty((len(lens), 6))
     sigma[:, :4] = _OWN_LENS_SIGMA
     sigma[:, 4:] = _OWN_CENTRE_SHARE * lens[:, 6:7]
-    sigma[p.lens_sigma[adjustment.rig.lens_id[first]] == 0] = 0.0
-    rig = replace(adjustment.rig, lens=lens, lens_id=vehicle.astype(np.int32))
+    sigma[p.lens_sigma[adjustment.cameras.lens_id[first]] == 0] = 0.0
+    cameras = replace(adjustment.cameras, lens=lens, lens_id=vehicle.astype(np.int32))
     priors = replace(p, lens=np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]]), lens_sigma=sigma)
-    own = Adjustment.begin(rig, adjustment.tracks, priors, adjustment.points)
+    own = Adjustment.begin(cameras, adjustment.tracks, priors, adjustment.points)
     own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
     for _ in range(_OWN_LENS_STEPS):
         own.step(9.0, datum(own))
@@ -115,7 +115,7 @@ def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
 
 def _apart(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
     """The adjustment of some photos by themselves, as found together with all others."""
-    local = np.full(len(adjustment.rig), -1, np.int32)
+    local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)
     t = adjustment.tracks
     mine = local[t.camera] >= 0
@@ -123,20 +123,22 @@ def _apart(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) 
     kept = np.flatnonzero(mine & (count[t.point] >= 2))
     points, point = np.unique(t.point[kept], return_inverse=True)
     tracks = Tracks(local[t.camera[kept]], point.reshape(-1).astype(np.int32), t.uv[kept], t.sigma_px[kept])
-    rig = adjustment.rig.take(rows)
-    lens_row = int(rig.lens_id[0])
-    rig = replace(rig, lens=rig.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
-    lens = np.concatenate([[np.log(rig.lens[0, 0])], rig.lens[0, 1:6]])[None]
+    cameras = adjustment.cameras.take(rows)
+    lens_row = int(cameras.lens_id[0])
+    cameras = replace(cameras, lens=cameras.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
+    lens = np.concatenate([[np.log(cameras.lens[0, 0])], cameras.lens[0, 1:6]])[None]
     free = adjustment.priors.lens_sigma[lens_row] > 0
     priors = Priors(
-        position=rig.position.copy(),
+        position=cameras.position.copy(),
         position_sigma=np.full((len(rows), 3), _HELD_POSITION_M),
-        rotation=rig.rotation.copy(),
+        rotation=cameras.rotation.copy(),
         rotation_sigma=np.full((len(rows), 3), _HELD_ATTITUDE),
         velocity=start.velocity[rows],
         group=np.zeros(len(rows), np.int32),
         models=(_MOVABLE,),
         lens=lens,
-        lens_sigma=np.where(free, _HELD_LENS * np.array([1, 1, 1, 1, rig.lens[0, 6], rig.lens[0, 6]]), 0.0)[None],
+        lens_sigma=np.where(free, _HELD_LENS * np.array([1, 1, 1, 1, cameras.lens[0, 6], cameras.lens[0, 6]]), 0.0)[
+            None
+        ],
     )
-    return Adjustment.begin(rig, tracks, priors, adjustment.points[points])
+    return Adjustment.begin(cameras, tracks, priors, adjustment.points[points])

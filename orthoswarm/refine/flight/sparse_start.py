@@ -11,16 +11,16 @@ import numpy as np
 
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, F, Rig, Tracks
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock, F, Tracks
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
 from orthoswarm.refine.flight.record_findings import findings, flipped_yaw, unplaced_reasons
-from orthoswarm.refine.initial.initial_orientation import Start2D, start_in_plane
-from orthoswarm.refine.initial.lens_groups import by_vehicle, told_apart
+from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
+from orthoswarm.refine.initial.lens_groups import lens_per_vehicle, split_unlike_lenses
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, Progress, ReadGray, Run, build_pair_graph, serial
 from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, Records
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments
 
@@ -36,7 +36,7 @@ class SparseStart:
     """Everything that the adjustment of N photos needs, in a local frame; pixels are those of the full pictures.
 
     Attributes:
-        rig: start values. tracks: observations of points, length 2 to 20.
+        cameras: start values. tracks: observations of points, length 2 to 20.
         segment: int32 (N,), attitude bias, height offset and lag are common to a segment.
         component: int32 (N,), connected part of the pair graph, the largest is 0.
         position_prior: float64 (N, 3), recorded positions; where the receiver is an outlier, the network's.
@@ -50,7 +50,7 @@ class SparseStart:
         records: what the photos recorded. pairs: pairs tried and matched.
     """
 
-    rig: Rig
+    cameras: CameraBlock
     tracks: Tracks
     segment: Ints
     component: Ints
@@ -66,12 +66,14 @@ class SparseStart:
     yaw_flipped: Flags
     metres_per_pixel: Array
     warnings: list[str]
-    plane: Start2D
-    records: Records
+    plane: InitialOrientation
+    records: PhotoRecords
     pairs: tuple[int, int]
 
 
-def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, share_lenses: bool = False) -> Records:
+def read_records(
+    frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, share_lenses: bool = False
+) -> PhotoRecords:
     """What frames recorded, as arrays in the local frame.
 
     Args:
@@ -91,7 +93,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, sha
     time_s = np.array([np.nan if f.time_s is None else f.time_s for f in frames], float)
     level = np.where(np.isfinite(height), height, altitude)
     hints = [[f.fov_hint_rad for f, k in zip(frames, lens) if k == n] for n in range(int(lens.max()) + 1)]
-    return Records(
+    return PhotoRecords(
         position=xy[:, 0] + 1j * xy[:, 1],
         position_sigma=_column(frames, "position_sigma_m"),
         time_s=time_s,
@@ -112,7 +114,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, sha
 
 def sparse_start(
     frames: Sequence[Frame],
-    records: Records,
+    records: PhotoRecords,
     read_gray: ReadGray,
     run: Run = serial,
     progress: Progress | None = None,
@@ -130,19 +132,19 @@ def sparse_start(
     builder = PairGraphBuilder(frames, records, read_gray, run, progress)
     start = build_pair_graph(builder)
     if len(records.fov_hint) <= int(records.vehicle.max()):  # vehicles share lenses by name
-        alone = start_in_plane(by_vehicle(records), builder.pairs(), builder.features)
-        records = told_apart(records, alone)
+        alone = find_initial_orientation(lens_per_vehicle(records), builder.pairs(), builder.features)
+        records = split_unlike_lenses(records, alone)
         if records is not builder.records:
-            start = start_in_plane(records, builder.pairs(), builder.features)
+            start = find_initial_orientation(records, builder.pairs(), builder.features)
     return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
 
 
 def assemble(
     frames: Sequence[Frame],
-    records: Records,
+    records: PhotoRecords,
     features: Sequence[Features],
     pairs: Sequence[Pair],
-    start: Start2D,
+    start: InitialOrientation,
     damaged: Mapping[int, str],
     tried: int,
 ) -> SparseStart:
@@ -165,7 +167,7 @@ def assemble(
     held[np.unique(tracks.camera)] = True
     velocity = records.velocity()
     return SparseStart(
-        rig=_rig(records, start),
+        cameras=_rig(records, start),
         tracks=tracks,
         segment=records.segment,
         component=start.component,
@@ -187,16 +189,16 @@ def assemble(
     )
 
 
-def _rig(records: Records, start: Start2D) -> Rig:
+def _rig(records: PhotoRecords, start: InitialOrientation) -> CameraBlock:
     position = np.stack([start.position.real, start.position.imag, start.height], axis=1)
     lens = np.zeros((len(start.focal), 8))
     first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
     lens[:, F], lens[:, K1] = start.focal, start.k1
     lens[:, WIDTH], lens[:, HEIGHT] = records.width[first], records.rows[first]
-    return Rig(position, start.rotation(), records.lens.astype(np.int32), lens)
+    return CameraBlock(position, start.rotation(), records.lens.astype(np.int32), lens)
 
 
-def _position_priors(records: Records, start: Start2D) -> tuple[Array, Array, Flags]:
+def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[Array, Array, Flags]:
     """Recorded positions with their sigmas (N, 3) east, north, up, and where heights are recorded and possible.
 
     A position that states its own sigma (RTK) lags by the same time on all photos; others by a time that varies.

@@ -62,18 +62,18 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         k = int(np.searchsorted(strong, i))
         a, b = strong[max(k - 1, 0)], strong[min(k, len(strong) - 1)]
         t = 0.5 if time[b] == time[a] else float(np.clip((time[i] - time[a]) / (time[b] - time[a]), 0.0, 1.0))
-        straight = adj.rig.position[a] * (1 - t) + adj.rig.position[b] * t
-        offset = (adj.rig.position[a] - recorded[a]) * (1 - t) + (adj.rig.position[b] - recorded[b]) * t
+        straight = adj.cameras.position[a] * (1 - t) + adj.cameras.position[b] * t
+        offset = (adj.cameras.position[a] - recorded[a]) * (1 - t) + (adj.cameras.position[b] - recorded[b]) * t
         follows = recorded[i] + offset
         gap = float(np.hypot(*(follows - straight)[:2]))
-        step = float(np.hypot(*(adj.rig.position[b] - adj.rig.position[a])[:2]))
+        step = float(np.hypot(*(adj.cameras.position[b] - adj.cameras.position[a])[:2]))
         turning = flight.leg[a] != flight.leg[b]  # a straight line means nothing there
         believed = a == b or turning or gap < max(4.0, 0.3 * step)  # a == b: at an end
-        adj.rig.position[i] = follows if believed else straight
-        adj.rig.position[i, 2] = follows[2]  # receivers err sideways; a height far from the others' is meant
+        adj.cameras.position[i] = follows if believed else straight
+        adj.cameras.position[i, 2] = follows[2]  # receivers err sideways; a height far from the others' is meant
         near = a if i - a <= b - i else b
-        turn = adj.rig.rotation[near] @ adj.priors.rotation[near].T
-        adj.rig.rotation[i] = turn @ adj.priors.rotation[i]
+        turn = adj.cameras.rotation[near] @ adj.priors.rotation[near].T
+        adj.cameras.rotation[i] = turn @ adj.priors.rotation[i]
         leapt = float(np.hypot(*(adj.priors.position[i] - recorded[i])[:2]))
         told = max(leapt, 0.0 if believed else gap)
         sigma_m[i] = max(sigma_m[i], 1.0 + 0.1 * min(abs(i - a), abs(b - i), FARTHEST), 0.5 * told)

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import spsolve
 
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, Records
+from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
 
 _COURSE_SIGMA = float(np.radians(2.0))
 _C_SCHEDULE = (400.0, 100.0, 36.0, 9.0, 9.0)
@@ -68,7 +68,7 @@ def chain_headings(graph: PairGraph, count: int) -> Array:
 
 
 def course_headings(
-    graph: PairGraph, records: Records, metres: Array, offset: Complex, offset_sigma_px: Array
+    graph: PairGraph, records: PhotoRecords, metres: Array, offset: Complex, offset_sigma_px: Array
 ) -> tuple[Array, Array]:
     """Absolute headings of the first photo of each pair, from the recorded way and the picture's shift.
 
@@ -159,7 +159,7 @@ def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
     return wrap_rad(mode)
 
 
-def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
+def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
     """Which recorded angle of some photos of one vehicle follows the pictures' headings, up to a constant.
 
     Args:
@@ -181,6 +181,6 @@ def tag_heading(records: Records, rows: NDArray[np.intp], yaw: Array) -> TagHead
     return best if best.agree >= 0.5 else TagHeading("", 0.0, best.agree)
 
 
-def tag_yaw(records: Records, source: str) -> Array:
+def tag_yaw(records: PhotoRecords, source: str) -> Array:
     """A recorded heading by name, float64 (N,), NaN where unknown."""
     return records.flight_yaw if source == "flight_yaw" else records.yaw

@@ -23,19 +23,19 @@ from orthoswarm.refine.initial.heading import (
     tag_heading,
     tag_yaw,
 )
-from orthoswarm.refine.initial.planar_network import Beliefs, solve_network
+from orthoswarm.refine.initial.planar_network import NetworkPriors, solve_network
 from orthoswarm.refine.initial.planar_similarity import (
     Array,
     Complex,
     Flags,
     Ints,
     PairGraph,
-    Records,
+    PhotoRecords,
     level_from_nadir,
     rotation_of,
 )
 from orthoswarm.refine.initial.relative_scale import (
-    Heights,
+    RecordedHeights,
     first_of,
     first_scale,
     focal_by_height,
@@ -43,7 +43,7 @@ from orthoswarm.refine.initial.relative_scale import (
     recorded_heights,
     relative_scales,
 )
-from orthoswarm.refine.initial.tilt_and_lens import Matches, Shape, similarities, solve_shape
+from orthoswarm.refine.initial.tilt_and_lens import Matches, TiltAndLens, similarities, solve_tilt_and_lens
 
 _ROUNDS = 2
 _HEIGHT_SIGMA = 0.12
@@ -53,7 +53,7 @@ _TILT_FLOOR = float(np.radians(0.7))
 
 
 @dataclass(frozen=True, slots=True)
-class Start2D:
+class InitialOrientation:
     """The start of N photos of L lenses in S segments with E pairs.
 
     Attributes:
@@ -103,7 +103,9 @@ class Start2D:
         return np.asarray(self.position + self.height * ahead * np.exp(-1j * self.yaw))
 
 
-def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[Features]) -> Start2D:
+def find_initial_orientation(
+    records: PhotoRecords, pairs: Sequence[Pair], features: Sequence[Features]
+) -> InitialOrientation:
     """Find start values of all photos.
 
     Args:
@@ -136,7 +138,7 @@ def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[F
         )
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
         network = solve_network(
-            graph, records, yaw, _beliefs(records, heights, relative, metres, lens_of, tilt_px, by_height, focal)
+            graph, records, yaw, _network_priors(records, heights, relative, metres, lens_of, tilt_px, by_height, focal)
         )
         metres = network.metres
     level = shape.level.copy()
@@ -146,7 +148,7 @@ def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[F
     vehicles = [np.flatnonzero(yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)]
     tags = tuple(tag_heading(records, rows, yaw) for rows in vehicles)
     each = metres[records.segment] * relative
-    return Start2D(
+    return InitialOrientation(
         position=network.position,
         yaw=_fill_headings(records, yaw, yaw_known, component, tags),
         level=level,
@@ -170,12 +172,12 @@ def start_in_plane(records: Records, pairs: Sequence[Pair], features: Sequence[F
     )
 
 
-def _shape(matches: Matches, records: Records, log_focal: Array, log_focal_sigma: Array) -> Shape:
+def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
     tagged = np.isfinite(records.pitch)
     segments = int(records.segment.max()) + 1
     share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
     tilt_sigma = np.where(share > 0.5, _TAG_TILT_SIGMA, _FREE_TILT_SIGMA)
-    return solve_shape(matches, records, records.tag_level(), log_focal, log_focal_sigma, tilt_sigma)
+    return solve_tilt_and_lens(matches, records, records.tag_level(), log_focal, log_focal_sigma, tilt_sigma)
 
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
@@ -189,16 +191,16 @@ def _differs(one: Array, two: Array) -> bool:
     return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > 0.03)))
 
 
-def _beliefs(
-    records: Records,
-    heights: Heights,
+def _network_priors(
+    records: PhotoRecords,
+    heights: RecordedHeights,
     relative: Array,
     metres: Array,
     lens_of: Ints,
     tilt_px: Array,
     by_height: Array,
     focal: Array,
-) -> Beliefs:
+) -> NetworkPriors:
     """Segments of one lens share its metres per pixel, scaled by their recorded heights where these are possible."""
     link, link_sigma = np.ones(len(metres)), np.full(len(metres), 0.15)
     for k in range(len(focal)):
@@ -206,10 +208,12 @@ def _beliefs(
         if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
             link[rows] = heights.segment[rows] / np.median(heights.segment[rows])
             link_sigma[rows] = 0.03
-    return Beliefs(metres, relative, link, link_sigma, 0.5, tilt_px, lens_of, records.vehicle)
+    return NetworkPriors(metres, relative, link, link_sigma, 0.5, tilt_px, lens_of, records.vehicle)
 
 
-def _fill_headings(records: Records, yaw: Array, known: Flags, component: Ints, tags: tuple[TagHeading, ...]) -> Array:
+def _fill_headings(
+    records: PhotoRecords, yaw: Array, known: Flags, component: Ints, tags: tuple[TagHeading, ...]
+) -> Array:
     """Headings of parts that no course fixes: by the tag that follows the pictures elsewhere, else the way flown."""
     yaw = yaw.copy()
     velocity = records.velocity()

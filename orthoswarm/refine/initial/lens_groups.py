@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoswarm.refine.initial.initial_orientation import Start2D
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, Records
+from orthoswarm.refine.initial.initial_orientation import InitialOrientation
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
 
 _UNLIKE_SIGMAS = 2.5
 _UNLIKE_SHARE = 0.06
@@ -17,18 +17,18 @@ _ONE_WAY = 0.9
 """Length of the mean of headings from which on the shapes of matches do not tell the focal length."""
 
 
-def by_vehicle(records: Records) -> Records:
+def lens_per_vehicle(records: PhotoRecords) -> PhotoRecords:
     """The records with a lens for each vehicle."""
     first = np.unique(records.vehicle, return_index=True)[1]
     return replace(records, lens=records.vehicle.copy(), fov_hint=records.fov_hint[records.lens[first]])
 
 
-def told_apart(records: Records, alone: Start2D) -> Records:
+def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> PhotoRecords:
     """The records with lenses as shared as the pictures allow.
 
     Args:
         records: of vehicles that share lenses by name.
-        alone: start values of the same photos with a lens for each vehicle (see `by_vehicle`).
+        alone: start values of the same photos with a lens for each vehicle (see `lens_per_vehicle`).
 
     Returns:
         The same records where no vehicle's focal length is unlike that of others of its name.

@@ -16,8 +16,8 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
 from orthoswarm.refine.features.sift_features import FINE_PIXELS, WORKING_PIXELS, Features, detect
-from orthoswarm.refine.initial.initial_orientation import Start2D, start_in_plane
-from orthoswarm.refine.initial.planar_similarity import Ints, Records
+from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
+from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
 
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
@@ -60,7 +60,7 @@ class PairGraphBuilder:
     """
 
     frames: Sequence[Frame]
-    records: Records
+    records: PhotoRecords
     read_gray: ReadGray
     run: Run = serial
     progress: Progress | None = None
@@ -97,15 +97,15 @@ class PairGraphBuilder:
                 matches[k] += len(m)
         return pairs, matches
 
-    def near(self, start: Start2D, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
+    def near(self, start: InitialOrientation, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
         """Pairs whose pictures should overlap by the start; `only` bool (N,) asks for one of them to be set."""
         reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
         pairs = nearby(start.middle(), reach, self.records.segment, count)
         return pairs if only is None or not len(pairs) else pairs[only[pairs].any(1)]
 
-    def start(self) -> Start2D:
+    def start(self) -> InitialOrientation:
         """Start values by the pairs found so far."""
-        return start_in_plane(self.records, self.pairs(), self.features)
+        return find_initial_orientation(self.records, self.pairs(), self.features)
 
     def redetect(self, weak: NDArray[np.bool_]) -> None:
         """Find features of weak photos on larger pictures and forget their pairs."""
@@ -145,7 +145,7 @@ def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list
     return [match_features(features[a], features[b]) for a, b in pairs]
 
 
-def build_pair_graph(builder: PairGraphBuilder) -> Start2D:
+def build_pair_graph(builder: PairGraphBuilder) -> InitialOrientation:
     """Find features, pairs and start values of all photos; the builder holds what was found."""
     records = builder.records
     builder.detect_all()

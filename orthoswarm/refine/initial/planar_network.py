@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, Records
+from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
 
 LAG_SPREAD_S = 0.3
 _LAG_SIGMA_S = 0.5
@@ -24,7 +24,7 @@ _GATE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Beliefs:
+class NetworkPriors:
     """What is believed of the common unknowns before the network is solved (S segments, N photos).
 
     Attributes:
@@ -123,7 +123,7 @@ class _Rows:
         return matrix, np.concatenate(self.rhs)
 
 
-def solve_network(graph: PairGraph, records: Records, yaw: Array, beliefs: Beliefs) -> Network:
+def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:
     """Solve positions, scale, nadir offset and lag.
 
     Args:
@@ -185,7 +185,9 @@ def _sigmas(factor: Any, at: _Columns) -> Array:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1))
 
 
-def _pair_rows(rows: _Rows, at: _Columns, graph: PairGraph, records: Records, unit: Complex, b: Beliefs) -> Array:
+def _pair_rows(
+    rows: _Rows, at: _Columns, graph: PairGraph, records: PhotoRecords, unit: Complex, b: NetworkPriors
+) -> Array:
     """East, then north rows of all pairs; returns their one sigma in metres (E,)."""
     i, j = graph.first, graph.second
     si, sj = records.segment[i], records.segment[j]
@@ -208,7 +210,7 @@ def _pair_rows(rows: _Rows, at: _Columns, graph: PairGraph, records: Records, un
     return sigma
 
 
-def _gps_rows(rows: _Rows, at: _Columns, records: Records, vehicle: Ints) -> Complex:
+def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:
     """Rows of recorded positions along and across the way flown: P - lag v = recorded; returns v (N,)."""
     velocity = records.velocity()
     speed = np.abs(velocity)
@@ -225,7 +227,7 @@ def _gps_rows(rows: _Rows, at: _Columns, records: Records, vehicle: Ints) -> Com
     return velocity
 
 
-def _prior_rows(rows: _Rows, at: _Columns, b: Beliefs) -> None:
+def _prior_rows(rows: _Rows, at: _Columns, b: NetworkPriors) -> None:
     segment, lens, vehicle = np.arange(at.segments), np.arange(at.lenses), np.arange(at.vehicles)
     link = b.link_sigma * b.metres
     rows.block(np.zeros(at.segments), (at.metres + segment, 1.0 / link), (at.lens + b.lens, -b.link / link))

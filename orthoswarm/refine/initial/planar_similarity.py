@@ -23,7 +23,7 @@ MAX_TAG_TILT_RAD = float(np.radians(45.0))
 
 
 @dataclass(frozen=True, slots=True)
-class Records:
+class PhotoRecords:
     """What was recorded of N photos taken with L lenses in S segments; NaN where unknown.
 
     Photos of a vehicle stand in order of time.

@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, Records
+from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, PhotoRecords
 
 DEFAULT_FOV_RAD = float(np.radians(75.0))
 DEFAULT_HEIGHT_M = 60.0
@@ -20,7 +20,7 @@ _C_SCHEDULE = (100.0, 25.0, 9.0, 9.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Heights:
+class RecordedHeights:
     """Recorded heights as evidence of scale.
 
     Attributes:
@@ -34,7 +34,7 @@ class Heights:
     segment: Array
 
 
-def recorded_heights(records: Records, above: Array) -> Heights:
+def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
     """Heights over the segment's median, from heights or, for want of them, from absolute altitudes.
 
     Args:
@@ -55,10 +55,10 @@ def recorded_heights(records: Records, above: Array) -> Heights:
             continue
         relative[rows] = np.where((ratio > 0.2) & (ratio < 5.0), ratio, np.nan)
     known = np.isfinite(relative)
-    return Heights(np.where(known, relative, 1.0), known, level)
+    return RecordedHeights(np.where(known, relative, 1.0), known, level)
 
 
-def first_scale(graph: PairGraph, records: Records, lens_of: Ints, focal: Array) -> tuple[Array, Flags]:
+def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: Array) -> tuple[Array, Flags]:
     """Metres per pixel of each segment (S,) from ways recorded and shifts seen, and which lenses (L,) had such.
 
     Pairs of nearly equal heading, whose shift does not depend on the tilt, count alone where there are any. A lens
@@ -94,7 +94,7 @@ def first_scale(graph: PairGraph, records: Records, lens_of: Ints, focal: Array)
     return np.asarray(metres), told
 
 
-def relative_scales(graph: PairGraph, records: Records, heights: Heights, count: int) -> Array:
+def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHeights, count: int) -> Array:
     """Metres per pixel of each photo over its segment's, float64 (N,), from the zoom between level pictures.
 
     Recorded heights are believed to 3 %, none to 15 %; pairs of one segment to 2 % (relief). Robust.
@@ -122,7 +122,7 @@ def relative_scales(graph: PairGraph, records: Records, heights: Heights, count:
     return np.asarray(np.exp(x))
 
 
-def focal_by_height(records: Records, heights: Heights, metres: Array, lens_of: Ints) -> Array:
+def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Array, lens_of: Ints) -> Array:
     """Focal length in pixels of each lens, height over metres per pixel, NaN where that is no lens that exists."""
     focal = np.full(len(records.fov_hint), np.nan)
     for k in range(len(focal)):
@@ -134,7 +134,7 @@ def focal_by_height(records: Records, heights: Heights, metres: Array, lens_of: 
     return focal
 
 
-def focal_by_hint(records: Records) -> tuple[Array, Array]:
+def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
     """Log of the focal length in pixels of each lens, and its one sigma: tags to 6 %, else 75 degrees to 35 %."""
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
     with np.errstate(invalid="ignore"):

@@ -20,7 +20,7 @@ from orthoswarm.refine.initial.planar_similarity import (
     Complex,
     Ints,
     PairGraph,
-    Records,
+    PhotoRecords,
     centred,
     level_from_nadir,
 )
@@ -68,7 +68,7 @@ class Matches:
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class TiltAndLens:
     """Tilt and lens found from shapes.
 
     Attributes:
@@ -91,15 +91,15 @@ def _spaced(count: int) -> NDArray[np.intp]:
     return np.linspace(0, count - 1, _MOST_MATCHES).astype(np.intp)
 
 
-def solve_shape(
+def solve_tilt_and_lens(
     matches: Matches,
-    records: Records,
+    records: PhotoRecords,
     level: Array,
     log_focal: Array,
     log_focal_sigma: Array,
     tilt_sigma: Array,
     bend_sigma: float = 0.06,
-) -> Shape:
+) -> TiltAndLens:
     """Find tilt, focal length and first radial term that make the matches similar figures.
 
     Args:
@@ -153,7 +153,7 @@ def solve_shape(
             break
     deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
     last_misfit = float(np.median(misfit)) if len(misfit) else float("nan")
-    return Shape(
+    return TiltAndLens(
         level,
         deviation[: 2 * segments].reshape(-1, 2).max(1),
         lens[:, 0].copy(),
@@ -163,7 +163,7 @@ def solve_shape(
     )
 
 
-def similarities(matches: Matches, records: Records, shape: Shape) -> PairGraph:
+def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) -> PairGraph:
     """The similarity of every pair between its level, undistorted pictures."""
     pairs = len(matches.first)
     table = np.zeros((pairs, 5), np.complex128)
@@ -193,7 +193,7 @@ def similarities(matches: Matches, records: Records, shape: Shape) -> PairGraph:
     )
 
 
-def corner_radius(records: Records) -> Array:
+def corner_radius(records: PhotoRecords) -> Array:
     """Half the diagonal of each lens's picture, float64 (L,), pixels."""
     first = [int(np.argmax(records.lens == k)) for k in range(len(records.fov_hint))]
     return np.asarray(0.5 * np.hypot(records.width[first], records.rows[first]))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.refine.bundle.adjustment import Adjustment, Ties
+from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.features.patch_matching import gradient_field, texture_field
@@ -46,7 +46,7 @@ class Settled:
     """
 
     surface: GroundModel
-    ties: Ties
+    ties: MapTies
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
     ground_shift: Array
@@ -55,10 +55,10 @@ class Settled:
 
 def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
     """The map under a vehicle's pictures, with a margin for the search."""
-    rig = flight.rig()
-    height = float(np.median(rig.position[:, 2]))
-    reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(rig.lens[0, 0]) + 40.0
-    low, high = rig.position[:, :2].min(0) - reach, rig.position[:, :2].max(0) + reach
+    cameras = flight.cameras()
+    height = float(np.median(cameras.position[:, 2]))
+    reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0]) + 40.0
+    low, high = cameras.position[:, :2].min(0) - reach, cameras.position[:, :2].max(0) + reach
     return LoadedMap.load(basemap, origin, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), gsd_m)
 
 
@@ -77,7 +77,7 @@ def tie_round(
     ones to compare, None for all.
     """
     adj = flight.adjustment
-    seen = flight.sights(pictures)
+    seen = flight.best_views(pictures)
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
     fewest = 2 if flight.sparse else 3
     usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
@@ -99,7 +99,9 @@ def _ground_matches(
     adj = flight.adjustment
     half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
     level = surface.height(adj.points[:, :2])
-    return match_points(adj.rig, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field)
+    return match_points(
+        adj.cameras, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field
+    )
 
 
 def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float) -> Array:
@@ -185,15 +187,15 @@ def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
     return line, np.asarray(np.hypot(*(shift - a @ line).T) < ON_LINE_M)
 
 
-def as_ties(matches: MapMatches, points: Array) -> Ties:
+def as_ties(matches: MapMatches, points: Array) -> MapTies:
     """Ties for the adjustment: where the map shows the ground that each point's surroundings lie on.
 
     What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map.
     """
-    return Ties(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
+    return MapTies(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
 
 
-def weighed(ties: Ties, residual: Array) -> Ties:
+def weighed(ties: MapTies, residual: Array) -> MapTies:
     """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
     if len(residual) < FEWEST_TO_WEIGH:
         return ties
@@ -204,13 +206,13 @@ def weighed(ties: Ties, residual: Array) -> Ties:
 def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Raised points found on the map, and their heights over the ground."""
     adj = flight.adjustment
-    seen = flight.sights()
+    seen = flight.best_views()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
     usable = (seen.camera >= 0) & (seen.count >= 6) & (seen.mean_weight > 0.5) & (height > 4.0) & (height < 40.0)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), 30.0)
     half, reach = max(8, round(7.5 / ground.gsd_m)), max(8, round(11.0 / ground.gsd_m))
-    found = match_points(adj.rig, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+    found = match_points(adj.cameras, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
     found = accepted(found, 0.2, 0.85)
     return found, height[found.point]
 
@@ -218,7 +220,7 @@ def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple
 def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
     """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
     adj = flight.adjustment
-    seen = flight.sights()
+    seen = flight.best_views()
     usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), cell_m)
@@ -226,7 +228,7 @@ def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
     if len(np.unique(flight.leg[candidates])) < 2:
         return 0
     camera, point, uv, _ = link_legs(
-        adj.rig, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
+        adj.cameras, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
     )
     if len(camera):
         extend(flight, camera, point, uv, LINK_SIGMA_PX)
@@ -242,7 +244,7 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
         np.concatenate([old.tracks.uv, uv]),
         np.concatenate([old.tracks.sigma_px, np.full(len(camera), sigma_px, np.float32)]),
     )
-    new = Adjustment.begin(old.rig, tracks, old.priors, old.points, old.free)
+    new = Adjustment.begin(old.cameras, tracks, old.priors, old.points, old.free)
     new.common[:] = old.common
     flight.adjustment = new
 
@@ -276,9 +278,9 @@ def resettle(
     flight: Flight,
     ground: LoadedMap,
     surface: GroundModel,
-    ties: Ties,
+    ties: MapTies,
     pictures: NDArray[np.bool_] | None = None,
-) -> tuple[GroundModel, Ties, MapMatches]:
+) -> tuple[GroundModel, MapTies, MapMatches]:
     """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved).
 
     pictures: bool (N,), the ones to compare with the map, None for all.
@@ -294,7 +296,7 @@ def _second_round(
     surface: GroundModel,
     rounds: int,
     pictures: NDArray[np.bool_] | None = None,
-) -> tuple[GroundModel, Ties, MapMatches]:
+) -> tuple[GroundModel, MapTies, MapMatches]:
     """Ties compared on the ground as it is now (fitted by the caller: the points moved, with their level, too)."""
     matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, NEAR_M, pictures=pictures))
     matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, NEAR_M))
@@ -310,12 +312,12 @@ def _second_round(
 
 def working_gsd(flight: Flight) -> float:
     """Pixel for comparing pictures with each other: about their own."""
-    rig = flight.rig()
-    return 1.07 * float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
+    cameras = flight.cameras()
+    return 1.07 * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
 
 
 def map_gsd(flight: Flight, basemap: MapWindow) -> float:
     """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
-    rig = flight.rig()
-    picture = float(np.median(rig.position[:, 2])) / float(rig.lens[0, 0])
+    cameras = flight.cameras()
+    picture = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
     return float(np.clip(max(picture, basemap.native_gsd_m), 0.25, 2.0)) if picture < 0.4 else max(0.5, picture)

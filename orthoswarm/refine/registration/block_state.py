@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.oldpickles import set_fields
-from orthoswarm.refine.bundle.adjustment import Ties
-from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, F, Rig
+from orthoswarm.refine.bundle.adjustment import MapTies
+from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weak_pictures import ENOUGH, observations_per_camera
 from orthoswarm.refine.registration.tie_points import MapMatches
@@ -44,9 +44,9 @@ class VehicleState:
 
     vehicle: str
     flight: Flight
-    coarse: Rig
+    coarse: CameraBlock
     surface: GroundModel
-    ties: Ties
+    ties: MapTies
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
     dense: tuple[Array, Array]
@@ -108,18 +108,18 @@ def to_solution(
 ) -> Solution:
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
-    rig = state.coarse if coarse else flight.adjustment.rig
+    cameras = state.coarse if coarse else flight.adjustment.cameras
     stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
-    rig = full_resolution(rig, flight)
+    cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
     weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else ENOUGH)
     placed = [
-        PlacedFrame(frame, rig.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
+        PlacedFrame(frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
         for i, frame in enumerate(flight.frames)
         if i not in flight.pictures.damaged
     ]
     dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
-    lens = flight.adjustment.rig.lens[0]
+    lens = flight.adjustment.cameras.lens[0]
     return Solution(
         state.vehicle,
         placed,
@@ -133,27 +133,29 @@ def to_solution(
         state,
         list(flight.warnings),
         dict(state.timings),
-        _mean_gsd(rig, flight),
+        _mean_gsd(cameras, flight),
     )
 
 
-def _mean_gsd(rig: Rig, flight: Flight) -> float:
-    """Mean height above the ground's points over the focal length (rig: full resolution), metres a pixel."""
+def _mean_gsd(cameras: CameraBlock, flight: Flight) -> float:
+    """Mean height above the ground's points over the focal length (cameras: full resolution), metres a pixel."""
     points, _ = ground_points(flight.adjustment)
     if not len(points):
         return float("nan")
-    heights = flight.rig().position[:, 2]  # points and cameras of one state, also where the rig is that before the map
-    return float((heights.mean() - points[:, 2].mean()) / rig.lens[0, F])
+    heights = flight.cameras().position[
+        :, 2
+    ]  # points and cameras of one state, also where the cameras are those before the map
+    return float((heights.mean() - points[:, 2].mean()) / cameras.lens[0, F])
 
 
-def full_resolution(rig: Rig, flight: Flight) -> Rig:
-    """A rig whose lenses are in pixels of the stored pictures instead of working pixels."""
+def full_resolution(cameras: CameraBlock, flight: Flight) -> CameraBlock:
+    """Cameras whose lenses are in pixels of the stored pictures instead of working pixels."""
     frame = flight.frames[0]
     scale = frame.width / flight.pictures.size[0]
-    lens = rig.lens.copy()
+    lens = cameras.lens.copy()
     lens[:, [F, CX, CY]] *= scale
     lens[:, WIDTH], lens[:, WIDTH + 1] = frame.width, frame.height
-    return replace(rig, lens=lens)
+    return replace(cameras, lens=lens)
 
 
 def leg_states(state: VehicleState) -> list[Leg]:

@@ -44,8 +44,8 @@ class CoarseFit:
 
 def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
     """Register windows of each leg near their records, then all together, then farther off; None without consensus."""
-    rig = flight.rig()
-    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    cameras = flight.cameras()
+    width = flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
     gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
     tiles = TiledMap(basemap, gsd)
     near, far = REACHES_M
@@ -58,23 +58,23 @@ def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit |
 
 def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
     """One shift for the whole flight, from what all its windows say together (see `stacked`)."""
-    rig, windows = flight.rig(), _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
-    strips = [strip_and_map(rig, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
+    cameras, windows = flight.cameras(), _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    strips = [strip_and_map(cameras, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
     found = stacked([s for s in strips if s is not None])
     if found is None:
         return None
     shift, z, ratio = found
-    match = Match(0, len(rig) - 1, (float(shift[0]), float(shift[1])), z, ratio)
-    return CoarseFit(np.tile(shift, (len(rig), 1)), [match], np.ones(1, bool), 1.0 - ratio)
+    match = Match(0, len(cameras) - 1, (float(shift[0]), float(shift[1])), z, ratio)
+    return CoarseFit(np.tile(shift, (len(cameras), 1)), [match], np.ones(1, bool), 1.0 - ratio)
 
 
 def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
-    rig = flight.rig()
+    cameras = flight.cameras()
     windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
     matches = [
         m
         for index in windows
-        if (m := register(rig, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m)) is not None
+        if (m := register(cameras, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m)) is not None
     ]
     if not matches:
         return None
@@ -83,13 +83,13 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
         return None
     if inlier.sum() < MANY and min(m.ratio for m, ok in zip(matches, inlier) if ok) > CLEAR_RATIO:
         return None
-    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.mean()))
+    return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
 def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 30.0) -> CoarseFit | None:
     """Learned matching of a few strips where edges found no consensus; None if it finds none either."""
-    rig = flight.rig()
-    width = flight.pictures.size[0] / float(rig.lens[0, 0]) * float(np.median(rig.position[:, 2]))
+    cameras = flight.cameras()
+    width = flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
     gsd = float(np.clip(width / (2 * ACROSS_PX), 0.2, 0.6))
     windows = _windows(flight.leg, SECOND_LOOK_PICTURES)
     basemap = TiledMap(basemap, gsd)
@@ -97,7 +97,7 @@ def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: floa
     matches = [
         m
         for index in chosen
-        if (m := register(rig, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd, by_learning))
+        if (m := register(cameras, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd, by_learning))
         is not None
     ]
     if len(matches) < 2:
@@ -105,13 +105,13 @@ def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: floa
     inlier = _consensus(matches)
     if inlier.sum() < max(2, len(matches) // 2 + 1):
         return None
-    return CoarseFit(_smooth(matches, inlier, len(rig)), matches, inlier, float(inlier.sum()) / len(chosen))
+    return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.sum()) / len(chosen))
 
 
 def shift_cameras(flight: Flight, correction: Array) -> None:
     """Move cameras and points by a correction (N, 2), and the drift with them, so that the records still agree."""
     adj = flight.adjustment
-    adj.rig.position[:, :2] += correction
+    adj.cameras.position[:, :2] += correction
     n = len(adj.points)
     count = np.maximum(np.bincount(adj.tracks.point, minlength=n), 1)
     for a in range(2):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, Rig
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock
 from orthoswarm.refine.features.patch_matching import texture_field
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.absolute_orientation import TIE_HALF_M, accepted
@@ -49,17 +49,17 @@ def map_heights(
         tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
         pictures: bool (N,), the ones to compare with the map, None for all on legs.
     """
-    rig, own = flight.rig(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
+    cameras, own = flight.cameras(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
     if not len(tie_sigma_m) or not len(own):
         return np.zeros((0, 3)), np.zeros(0)
     cells = _positions(flight, flying_height(flight, surface), own, others)
     points = np.column_stack([cells, surface.terrain().height(cells)])
-    camera = _best_views(rig, points, own)
+    camera = _best_views(cameras, points, own)
     chosen = np.flatnonzero(camera >= 0)
     half, reach = max(8, round(TIE_HALF_M / ground.gsd_m)), max(4, round(REACH_M / ground.gsd_m))
     gray, level = flight.pictures.gray, points[:, 2]
-    found = accepted(match_points(rig, points, chosen, camera, gray, ground, half, reach, level, texture_field))
-    sight = points[found.point] - rig.position[found.camera]
+    found = accepted(match_points(cameras, points, chosen, camera, gray, ground, half, reach, level, texture_field))
+    sight = points[found.point] - cameras.position[found.camera]
     out = np.hypot(sight[:, 0], sight[:, 1])
     slope = out / np.maximum(-sight[:, 2], 1.0)
     east, north = (sight[:, :2] / np.maximum(out, 1.0)[:, None]).T
@@ -74,7 +74,7 @@ def map_heights(
 
 def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
     """Centres (K, 2) of cells that own cameras see obliquely and nobody sees better."""
-    path, cell, reach = flight.rig().position[:, :2], max(CELL_SHARE * height_m, LEAST_CELL_M), sight_reach(flight)
+    path, cell, reach = flight.cameras().position[:, :2], max(CELL_SHARE * height_m, LEAST_CELL_M), sight_reach(flight)
     cells = cells_near(path, cell, reach + cell)
     mine, _ = cKDTree(path[own]).query(cells)
     keep = (mine > LEAST_SLOPE * height_m) & (mine < reach)
@@ -83,17 +83,17 @@ def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others
     return np.asarray(cells[keep])
 
 
-def _best_views(rig: Rig, points: Array, cameras: NDArray[np.integer]) -> NDArray[np.int32]:
+def _best_views(cameras: CameraBlock, points: Array, own: NDArray[np.integer]) -> NDArray[np.int32]:
     """For each point (K, 3) the camera nearest above it that sees it, -1 for none."""
     best = np.full(len(points), -1, np.int32)
-    if not len(points) or not len(cameras):
+    if not len(points) or not len(own):
         return best
-    _, near = cKDTree(rig.position[cameras, :2]).query(points[:, :2], k=min(_TRIED, len(cameras)))
+    _, near = cKDTree(cameras.position[own, :2]).query(points[:, :2], k=min(_TRIED, len(own)))
     for rank in np.atleast_2d(near.T):
         left = best < 0
-        camera = cameras[rank]
-        uv = rig.project(camera, points)
-        size = rig.lens[rig.lens_id[camera]][:, [WIDTH, HEIGHT]]
+        camera = own[rank]
+        uv = cameras.project(camera, points)
+        size = cameras.lens[cameras.lens_id[camera]][:, [WIDTH, HEIGHT]]
         seen = np.isfinite(uv).all(1) & (uv > 0).all(1) & (uv < size - 1).all(1)
         best[left & seen] = camera[left & seen]
     return best

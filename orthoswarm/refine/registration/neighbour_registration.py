@@ -35,15 +35,19 @@ class HeldMosaic:
     def __init__(self, held: Held, epsg: int, origin: Array) -> None:
         self.epsg = epsg
         self._held, self._origin = held, origin
-        rig = held.rig
-        focal = rig.lens[rig.lens_id, 0]
-        self._reach_m = rig.position[:, 2] * np.hypot(rig.lens[rig.lens_id, 6], rig.lens[rig.lens_id, 7]) / focal
-        self.native_gsd_m = float(np.median(rig.position[:, 2] / focal))
+        cameras = held.cameras
+        focal = cameras.lens[cameras.lens_id, 0]
+        self._reach_m = (
+            cameras.position[:, 2]
+            * np.hypot(cameras.lens[cameras.lens_id, 6], cameras.lens[cameras.lens_id, 7])
+            / focal
+        )
+        self.native_gsd_m = float(np.median(cameras.position[:, 2] / focal))
 
     @property
     def bounds(self) -> Bounds:
         """West, south, east, north of what the cameras may see, in the area's grid."""
-        xy = self._held.rig.position[:, :2] + self._origin[:2]
+        xy = self._held.cameras.position[:, :2] + self._origin[:2]
         low, high = (xy - self._reach_m[:, None]).min(0), (xy + self._reach_m[:, None]).max(0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
@@ -60,11 +64,11 @@ class HeldMosaic:
     def _draw(
         self, grid: GroundGrid, rows: slice, cols: slice, gray: NDArray[np.float32], valid: NDArray[np.bool_]
     ) -> None:
-        rig, gsd = self._held.rig, grid.gsd_m
+        cameras, gsd = self._held.cameras, grid.gsd_m
         west = grid.west + cols.start * gsd - float(self._origin[0])
         north = grid.north - rows.start * gsd - float(self._origin[1])
         high, wide = gray.shape
-        x, y = rig.position[:, 0], rig.position[:, 1]
+        x, y = cameras.position[:, 0], cameras.position[:, 1]
         reach = 0.6 * self._reach_m
         near = (
             (x > west - reach)
@@ -72,7 +76,7 @@ class HeldMosaic:
             & (y < north + reach)
             & (y > north - high * gsd - reach)
         )
-        drawn = strip_mosaic(rig, np.flatnonzero(near), self._held.small, 0.0, gsd) if near.any() else None
+        drawn = strip_mosaic(cameras, np.flatnonzero(near), self._held.small, 0.0, gsd) if near.any() else None
         if drawn is None:
             return
         seen, known, left, top = drawn

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.refine.bundle.adjustment import Adjustment
-from orthoswarm.refine.bundle.block_arrays import Rig, Tracks
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.bundle.priors import Priors
 from orthoswarm.refine.flight.relative_block import Flight
@@ -24,12 +24,12 @@ MOST_HELD = 2
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Cameras of neighbours that may see a vehicle's ground, as they are: rig and how to read their pictures.
+    """Cameras of neighbours that may see a vehicle's ground, as they are: cameras and how to read their pictures.
 
     `gray` gives one at working scale, `small` a reduced one.
     """
 
-    rig: Rig
+    cameras: CameraBlock
     vehicle: NDArray[np.int32]
     gray: Callable[[int], Gray]
     small: Callable[[int], Gray]
@@ -37,21 +37,21 @@ class Held:
 
 def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | None:
     """The neighbours' cameras near a vehicle's path (every second one is enough); None where there are none."""
-    own = state.flight.adjustment.rig.position[:, :2]
-    height = float(np.median(state.flight.adjustment.rig.position[:, 2]))
+    own = state.flight.adjustment.cameras.position[:, :2]
+    height = float(np.median(state.flight.adjustment.cameras.position[:, 2]))
     low, high = own.min(0) - 1.2 * height, own.max(0) + 1.2 * height
     parts: list[tuple[VehicleState, NDArray[np.int64]]] = []
     for other in others:
-        xy = other.flight.adjustment.rig.position[: len(other.flight.frames), :2]
+        xy = other.flight.adjustment.cameras.position[: len(other.flight.frames), :2]
         near = np.flatnonzero(((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0))[::2]
         fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
         if len(near) and fits:
             parts.append((other, near))
     if not parts:
         return None
-    rigs = [o.flight.adjustment.rig.take(near) for o, near in parts]
+    rigs = [o.flight.adjustment.cameras.take(near) for o, near in parts]
     lens_at = np.cumsum([0] + [len(r.lens) for r in rigs])
-    rig = Rig(
+    cameras = CameraBlock(
         np.concatenate([r.position for r in rigs]),
         np.concatenate([r.rotation for r in rigs]),
         np.concatenate([r.lens_id + lens_at[k] for k, r in enumerate(rigs)]).astype(np.int32),
@@ -60,7 +60,7 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     vehicle = np.concatenate([np.full(len(near), k, np.int32) for k, (_, near) in enumerate(parts)])
     where = [(o, int(i)) for o, near in parts for i in near]
     return Held(
-        rig,
+        cameras,
         vehicle,
         lambda j: where[j][0].flight.pictures.gray(where[j][1]),
         lambda j: where[j][0].flight.pictures.small(where[j][1]),
@@ -77,9 +77,9 @@ def link_to_held(
         pictures: bool (N,), own ones to compare, None for all.
     """
     adj = flight.adjustment
-    n = len(adj.rig)
-    joint = _joined(adj.rig, held.rig)
-    seen = flight.sights(pictures)
+    n = len(adj.cameras)
+    joint = _joined(adj.cameras, held.cameras)
+    seen = flight.best_views(pictures)
     usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + held.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)
@@ -101,11 +101,13 @@ def link_to_held(
         np.concatenate([adj.tracks.sigma_px, np.full(len(camera), HELD_SIGMA_PX, np.float32)]),
     )
     free = np.arange(len(joint)) < n
-    new = Adjustment.begin(joint, tracks, _padded(adj.priors, len(held.rig), len(held.rig.lens)), adj.points, free)
+    new = Adjustment.begin(
+        joint, tracks, _padded(adj.priors, len(held.cameras), len(held.cameras.lens)), adj.points, free
+    )
     shift = new.layout.lens_columns - adj.layout.lens_columns
     new.common[: adj.layout.lens_columns] = adj.common[: adj.layout.lens_columns]
     new.common[adj.layout.lens_columns + shift :] = adj.common[adj.layout.lens_columns :]
-    new.priors.lens[len(adj.priors.lens) :] = _lens_values(held.rig.lens)
+    new.priors.lens[len(adj.priors.lens) :] = _lens_values(held.cameras.lens)
     flight.adjustment = new
     return len(camera)
 
@@ -113,10 +115,10 @@ def link_to_held(
 def release(flight: Flight) -> None:
     """Take held cameras out of a flight's adjustment again (their observations, too)."""
     adj = flight.adjustment
-    n, lenses = len(flight.frames), int(adj.rig.lens_id[: len(flight.frames)].max()) + 1
+    n, lenses = len(flight.frames), int(adj.cameras.lens_id[: len(flight.frames)].max()) + 1
     own = adj.tracks.camera < n
     tracks = Tracks(adj.tracks.camera[own], adj.tracks.point[own], adj.tracks.uv[own], adj.tracks.sigma_px[own])
-    rig = replace(adj.rig.take(slice(0, n)), lens=adj.rig.lens[:lenses])
+    cameras = replace(adj.cameras.take(slice(0, n)), lens=adj.cameras.lens[:lenses])
     p = adj.priors
     priors = replace(
         p,
@@ -129,7 +131,7 @@ def release(flight: Flight) -> None:
         lens=p.lens[:lenses],
         lens_sigma=p.lens_sigma[:lenses],
     )
-    new = Adjustment.begin(rig, tracks, priors, adj.points)
+    new = Adjustment.begin(cameras, tracks, priors, adj.points)
     new.common[: 6 * lenses] = adj.common[: 6 * lenses]
     new.common[6 * lenses :] = adj.common[adj.layout.lens_columns :]
     weight = adj.obs_weight[own]
@@ -140,8 +142,8 @@ def release(flight: Flight) -> None:
     flight.adjustment = new
 
 
-def _joined(a: Rig, b: Rig) -> Rig:
-    return Rig(
+def _joined(a: CameraBlock, b: CameraBlock) -> CameraBlock:
+    return CameraBlock(
         np.concatenate([a.position, b.position]),
         np.concatenate([a.rotation, b.rotation]),
         np.concatenate([a.lens_id, b.lens_id + len(a.lens)]).astype(np.int32),

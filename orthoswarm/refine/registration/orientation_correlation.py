@@ -11,7 +11,7 @@ from scipy import fft
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.subpixel_peak import vertex
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -96,7 +96,7 @@ def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> N
 
 
 def strip_mosaic(
-    rig: Rig, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
+    cameras: CameraBlock, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], float, float] | None:
     """Nearest-nadir grey mosaic of some pictures on a level plane.
 
@@ -108,7 +108,7 @@ def strip_mosaic(
     """
     corners, homographies = [], []
     for i in index:
-        camera = rig.camera(int(i), np.zeros(2))
+        camera = cameras.camera(int(i), np.zeros(2))
         quad = camera.corners(ground_z)
         if (
             not np.isfinite(quad).all()
@@ -168,7 +168,7 @@ class Strip:
 
 
 def strip_and_map(
-    rig: Rig,
+    cameras: CameraBlock,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
     basemap: MapWindow,
@@ -178,7 +178,7 @@ def strip_and_map(
     gsd_m: float,
 ) -> Strip | None:
     """Mosaic some consecutive pictures and read the map around them; None where either has nothing to show."""
-    mosaic = strip_mosaic(rig, index, picture, ground_z, gsd_m)
+    mosaic = strip_mosaic(cameras, index, picture, ground_z, gsd_m)
     if mosaic is None:
         return None
     gray, valid, west, north = mosaic
@@ -266,7 +266,7 @@ def by_learning(strip: Strip) -> Found | None:
 
 
 def register(
-    rig: Rig,
+    cameras: CameraBlock,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
     basemap: MapWindow,
@@ -277,7 +277,7 @@ def register(
     find: Callable[[Strip], Found | None] = by_edges,
 ) -> Match | None:
     """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""
-    strip = strip_and_map(rig, index, picture, basemap, origin, ground_z, reach_m, gsd_m)
+    strip = strip_and_map(cameras, index, picture, basemap, origin, ground_z, reach_m, gsd_m)
     found = None if strip is None else find(strip)
     if strip is None or found is None:
         return None

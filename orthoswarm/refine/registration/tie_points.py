@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.patch_matching import gradient_field, match, rectify
 from orthoswarm.refine.registration.map_windows import LoadedMap
 
@@ -36,7 +36,7 @@ class MapMatches:
 
 
 def match_points(
-    rig: Rig,
+    cameras: CameraBlock,
     points: Array,
     chosen: NDArray[np.integer],
     camera: Ints,
@@ -54,7 +54,7 @@ def match_points(
 
     Args:
         chosen: (Q,) indices of points; camera: (P,) the picture to take for each point.
-        gray: working-scale picture of a camera (the rig's lenses are in its pixels).
+        gray: working-scale picture of a camera (its lens is in these pixels).
         half: half the patch in map pixels; reach: search in map pixels.
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
         field: what is compared of pictures.
@@ -66,14 +66,16 @@ def match_points(
         p, i = int(chosen[k]), int(camera[chosen[k]])
         x, y, z = points[p]
         plane = z if level is None else float(level[p])
-        along = (points[p, :2] - rig.position[i, :2]) / max(rig.position[i, 2] - z, 1.0)
+        along = (points[p, :2] - cameras.position[i, :2]) / max(cameras.position[i, 2] - z, 1.0)
         x, y = x + along[0] * (z - plane), y + along[1] * (z - plane)
         row, column, cx, cy = ground.pixel_centre(x, y)
         window = ground.window(row, column, half + reach + 1)
         if window is None or window[1] < 0.7:
             continue
-        lens = rig.lens[rig.lens_id[i]]
-        seen = rectify(rig.position[i], rig.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch)
+        lens = cameras.lens[cameras.lens_id[i]]
+        seen = rectify(
+            cameras.position[i], cameras.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch
+        )
         if seen < 0.85:
             continue
         template = field(patch)[1:-1, 1:-1]
@@ -122,7 +124,7 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
 
 
 def link_legs(
-    rig: Rig,
+    cameras: CameraBlock,
     points: Array,
     chosen: NDArray[np.integer],
     camera: Ints,
@@ -145,13 +147,13 @@ def link_legs(
     cams, pts, uvs, tried = [], [], [], 0
     size = 2 * (half + reach) + 3
     template, window = np.empty((2 * half + 3, 2 * half + 3), np.float32), np.empty((size, size), np.float32)
-    nadir = rig.position[candidates, :2]
+    nadir = cameras.position[candidates, :2]
     for p in chosen:
         i = int(camera[p])
         x, y, z = points[p]
         distance = np.hypot(nadir[:, 0] - x, nadir[:, 1] - y)
-        uv = rig.project(candidates, np.broadcast_to(points[p], (len(candidates), 3)))
-        lens = rig.lens[rig.lens_id[candidates]]
+        uv = cameras.project(candidates, np.broadcast_to(points[p], (len(candidates), 3)))
+        lens = cameras.lens[cameras.lens_id[candidates]]
         margin = 12.0
         sees = (uv[:, 0] > margin) & (uv[:, 1] > margin)
         sees &= (uv[:, 0] < lens[:, 6] - margin) & (uv[:, 1] < lens[:, 7] - margin)
@@ -161,14 +163,16 @@ def link_legs(
         picks = candidates[near[np.sort(first)[:most]]]
         if not len(picks):
             continue
-        li = rig.lens[rig.lens_id[i]]
-        if rectify(rig.position[i], rig.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template) < 0.95:
+        li = cameras.lens[cameras.lens_id[i]]
+        if rectify(cameras.position[i], cameras.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template) < 0.95:
             continue
         field = np.ascontiguousarray(gradient_field(template)[1:-1, 1:-1])
         for j in picks:
-            lj = rig.lens[rig.lens_id[j]]
+            lj = cameras.lens[cameras.lens_id[j]]
             tried += 1
-            seen = rectify(rig.position[j], rig.rotation[j], lj, gray(int(j)), x, y, z, gsd_m, half + reach + 1, window)
+            seen = rectify(
+                cameras.position[j], cameras.rotation[j], lj, gray(int(j)), x, y, z, gsd_m, half + reach + 1, window
+            )
             if seen < 0.8:
                 continue
             dc, dr, peak, second = match(field, gradient_field(window)[1:-1, 1:-1], exclude=3)
@@ -176,5 +180,5 @@ def link_legs(
                 moved = np.array([[x + dc * gsd_m, y - dr * gsd_m, z]])
                 cams.append(int(j))
                 pts.append(int(p))
-                uvs.append(rig.project(np.array([j]), moved)[0])
+                uvs.append(cameras.project(np.array([j]), moved)[0])
     return np.array(cams, np.int32), np.array(pts, np.int32), np.array(uvs, float).reshape(-1, 2), tried

@@ -115,7 +115,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     if basemap is not None:
         fit = coarse_fit(flight, basemap, origin)
     if fit is not None:
-        height = float(np.median(flight.rig().position[:, 2]))
+        height = float(np.median(flight.cameras().position[:, 2]))
         share = ONE_WAY_SIGMA if one_way else MANY_WAYS_SIGMA
         state = _shifted(state, fit.correction)
         state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(fit)), state.coarse_sigma_m)
@@ -137,15 +137,15 @@ def _hold_drift(flight: Flight) -> None:
 
 def _check(flight: Flight) -> None:
     """Refuse what a few pictures can make of themselves but no camera can be."""
-    rig, records = flight.rig(), flight.records
+    cameras, records = flight.cameras(), flight.records
     if float(np.median(observations_per_camera(flight))) < ENOUGH:
         raise OrthoSwarmError("its pictures show too little that one can be laid beside the other")
-    if not (np.isfinite(rig.position).all() and np.isfinite(rig.rotation).all()):
+    if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
         raise OrthoSwarmError("its pictures do not hold together yet")
-    focal = float(rig.lens[0, 0])
-    height = float(np.median(rig.position[:, 2]))
+    focal = float(cameras.lens[0, 0])
+    height = float(np.median(cameras.position[:, 2]))
     begun = flight.calibration.height_m
-    axes = np.einsum("ni,ni->n", rig.rotation[:, :, 2], records.rotation()[:, :, 2])
+    axes = np.einsum("ni,ni->n", cameras.rotation[:, :, 2], records.rotation()[:, :, 2])
     turned = np.arccos(np.clip(axes, -1.0, 1.0))
     tilt_off = bool(records.has_tilt.any()) and float(np.median(turned[records.has_tilt])) > _TURN_RAD
     if (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.refine.bundle.covariance import frame_sigmas, map_doubt, unexplained
+from orthoswarm.refine.bundle.covariance import common_map_sigma, frame_sigmas, systematic_tie_offset
 from orthoswarm.refine.flight.weak_pictures import steady_weak
 from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, resettle, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
@@ -71,7 +71,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     ties = state.ties if state.on_map else None
     floor = 0.05
     if ground is not None:
-        floor = map_doubt(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
+        floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
     sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
@@ -81,7 +81,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
     if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
-        off = unexplained(flight.leg, state.matches.camera, adj.tie_residual)
+        off = systematic_tie_offset(flight.leg, state.matches.camera, adj.tie_residual)
         off[off < COHERENT * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)
 
@@ -97,7 +97,7 @@ def _denser_ground(
     points, sigmas, state.high = dense_points(flight, state.surface)
     state.dense = points, sigmas
     if ground is not None:
-        paths = [other.flight.rig().position[:, :2] for other in others if other.on_map]
+        paths = [other.flight.cameras().position[:, :2] for other in others if other.on_map]
         elsewhere = np.concatenate([np.zeros((0, 2)), *paths])
         more = map_heights(flight, state.surface, ground, elsewhere, state.ties.sigma_m, pictures)
         state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])

@@ -17,7 +17,7 @@ from orthoswarm.model.errors import AdjustmentError, OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
-from orthoswarm.mosaic.recorded_pose import recorded_cameras, told_of_lone_ones
+from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.carried_pictures import carry, follow, sort_out
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map, to_solution
@@ -89,7 +89,7 @@ class SwarmRefiner:
         recorded = recorded_cameras(frames, LocalGrid(self.epsg))
         kinds = sort_out(recorded.placed)
         if kinds.fit:
-            solution = self._refined(told_of_lone_ones(kinds.fit), neighbours, basemap)
+            solution = self._refined(hint_lone_photos(kinds.fit), neighbours, basemap)
         else:
             solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
         odd = carry(kinds.odd, kinds.fit, solution.placed)
@@ -280,7 +280,7 @@ def _level(states: Sequence[VehicleState]) -> None:
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     for state, correction in zip(states, network.correction_m, strict=True):
         adj = state.flight.adjustment
-        adj.rig.position[:, 2] += correction
+        adj.cameras.position[:, 2] += correction
         adj.points[:, 2] += correction
         state.dense[0][:, 2] += correction
         state.high[:, 2] += correction

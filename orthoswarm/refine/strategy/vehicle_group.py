@@ -55,12 +55,12 @@ def local_origin(grid: LocalGrid, frames: Iterable[Frame]) -> Array:
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
     """The other vehicles whose paths come within sight of this one's."""
-    own = state.flight.adjustment.rig.position
+    own = state.flight.adjustment.cameras.position
     reach = 1.5 * float(np.median(own[:, 2]))
     low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
     out = []
     for other in states:
-        xy = other.flight.adjustment.rig.position[:, :2]
+        xy = other.flight.adjustment.cameras.position[:, :2]
         if other is not state and ((xy > low) & (xy < high)).all(1).any():
             out.append(other)
     return out
@@ -95,7 +95,7 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
     sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
     if len(points) < 60:
         return states[0].surface.terrain(), []
-    path = np.concatenate([s.flight.adjustment.rig.position for s in states])
+    path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
     reach = 1.1 * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))

@@ -14,10 +14,10 @@ from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray
-from orthoswarm.refine.bundle.adjustment import Ties
+from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import frame_sigmas
-from orthoswarm.refine.bundle.height_consistency import contradicted, height_doubt, release_heights
+from orthoswarm.refine.bundle.height_consistency import contradicted_heights, height_disagreement, release_heights
 from orthoswarm.refine.bundle.snapshot import Snapshot
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
@@ -126,7 +126,7 @@ def followed(
         return None
     try:
         surface = relative(flight, options.ground(origin))
-        if not NARROWEST_RAD < fov_rad(float(flight.rig().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
+        if not NARROWEST_RAD < fov_rad(float(flight.cameras().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
             return None  # the recorded height that is behind such a lens cannot be right
         if len(frames) < FEW and strong_lens(flight):
             return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
@@ -156,12 +156,15 @@ def from_flight(
     belief = surface.belief(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
     coarse = replace(
-        adj.rig, position=adj.rig.position.copy(), rotation=adj.rig.rotation.copy(), lens=adj.rig.lens.copy()
+        adj.cameras,
+        position=adj.cameras.position.copy(),
+        rotation=adj.cameras.rotation.copy(),
+        lens=adj.cameras.lens.copy(),
     )
     watch.lap("relative")
     none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     state = VehicleState(
-        flight.frames[0].vehicle, flight, coarse, surface, Ties.none(), none, (none, np.zeros(0)),
+        flight.frames[0].vehicle, flight, coarse, surface, MapTies.none(), none, (none, np.zeros(0)),
         (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
         coarse_surface=surface,
     )  # fmt: skip
@@ -205,7 +208,7 @@ def ran_away(flight: Flight) -> bool:
     told = flight.calibration
     if told.pairs < FLOW_PAIRS or not told.trusted_height or not np.isfinite(told.spread):
         return False
-    away = abs(float(np.log(flight.adjustment.rig.lens[0, F] / told.focal_px)))
+    away = abs(float(np.log(flight.adjustment.cameras.lens[0, F] / told.focal_px)))
     return away > max(RUNAWAY, RUNAWAY_SIGMAS * told.focal_sigma)
 
 
@@ -231,7 +234,7 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     They must do so still when the adjustment is at rest, and it must come to rest without the heights, too: few
     pictures of a camera that is held level tell little of the focal length, and without heights run anywhere.
     """
-    if not flight.records.has_height.any() or not contradicted(flight.adjustment).any():
+    if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
     surface, _ = _steps(flight, surface, REST_STEPS)
     believed, calibration, was = Snapshot.of(flight.adjustment), flight.calibration, surface
@@ -244,7 +247,7 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
         if at_rest:
             break
     said = float(np.median(flight.records.position[flight.records.has_height, 2]))
-    seen = float(np.median(flight.adjustment.rig.position[:, 2])) - surface.level_m
+    seen = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
     if not at_rest or abs(seen - said) < AGREES * said:
         flight.adjustment, flight.calibration = believed.restored(), calibration
         flight.adjustment.step(9.0, was.belief(flight.adjustment.points))  # what is asked of a step is not restored
@@ -259,7 +262,7 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     for _ in range(count):
         flight.adjustment.step(9.0, surface.belief(flight.adjustment.points))
         surface = fit_surface(flight.adjustment, surface)
-        focal_px.append(float(flight.adjustment.rig.lens[0, F]))
+        focal_px.append(float(flight.adjustment.cameras.lens[0, F]))
     return surface, focal_px
 
 
@@ -299,7 +302,7 @@ def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: A
     shift_cameras(flight, fit.correction)
     settled = settle(flight, basemap, origin, state.surface)
     told, now = (
-        float(np.degrees(fov_rad(float(a.rig.lens[0, F]), flight.pictures.size[0])))
+        float(np.degrees(fov_rad(float(a.cameras.lens[0, F]), flight.pictures.size[0])))
         for a in (before, flight.adjustment)
     )
     if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
@@ -331,14 +334,14 @@ def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     unknown = flight.sparse or not flight.records.has_height.any()
     if unknown and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
         return ONE_WAY_FOV_SIGMA_DEG
-    rig = flight.rig()
+    cameras = flight.cameras()
     held = flight.focal_sigma
     share = float(np.hypot(held, DECENTRED_SHARE if strong_lens(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
-        level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(rig.position[:, 2])), 1.0)
-        share = float(np.linalg.norm([share, level, height_doubt(flight.adjustment)]))
+        level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(cameras.position[:, 2])), 1.0)
+        share = float(np.linalg.norm([share, level, height_disagreement(flight.adjustment)]))
     elif not flight.sparse:
         share = float(np.hypot(share, NO_HEIGHT_SHARE))
-    half = 0.5 * fov_rad(float(rig.lens[0, F]), int(rig.lens[0, WIDTH]))
+    half = 0.5 * fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
     return float(np.degrees(np.sin(2 * half))) * share

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.surface.vertical_line_locus import SMALL, Gray, LocusPoints, Sweep, dense_ground, height_above
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def draw_positions(camera_xy: Array, *, count: int = 900, spread_m: float = 100.
 
 
 def ground_lift(
-    rig: Rig,
+    cameras: CameraBlock,
     gray: Gray,
     positions: Array,
     terrain: Terrain,
@@ -63,7 +63,7 @@ def ground_lift(
     """Level of the ground over the terrain at free positions (see `draw_positions`), with small patches.
 
     Args:
-        rig: cameras.
+        cameras: cameras.
         gray: picture of a camera by index, uint8.
         positions: float64 (C, 2).
         terrain: the surface, within sweep.reach_m of the ground.
@@ -74,7 +74,7 @@ def ground_lift(
         limits_m: the lift is clipped to this range.
     """
     found = dense_ground(
-        rig, gray, positions, terrain, leg_of_camera, (sweep or NEAR.at_height(height_above(rig, terrain)),)
+        cameras, gray, positions, terrain, leg_of_camera, (sweep or NEAR.at_height(height_above(cameras, terrain)),)
     )
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
     if len(above) < least:

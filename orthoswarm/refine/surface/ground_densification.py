@@ -31,10 +31,12 @@ def refit(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> G
         surface = fit_surface(flight.adjustment, surface)
         if surface.fit is None:
             return surface
-    rig = flight.rig()
-    positions = draw_positions(rig.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M)
+    cameras = flight.cameras()
+    positions = draw_positions(
+        cameras.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M
+    )
     gray = flight.pictures.gray
-    free = ground_lift(rig, gray, positions, surface.terrain(), flight.leg).points
+    free = ground_lift(cameras, gray, positions, surface.terrain(), flight.leg).points
     kappa = surface.fit.kappa if as_smooth and isinstance(surface.fit, TerrainFit) else None
     surface = replace(surface, lift_m=0.0)
     return fit_surface(flight.adjustment, surface, kappa=kappa, extra=(free.points, free.sigma_z))
@@ -42,19 +44,19 @@ def refit(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> G
 
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Array]:
     """Ground points (K, 3) and their sigmas, one in each cell that shows its height; points (H, 3) high above it."""
-    rig, height = flight.rig(), flying_height(flight, surface)
-    cells = cells_near(rig.position[:, :2], dense_cell(height), sight_reach(flight))
+    cameras, height = flight.cameras(), flying_height(flight, surface)
+    cells = cells_near(cameras.position[:, :2], dense_cell(height), sight_reach(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     ground, gray = surface.terrain(), flight.pictures.gray
-    found = dense_ground(rig, gray, cells, ground, flight.leg)
+    found = dense_ground(cameras, gray, cells, ground, flight.leg)
     high = np.zeros((0, 3))
     above = 0.5 * (HIGH_FROM_M + HIGH_SHARE * height), 0.5 * (HIGH_SHARE * height - HIGH_FROM_M)
     if above[1] > 0.0:
         left = np.delete(cells, found.cell, axis=0)
         raised = replace(ground, z=ground.z + np.float32(above[0]))
         sweeps = [replace(s.at_height(height), reach_m=above[1]) for s in (HIGH_SMALL, HIGH_LARGE)]
-        high = dense_ground(rig, gray, left, raised, flight.leg, sweeps).points
+        high = dense_ground(cameras, gray, left, raised, flight.leg, sweeps).points
     return found.points, found.sigma_z, high
 
 
@@ -63,7 +65,7 @@ def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
 
     They show all that there is to see: what needs no more than these has fewer to decode.
     """
-    _, camera, _ = spaced(flight.rig(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m)
+    _, camera, _ = spaced(flight.cameras(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m)
     out = np.asarray(flight.leg < 0)
     out[camera] = True
     return out
@@ -76,9 +78,9 @@ def dense_cell(height_m: float) -> float:
 
 def sight_reach(flight: Flight) -> float:
     """How far from below the camera a vehicle's pictures show the ground, to their corners, metres."""
-    rig = flight.rig()
+    cameras = flight.cameras()
     diagonal = float(np.hypot(*flight.pictures.size))
-    return float(0.5 * diagonal / rig.lens[0, 0] * np.median(rig.position[:, 2]))
+    return float(0.5 * diagonal / cameras.lens[0, 0] * np.median(cameras.position[:, 2]))
 
 
 def cells_near(path: Array, cell_m: float, reach_m: float) -> Array:
@@ -97,4 +99,4 @@ def cells_near(path: Array, cell_m: float, reach_m: float) -> Array:
 
 def flying_height(flight: Flight, surface: GroundModel) -> float:
     """Flying height above the ground, metres."""
-    return max(1.0, float(np.median(flight.rig().position[:, 2])) - surface.level_m)
+    return max(1.0, float(np.median(flight.cameras().position[:, 2])) - surface.level_m)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.oldpickles import set_fields
-from orthoswarm.refine.bundle.adjustment import Adjustment, Ground
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.surface.given_dem import Given, GivenFit, fit_given
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import TerrainFit, fit_terrain
@@ -49,13 +49,13 @@ class GroundModel:
         """The ground for rectifying pictures."""
         return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.lift_m)
 
-    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> Ground:
+    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> HeightPrior:
         """The height prior of points (P, 3)."""
         if self.fit is None:
             expected = self._begun(points[:, :2])
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
-        return Ground(expected, sigma_m, 20.0, c)
+        return HeightPrior(expected, sigma_m, 20.0, c)
 
     def _begun(self, xy: Array) -> Array:
         level = np.full(len(xy), self.level_m)
@@ -87,8 +87,8 @@ def fit_surface(
         points, sigma = np.concatenate([points, extra[0]]), np.concatenate([sigma, extra[1]])
     if len(points) < 60:
         return before
-    position = adjustment.rig.position[:, :2]
-    reach = 0.9 * float(np.median(adjustment.rig.position[:, 2])) * 1.2
+    position = adjustment.cameras.position[:, :2]
+    reach = 0.9 * float(np.median(adjustment.cameras.position[:, 2])) * 1.2
     low, high = position.min(0) - reach, position.max(0) + reach
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     if before.given is not None:

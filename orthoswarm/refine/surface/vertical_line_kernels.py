@@ -1,6 +1,6 @@
 """Compiled parts of the vertical line locus: choice of pictures, rectified strips, correlation, peaks.
 
-Cameras come as the arrays of a Rig; `plane` is float64 (C, 3): terrain height and slope (east, north) at each cell.
+Cameras come as the arrays of a CameraBlock; `plane` is float64 (C, 3): terrain height and slope (east, north) by cell.
 """
 
 import numpy as np

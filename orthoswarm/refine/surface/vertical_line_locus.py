@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F, Rig
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class LocusPoints:
 
 
 def dense_ground(
-    rig: Rig,
+    cameras: CameraBlock,
     gray: Gray,
     cells: Array,
     terrain: Terrain,
@@ -111,7 +111,7 @@ def dense_ground(
     """Heights at free positions from correlation between pictures, of one leg where there are enough.
 
     Args:
-        rig: cameras of one or several vehicles.
+        cameras: cameras of one or several vehicles.
         gray: picture of a camera by its index, uint8 (rows, columns) as its lens says; called in the order of the
             legs, once a picture unless a window of `slots` pictures is too short for it.
         cells: float64 (C, 2), positions, east and north.
@@ -122,33 +122,33 @@ def dense_ground(
         slots: number of pictures held at a time (more only where the cells of one reference need more).
     """
     if sweeps is None:
-        height = height_above(rig, terrain)
+        height = height_above(cameras, terrain)
         sweeps = (SMALL.at_height(height), LARGE.at_height(height))
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
     plane = _planes(terrain, cells, max(5.0, s.half * s.step_m))
-    keys = _key_cameras(rig, np.asarray(leg_of_camera), s.spacing_m)
+    keys = _key_cameras(cameras, np.asarray(leg_of_camera), s.spacing_m)
     ref = np.full(len(cells), -1, np.int32)
     found = np.full((len(cells), 3), -1.0)
     if len(keys.camera) and len(cells):
         wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
         partner = np.full((len(cells), len(wished)), -1, np.int32)
         kernels.choose(
-            rig.position, rig.rotation, rig.lens_id, rig.lens, keys.camera, keys.leg, keys.along,
+            cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, keys.camera, keys.leg, keys.along,
             cells, plane, s.half * s.step_m, wished, 0.4 * min(s.baselines_m), ref, partner,
         )  # fmt: skip
-        _sweep_in_windows(rig, gray, keys.order, cells, plane, ref, partner, sweeps, slots, found)
+        _sweep_in_windows(cameras, gray, keys.order, cells, plane, ref, partner, sweeps, slots, found)
     good = np.flatnonzero(found[:, 1] >= 0.0)
     points = np.empty((len(good), 3))
-    kernels.raise_points(rig.position, ref[good], cells[good], plane[good], found[good, 0], points)
+    kernels.raise_points(cameras.position, ref[good], cells[good], plane[good], found[good, 0], points)
     return LocusPoints(points, found[good, 2], found[good, 1], good)
 
 
-def height_above(rig: Rig, terrain: Terrain) -> float:
+def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
     """Median height of cameras above the terrain, metres, at least 1."""
-    if len(rig) == 0:
+    if len(cameras) == 0:
         return 150.0
-    return max(1.0, float(np.median(rig.position[:, 2] - terrain.height(rig.position[:, :2]))))
+    return max(1.0, float(np.median(cameras.position[:, 2] - terrain.height(cameras.position[:, :2]))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class _Keys:
 
 
 def spaced(
-    rig: Rig, leg_of_camera: NDArray[np.integer], spacing_m: float
+    cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
     """Cameras at least so far apart along their legs, and each leg's last one: leg, camera and way along it, sorted."""
     camera: list[int] = []
@@ -172,7 +172,7 @@ def spaced(
         members = np.flatnonzero(leg_of_camera == number)
         if len(members) < 2:
             continue
-        p = rig.position[members, :2]
+        p = cameras.position[members, :2]
         way = (p - p.mean(0)) @ np.linalg.svd(p - p.mean(0), full_matrices=False)[2][0]
         last = -np.inf
         rank = np.argsort(way)
@@ -185,9 +185,9 @@ def spaced(
     return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
 
 
-def _key_cameras(rig: Rig, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
-    leg, camera, along = spaced(rig, leg_of_camera, spacing)
-    order = np.full(len(rig), -1, np.int64)
+def _key_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
+    leg, camera, along = spaced(cameras, leg_of_camera, spacing)
+    order = np.full(len(cameras), -1, np.int64)
     order[camera] = np.arange(len(camera))
     return _Keys(camera, leg, along, order)
 
@@ -202,7 +202,7 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
 
 
 def _sweep_in_windows(
-    rig: Rig,
+    cameras: CameraBlock,
     gray: Gray,
     order: NDArray[np.int64],
     cells: Array,
@@ -226,7 +226,7 @@ def _sweep_in_windows(
         for a, b in pairwise(np.flatnonzero(np.r_[True, np.diff(ref[usable]) != 0, True]).tolist())
     ]
     slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
-    window = _Window(rig, gray, _reduction(rig, plane, ref, min(s.step_m for s in sweeps)), slots)
+    window = _Window(cameras, gray, _reduction(cameras, plane, ref, min(s.step_m for s in sweeps)), slots)
     factor = window.factor.astype(np.float64)
 
     def search(block: NDArray[np.int64], needed: set[int]) -> None:
@@ -234,7 +234,7 @@ def _sweep_in_windows(
         for s in sweeps:
             curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
             kernels.correlate(
-                rig.position, rig.rotation, rig.lens_id, rig.lens, window.stack, window.slot, factor,
+                cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, window.stack, window.slot, factor,
                 cells[block], plane[block], ref[block], partner[block], s.heights, s.half, s.step_m, curve,
             )  # fmt: skip
             kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
@@ -254,19 +254,19 @@ def _sweep_in_windows(
 class _Window:
     """The pictures held at a time, shrunk to what the sweep needs: a stack, and the slot of each camera in it."""
 
-    def __init__(self, rig: Rig, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
+    def __init__(self, cameras: CameraBlock, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
         self.factor = factor
-        self.slot = np.full(len(rig), -1, np.int32)
-        sizes = rig.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
+        self.slot = np.full(len(cameras), -1, np.int32)
+        sizes = cameras.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
         self.stack = np.zeros((slots, int(sizes[:, 0].max()), int(sizes[:, 1].max())), np.uint8)
-        self._lens_id, self._gray, self._free = rig.lens_id, gray, list(range(slots))
+        self._lens_id, self._gray, self._free = cameras.lens_id, gray, list(range(slots))
 
-    def hold(self, cameras: list[int]) -> None:
+    def hold(self, wanted: list[int]) -> None:
         """Read the pictures that are not held yet, into the places of those no longer needed."""
-        for camera in set(np.flatnonzero(self.slot >= 0).tolist()).difference(cameras):
+        for camera in set(np.flatnonzero(self.slot >= 0).tolist()).difference(wanted):
             self._free.append(int(self.slot[camera]))
             self.slot[camera] = -1
-        for camera in cameras:
+        for camera in wanted:
             if self.slot[camera] < 0:
                 place = self._free.pop()
                 picture = _reduced(self._gray(camera), int(self.factor[self._lens_id[camera]]))
@@ -274,10 +274,10 @@ class _Window:
                 self.slot[camera] = place
 
 
-def _reduction(rig: Rig, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
+def _reduction(cameras: CameraBlock, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
     """Whole number by which each lens's pictures are shrunk, so that a pixel is not finer than a sample needs."""
-    above = float(np.median(rig.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
-    gsd = max(above, 1.0) / rig.lens[:, F]
+    above = float(np.median(cameras.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
+    gsd = max(above, 1.0) / cameras.lens[:, F]
     return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
 
 

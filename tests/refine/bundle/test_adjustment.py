@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.linalg import lapack
 
 from orthoswarm.refine.bundle import normal_equations
-from orthoswarm.refine.bundle.adjustment import Adjustment, Ground, Ties, _back, exp_rotation, log_rotation
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies, _back, exp_rotation, log_rotation
 from orthoswarm.refine.flight.relative_block import first_points
 from tests.kit.swarm_block import make_block
 
 
 def level(points, sigma=1.0):
     zero = np.zeros(points)
-    return Ground(zero, sigma, 20.0, c=9.0)
+    return HeightPrior(zero, sigma, 20.0, c=9.0)
 
 
 def solved(block, free=None, ties=None, schedule=(1e4, 1e4, 100.0, 100.0, 9.0, 9.0, 9.0)):
@@ -29,7 +29,7 @@ def solved(block, free=None, ties=None, schedule=(1e4, 1e4, 100.0, 100.0, 9.0, 9
 def test_focal_length_distortion_and_attitude_bias_are_found():
     block = make_block()
     adj = solved(block)
-    f, k1, k2 = adj.rig.lens[0, :3]
+    f, k1, k2 = adj.cameras.lens[0, :3]
     assert f == pytest.approx(300.0, abs=1.5)
     assert k1 == pytest.approx(-0.05, abs=0.004)
     assert k2 == pytest.approx(0.01, abs=0.004)
@@ -40,7 +40,7 @@ def test_focal_length_distortion_and_attitude_bias_are_found():
 def test_positions_are_relatively_better_than_their_records():
     block = make_block()
     adj = solved(block)
-    error = (adj.rig.position - block.true.position)[:, :2]
+    error = (adj.cameras.position - block.true.position)[:, :2]
     recorded = (block.priors.position - block.true.position)[:, :2]
     assert (error - error.mean(0)).std() < 0.5 * (recorded - recorded.mean(0)).std()
 
@@ -53,9 +53,9 @@ def test_a_late_receiver_is_noticed():
 def test_ties_bring_a_drifting_flight_to_its_place():
     block = make_block()
     chosen = np.arange(0, len(block.points), 12, dtype=np.int32)
-    ties = Ties(chosen, block.points[chosen, :2], np.full(len(chosen), 0.2))
+    ties = MapTies(chosen, block.points[chosen, :2], np.full(len(chosen), 0.2))
     adj = solved(block, ties=ties)
-    error = np.hypot(*(adj.rig.position - block.true.position)[:, :2].T)
+    error = np.hypot(*(adj.cameras.position - block.true.position)[:, :2].T)
     assert np.median(error) < 0.15
     assert np.hypot(*adj.tie_residual.T).max() < 1.0
 
@@ -67,8 +67,8 @@ def test_held_cameras_stay_where_they_are():
     adj = Adjustment.begin(held, block.tracks, block.priors, first_points(held, block.tracks), free)
     for c in (1e4, 100.0, 9.0):
         adj.step(c, level(len(adj.points)))
-    np.testing.assert_array_equal(adj.rig.position[~free], block.true.position[~free])
-    assert np.abs(adj.rig.position[free] - block.true.position[free]).max() > 0
+    np.testing.assert_array_equal(adj.cameras.position[~free], block.true.position[~free])
+    assert np.abs(adj.cameras.position[free] - block.true.position[free]).max() > 0
 
 
 def test_a_wild_observation_does_not_bend_the_block():
@@ -77,7 +77,7 @@ def test_a_wild_observation_does_not_bend_the_block():
     wild = np.arange(0, len(uv), 20)
     uv[wild] += 40.0
     adj = solved(replace(block, tracks=replace(block.tracks, uv=uv)))
-    assert adj.rig.lens[0, 0] == pytest.approx(300.0, abs=2.0)
+    assert adj.cameras.lens[0, 0] == pytest.approx(300.0, abs=2.0)
     order = np.lexsort((block.tracks.camera, block.tracks.point))
     assert np.median(adj.obs_weight[np.isin(order, wild)]) < 0.01
 
@@ -88,11 +88,11 @@ def test_stated_covariance_is_the_scatter_of_repeated_flights():
         block = make_block(seed=seed, per_leg=15, legs=2)
         chosen = np.arange(0, len(block.points), 10, dtype=np.int32)
         noise = np.random.default_rng(seed + 99).normal(0, 0.2, (len(chosen), 2))
-        ties = Ties(chosen, block.points[chosen, :2] + noise, np.full(len(chosen), 0.2))
+        ties = MapTies(chosen, block.points[chosen, :2] + noise, np.full(len(chosen), 0.2))
         adj = solved(block, ties=ties)
         middle = np.array([7, 22])
         covariance, _ = adj.covariance(middle, 9.0, level(len(adj.points)), ties)
-        errors.append((adj.rig.position - block.true.position)[middle, :2])
+        errors.append((adj.cameras.position - block.true.position)[middle, :2])
         stated.append(np.sqrt(covariance[:, [0, 1], [0, 1]]))
     ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))
     assert 0.5 < ratio < 1.7

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from orthoswarm.refine.bundle.covariance import MAP_FLOOR_PX, RADIAL, TIE_SHARE, map_doubt, unexplained
+from orthoswarm.refine.bundle.covariance import MAP_FLOOR_PX, RADIAL, TIE_SHARE, common_map_sigma, systematic_tie_offset
 
 
 def test_one_and_two_stated_sigmas_are_honest_by_axis_and_by_length():
@@ -17,7 +17,7 @@ def test_one_and_two_stated_sigmas_are_honest_by_axis_and_by_length():
 def test_a_map_that_scatters_its_ties_is_doubted_more():
     residual = np.random.default_rng(1).normal(0.0, 1.0, (400, 2))
     given = np.full(400, 0.1)
-    good, bad = map_doubt(0.03 * residual, given, 0.5), map_doubt(0.5 * residual, given, 0.5)
+    good, bad = common_map_sigma(0.03 * residual, given, 0.5), common_map_sigma(0.5 * residual, given, 0.5)
     assert good == pytest.approx(np.hypot(MAP_FLOOR_PX * 0.5, TIE_SHARE * 0.03), rel=0.1)
     assert bad == pytest.approx(TIE_SHARE * 0.5, rel=0.1)
 
@@ -25,15 +25,15 @@ def test_a_map_that_scatters_its_ties_is_doubted_more():
 def test_wrong_ties_make_no_doubt_of_the_others():
     residual = np.random.default_rng(2).normal(0.0, 0.05, (400, 2))
     given = np.full(400, 0.1)
-    clean = map_doubt(residual, given, 0.5)
+    clean = common_map_sigma(residual, given, 0.5)
     residual[:40] += 4.0
-    assert map_doubt(residual, given, 0.5) < 1.25 * clean
+    assert common_map_sigma(residual, given, 0.5) < 1.25 * clean
 
 
 def test_few_ties_that_were_followed_are_not_believed_to_be_exact():
     doubt = np.hypot(MAP_FLOOR_PX * 0.5, TIE_SHARE * 0.35)
-    assert map_doubt(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(doubt, rel=0.02)
-    assert map_doubt(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(MAP_FLOOR_PX * 2.0)
+    assert common_map_sigma(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(doubt, rel=0.02)
+    assert common_map_sigma(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(MAP_FLOOR_PX * 2.0)
 
 
 def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not():
@@ -41,6 +41,6 @@ def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not()
     residual = np.random.default_rng(3).normal(0.0, 0.05, (80, 2))
     residual[7] += 3.0
     residual[camera >= 25] += (0.0, 1.0)
-    off = unexplained(leg, camera, residual)
+    off = systematic_tie_offset(leg, camera, residual)
     assert off[:15].max() < 0.1
     assert off[32:].min() > 0.8

@@ -10,22 +10,22 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.height_consistency import (
     FREE_SIGMA_M,
-    contradicted,
-    height_doubt,
+    contradicted_heights,
+    height_disagreement,
     log_focal_sigmas,
-    unbelieved_offsets,
+    offsets_without_height_prior,
 )
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.sparse_adjustment import believed_heights, solve_sparse
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_records
-from orthoswarm.refine.initial.initial_orientation import start_in_plane
-from orthoswarm.refine.initial.lens_groups import _groups, by_vehicle, told_apart
+from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
+from orthoswarm.refine.initial.lens_groups import _groups, lens_per_vehicle, split_unlike_lenses
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
 
 
 def begin(world: World, frames) -> SparseStart:
     records = read_records(frames, GRID, ORIGIN)
-    start = start_in_plane(records, world.pairs, world.features)
+    start = find_initial_orientation(records, world.pairs, world.features)
     return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
 
 
@@ -46,20 +46,20 @@ def recorded(frame, height_m):
 
 
 def fov_deg(adjustment: Adjustment) -> float:
-    return float(np.degrees(fov_rad(float(adjustment.rig.lens[0, F]), int(adjustment.rig.lens[0, WIDTH]))))
+    return float(np.degrees(fov_rad(float(adjustment.cameras.lens[0, F]), int(adjustment.cameras.lens[0, WIDTH]))))
 
 
 def sigma_deg(adjustment: Adjustment) -> float:
-    share = np.hypot(log_focal_sigmas(adjustment)[0], height_doubt(adjustment))
+    share = np.hypot(log_focal_sigmas(adjustment)[0], height_disagreement(adjustment))
     return float(np.degrees(np.sin(np.radians(fov_deg(adjustment))) * share))
 
 
 def test_right_heights_are_believed_and_agree_with_the_pictures():
     world = crosshatch(tilt_deg=10.0)
     adjustment, _, found = solved(world, world.frames)
-    offset, doubt = unbelieved_offsets(adjustment)
+    offset, doubt = offsets_without_height_prior(adjustment)
     assert found == []
-    assert not contradicted(adjustment).any() and height_doubt(adjustment) < 0.02
+    assert not contradicted_heights(adjustment).any() and height_disagreement(adjustment) < 0.02
     assert (np.abs(offset) < 4.0 * np.hypot(doubt, 1.0)).all()
 
 
@@ -136,7 +136,7 @@ def test_unlike_cameras_of_one_name_get_lenses_of_their_own(second_fov_deg, lens
     frames, features, pairs = two_cameras(second_fov_deg)
     records = read_records(frames, GRID, ORIGIN, share_lenses=True)
     assert records.lens.max() == 0
-    kept = told_apart(records, start_in_plane(by_vehicle(records), pairs, features))
+    kept = split_unlike_lenses(records, find_initial_orientation(lens_per_vehicle(records), pairs, features))
     assert int(kept.lens.max()) + 1 == lenses == len(kept.fov_hint)
     assert (kept is records) == (lenses == 1)
 

@@ -137,7 +137,7 @@ def weak_at(position, recorded, leg, weak):
         leg=np.asarray(leg),
         records=SimpleNamespace(time_s=np.arange(n, dtype=float)),
         adjustment=SimpleNamespace(
-            rig=SimpleNamespace(position=position.copy(), rotation=np.tile(np.eye(3), (n, 1, 1))),
+            cameras=SimpleNamespace(position=position.copy(), rotation=np.tile(np.eye(3), (n, 1, 1))),
             priors=SimpleNamespace(position=recorded, rotation=np.tile(np.eye(3), (n, 1, 1))),
             obs_weight=np.ones(len(strong) * 20),
             tracks=SimpleNamespace(camera=np.repeat(strong, 20)),
@@ -145,7 +145,7 @@ def weak_at(position, recorded, leg, weak):
     )
     sigma = np.full(n, 0.1)
     assert np.flatnonzero(steady_weak(flight, sigma)).tolist() == list(weak)
-    return flight.adjustment.rig.position, sigma
+    return flight.adjustment.cameras.position, sigma
 
 
 def test_a_weak_picture_at_a_corner_follows_the_record_and_not_the_line_across_it():

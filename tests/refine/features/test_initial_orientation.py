@@ -11,7 +11,7 @@ from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad, rotation_from_angles
 from orthoswarm.refine.flight.sparse_start import read_records
 from orthoswarm.refine.initial.heading import circular_mode
-from orthoswarm.refine.initial.initial_orientation import Start2D, start_in_plane
+from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.planar_similarity import level_from_nadir, rotation_of
 from orthoswarm.refine.initial.segments import photo_legs, split_segments
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
@@ -23,26 +23,26 @@ def crosshatch(**options) -> World:
     return make_world(np.concatenate([one, two]), np.concatenate([yaw_one, yaw_two]), **options)
 
 
-def begin(world: World, frames=None) -> Start2D:
-    return start_in_plane(read_records(frames or world.frames, GRID, ORIGIN), world.pairs, world.features)
+def begin(world: World, frames=None) -> InitialOrientation:
+    return find_initial_orientation(read_records(frames or world.frames, GRID, ORIGIN), world.pairs, world.features)
 
 
-def yaw_error_deg(start: Start2D, world: World) -> float:
-    axis_up = -world.rig.rotation[:, :, 1]
+def yaw_error_deg(start: InitialOrientation, world: World) -> float:
+    axis_up = -world.cameras.rotation[:, :, 1]
     true = np.arctan2(axis_up[:, 0], axis_up[:, 1])
     return float(np.degrees(np.median(np.abs(wrap_rad(start.yaw - true)))))
 
 
-def tilt_deg(start: Start2D) -> float:
+def tilt_deg(start: InitialOrientation) -> float:
     return float(np.degrees(np.median(np.arccos(start.level[:, 2, 2]))))
 
 
-def found_fov_deg(start: Start2D, width: int = 800) -> float:
+def found_fov_deg(start: InitialOrientation, width: int = 800) -> float:
     return float(np.degrees(fov_rad(float(start.focal[0]), width)))
 
 
-def position_error(start: Start2D, world: World) -> float:
-    true = world.rig.position[:, 0] + 1j * world.rig.position[:, 1]
+def position_error(start: InitialOrientation, world: World) -> float:
+    true = world.cameras.position[:, 0] + 1j * world.cameras.position[:, 1]
     return float(np.median(np.abs(start.position - true)))
 
 
@@ -85,7 +85,7 @@ def test_wrong_position_records_are_told_apart_and_replaced():
     ]
     start = begin(world, frames)
     assert np.flatnonzero(~start.gps_ok).tolist() == [4, 21]
-    true = world.rig.position[:, 0] + 1j * world.rig.position[:, 1]
+    true = world.cameras.position[:, 0] + 1j * world.cameras.position[:, 1]
     assert np.abs(start.position - true)[[4, 21]].max() < 3.0
 
 
@@ -119,7 +119,7 @@ def test_photos_of_two_heights_get_their_own_scale_without_height_tags():
     world = make_world(np.concatenate([low, high]), np.concatenate([yaw, yaw_high]), height=height)
     start = begin(world, [without(f, "height_m") for f in world.frames])
     found = start.metres / np.median(start.metres[:18])
-    true = world.rig.position[:, 2] / np.median(world.rig.position[:18, 2])
+    true = world.cameras.position[:, 2] / np.median(world.cameras.position[:18, 2])
     assert np.median(found[18:]) == pytest.approx(float(np.median(true[18:])), rel=0.05)
     assert np.abs(found / true - 1.0).max() < 0.08
 
@@ -134,7 +134,7 @@ def test_parts_without_overlap_are_told_apart_and_both_placed():
 
 def test_no_pair_at_all_leaves_the_tags():
     world = crosshatch()
-    start = start_in_plane(read_records(world.frames, GRID, ORIGIN), [], world.features)
+    start = find_initial_orientation(read_records(world.frames, GRID, ORIGIN), [], world.features)
     assert not start.yaw_known.any()
     assert yaw_error_deg(start, world) < 2.0
     assert np.isfinite(start.position).all()

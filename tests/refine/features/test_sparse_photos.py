@@ -18,7 +18,7 @@ from orthoswarm.refine.flight.sparse_adjustment import solve_sparse
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight, reduced
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_records, sparse_start
-from orthoswarm.refine.initial.initial_orientation import start_in_plane
+from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
 from orthoswarm.refine.initial.pair_graph import serial
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
 
@@ -26,7 +26,7 @@ from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, t
 def begin(world: World, frames=None) -> SparseStart:
     frames = frames or world.frames
     records = read_records(frames, GRID, ORIGIN)
-    start = start_in_plane(records, world.pairs, world.features)
+    start = find_initial_orientation(records, world.pairs, world.features)
     return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
 
 
@@ -37,13 +37,13 @@ def crosshatch(**options) -> World:
 
 
 def fov_deg(adjustment: Adjustment) -> float:
-    lens = adjustment.rig.lens[0]
+    lens = adjustment.cameras.lens[0]
     return float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH]))))
 
 
 def shape_error(adjustment: Adjustment, world: World) -> float:
     """Scatter of the cameras about the truth after one common shift, metres."""
-    off = adjustment.rig.position - world.rig.position
+    off = adjustment.cameras.position - world.cameras.position
     return float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
 
 
@@ -53,10 +53,10 @@ def test_adjustment_finds_cameras_and_lens_without_any_tag():
     start = begin(world, bare)
     adjustment = solve_sparse(start)
     assert fov_deg(adjustment) == pytest.approx(80.0, abs=1.0)
-    assert adjustment.rig.lens[0, 1] == pytest.approx(-0.03, abs=0.02)
+    assert adjustment.cameras.lens[0, 1] == pytest.approx(-0.03, abs=0.02)
     assert shape_error(adjustment, world) < 0.5
-    tilt = np.degrees(np.arccos(-adjustment.rig.rotation[:, 2, 2]))
-    true = np.degrees(np.arccos(-world.rig.rotation[:, 2, 2]))
+    tilt = np.degrees(np.arccos(-adjustment.cameras.rotation[:, 2, 2]))
+    true = np.degrees(np.arccos(-world.cameras.rotation[:, 2, 2]))
     assert np.abs(tilt - true).max() < 0.5
     residual = np.hypot(*adjustment.residuals().T)
     assert np.nanmedian(residual) < 0.6
@@ -66,9 +66,9 @@ def test_straight_down_over_flat_ground_keeps_scale_and_does_not_sink():
     xy, yaw = lawnmower(4, 6, 30.0, 45.0, True)
     world = make_world(xy, yaw, relief=0.2, gps_sigma=0.5)
     adjustment = solve_sparse(begin(world))
-    true = world.rig.lens[0, F] / 60.0
-    above = np.median(adjustment.rig.position[:, 2]) - np.median(adjustment.points[:, 2])
-    assert adjustment.rig.lens[0, F] / above == pytest.approx(true, rel=0.01)
+    true = world.cameras.lens[0, F] / 60.0
+    above = np.median(adjustment.cameras.position[:, 2]) - np.median(adjustment.points[:, 2])
+    assert adjustment.cameras.lens[0, F] / above == pytest.approx(true, rel=0.01)
     assert above == pytest.approx(60.0, abs=4.0)
 
 
@@ -95,9 +95,9 @@ def test_observation_sigmas_end_as_large_as_the_noise():
 def test_reduced_pictures_have_the_same_cameras():
     full = solve_sparse(begin(crosshatch(tilt_deg=8.0)))
     half = reduced(full, 2.0, (400, 300))
-    assert half.rig.lens[0, F] == pytest.approx(full.rig.lens[0, F] / 2.0, rel=2e-3)
-    assert np.abs(half.rig.position - full.rig.position).max() < 0.1
-    assert half.rig.lens[0, [WIDTH, HEIGHT]].tolist() == [400, 300]
+    assert half.cameras.lens[0, F] == pytest.approx(full.cameras.lens[0, F] / 2.0, rel=2e-3)
+    assert np.abs(half.cameras.position - full.cameras.position).max() < 0.1
+    assert half.cameras.lens[0, [WIDTH, HEIGHT]].tolist() == [400, 300]
     ratio = np.nanmedian(np.hypot(*half.residuals().T)) / np.nanmedian(np.hypot(*full.residuals().T))
     assert ratio == pytest.approx(0.5, abs=0.02)
 
@@ -152,13 +152,13 @@ def two_vehicles():
 def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then():
     world, frames = two_vehicles()
     records = read_records(frames, GRID, ORIGIN, share_lenses=True)
-    plane = start_in_plane(records, world.pairs, world.features)
+    plane = find_initial_orientation(records, world.pairs, world.features)
     start = assemble(frames, records, world.features, world.pairs, plane, {}, len(world.pairs))
-    assert len(start.rig.lens) == 1
+    assert len(start.cameras.lens) == 1
     assert len(start.plane.tags) == 2
     own = own_lenses(solve_sparse(start), start)
-    assert len(own.rig.lens) == 2
-    for lens in own.rig.lens:
+    assert len(own.cameras.lens) == 2
+    for lens in own.cameras.lens:
         assert np.degrees(fov_rad(float(lens[F]), 800)) == pytest.approx(80.0, abs=1.0)
     assert shape_error(own, world) < 0.5
 
@@ -184,9 +184,9 @@ def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
         results = [sparse_start(frames, records, lambda f: pictures[f.image], run) for run in runs_in]
     one, two = results
     assert np.array_equal(one.tracks.uv, two.tracks.uv)
-    assert np.array_equal(one.rig.position, two.rig.position)
+    assert np.array_equal(one.cameras.position, two.cameras.position)
     adjustment = solve_sparse(one)
-    step = np.diff(adjustment.rig.position[:, 1])
+    step = np.diff(adjustment.cameras.position[:, 1])
     assert np.median(step) == pytest.approx(20.0, abs=1.5)
     assert np.abs(wrap_rad(one.plane.yaw)).max() < np.radians(5.0)
 
@@ -197,13 +197,13 @@ def test_vehicles_come_apart_as_they_were_found_together():
     units = [[f for f in frames if f.vehicle == v] for v in "ba"]
     flights = open_sparse_flights(units, GRID, ORIGIN, lambda f: pictures[f.image])
     assert [[f.image for f in flight.frames] for flight in flights] == [[f.image for f in unit] for unit in units]
-    north = {f.image: p[1] for v in flights for f, p in zip(v.frames, v.adjustment.rig.position)}
+    north = {f.image: p[1] for v in flights for f, p in zip(v.frames, v.adjustment.cameras.position)}
     steps = np.diff([north[f.image] for f in frames])
     assert np.median(steps) == pytest.approx(20.0, abs=1.5)
     assert np.ptp(steps) < 1.0
     for flight in flights:
         assert flight.sparse
-        assert len(flight.adjustment.rig.lens) == 1
+        assert len(flight.adjustment.cameras.lens) == 1
         assert np.nanmedian(np.hypot(*flight.adjustment.residuals().T)) < 0.5
 
 
@@ -227,8 +227,8 @@ def test_one_or_two_photos_are_no_error(count):
     frames, pictures = flat_flight()
     start = sparse_start(frames[:count], read_records(frames[:count], GRID, ORIGIN), lambda f: pictures[f.image])
     adjustment = solve_sparse(start)
-    assert np.isfinite(adjustment.rig.position).all()
-    assert adjustment.rig.position[0, 2] == pytest.approx(60.0, abs=3.0)
+    assert np.isfinite(adjustment.cameras.position).all()
+    assert adjustment.cameras.position[0, 2] == pytest.approx(60.0, abs=3.0)
 
 
 def test_many_photos_of_one_spot_are_no_error():
@@ -236,7 +236,7 @@ def test_many_photos_of_one_spot_are_no_error():
     many = [replace(frames[0], image=f"s{k}.jpg", time_s=float(k)) for k in range(9)]
     start = sparse_start(many, read_records(many, GRID, ORIGIN), lambda f: pictures["p000.jpg"])
     adjustment = solve_sparse(start)
-    assert np.ptp(adjustment.rig.position, axis=0).max() < 1.0
+    assert np.ptp(adjustment.cameras.position, axis=0).max() < 1.0
 
 
 def real_frames(folder, every: int = 1):
@@ -273,20 +273,20 @@ def test_brighton_flips_are_found_and_the_flight_is_ready_for_the_later_steps(re
     assert flight.survived.all()
     assert flight.sparse
     assert flight.leg.tolist() == [0] * 6 + [1] * 6 + [2] * 6
-    up = -adjustment.rig.rotation[:, :2, 1]
+    up = -adjustment.cameras.rotation[:, :2, 1]
     assert np.abs(wrap_rad(np.arctan2(up[:, 0], up[:, 1]) - np.radians(45.0))).max() < np.radians(12.0)
-    assert adjustment.rig.lens[0, WIDTH] == flight.pictures.size[0]
+    assert adjustment.cameras.lens[0, WIDTH] == flight.pictures.size[0]
     assert np.nanmedian(np.hypot(*adjustment.residuals().T)) < 0.5
 
 
 def test_mirafiori_scale_holds_without_lens_tags(real_data):
     frames = [replace(f, fov_hint_rad=None) for f in real_frames(real_data("mirafiori_rtk"))]
     start, adjustment, grid, origin, _ = solved(frames)
-    scale = adjustment.rig.lens[0, F] / np.median(adjustment.rig.position[:, 2])
+    scale = adjustment.cameras.lens[0, F] / np.median(adjustment.cameras.position[:, 2])
     assert scale == pytest.approx(42.12, rel=0.012)
     fixes = grid.to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]) - origin
     lag = adjustment.group_values(0)[2]
-    off = adjustment.rig.position[:, :2] - fixes - lag * start.velocity
+    off = adjustment.cameras.position[:, :2] - fixes - lag * start.velocity
     assert np.sqrt((off**2).sum(1).mean()) < 0.08
     assert fov_deg(adjustment) == pytest.approx(45.4, abs=2.0)
 
@@ -295,7 +295,7 @@ def test_mirafiori_scale_holds_without_lens_tags(real_data):
 def test_jwcate_is_one_piece_with_its_tilts_and_lag(real_data):
     start, adjustment, *_ = solved(real_frames(real_data("jwcate_1200")))
     assert np.bincount(start.component).tolist() == [36]
-    tilt = np.degrees(np.arccos(-adjustment.rig.rotation[:, 2, 2]))
+    tilt = np.degrees(np.arccos(-adjustment.cameras.rotation[:, 2, 2]))
     medians = [float(np.median(tilt[start.segment == s])) for s in range(4)]
     assert medians == pytest.approx([0.8, 4.7, 1.0, 9.0], abs=1.0)
     assert any("lag" in w for w in start.warnings)
@@ -310,7 +310,7 @@ def control_point_rms(frames, adjustment, grid, origin, table) -> float:
     true = np.array([[float(r[0]), float(r[1])] for r in rows])
     level = np.full(len(rows), float(np.median(adjustment.points[:, 2])))
     for _ in range(2):
-        xy = adjustment.rig.to_ground(camera, uv, level)
+        xy = adjustment.cameras.to_ground(camera, uv, level)
         near = ((adjustment.points[:, None, :2] - xy[None]) ** 2).sum(-1).argsort(axis=0)[:12]
         level = np.median(adjustment.points[near, 2], axis=0)
     off = xy + origin - true
@@ -321,10 +321,10 @@ def test_every_fourth_sheffield_photo_without_tags_lies_on_the_control_points(re
     folder = real_data("sheffield_cross_800")
     frames = bare(real_frames(folder, 4))
     start, adjustment, grid, origin, _ = solved(frames)
-    tilt = np.degrees(np.arccos(-adjustment.rig.rotation[:, 2, 2]))
+    tilt = np.degrees(np.arccos(-adjustment.cameras.rotation[:, 2, 2]))
     assert np.median(tilt) == pytest.approx(15.3, abs=1.0)
     assert fov_deg(adjustment) == pytest.approx(81.2, abs=1.5)
-    assert np.median(adjustment.rig.position[:, 2]) == pytest.approx(62.5, abs=3.0)
+    assert np.median(adjustment.cameras.position[:, 2]) == pytest.approx(62.5, abs=3.0)
     assert start.placed.all()
     assert control_point_rms(frames, adjustment, grid, origin, folder / "gcp_file_4000px.txt") < 0.8
 
@@ -357,7 +357,7 @@ def test_legs_of_sheffield_as_vehicles_fit_together(real_data):
         index = {f.image: k for k, f in enumerate(flight.frames)}
         for r in (r for r in rows if r[5] in index):
             uv = np.array([[(float(r[3]) + 0.5) * 0.2 - 0.5, (float(r[4]) + 0.5) * 0.2 - 0.5]])
-            xy = flight.adjustment.rig.to_ground(np.array([index[r[5]]]), uv, np.zeros(1))
+            xy = flight.adjustment.cameras.to_ground(np.array([index[r[5]]]), uv, np.zeros(1))
             off.append(xy[0] + origin - np.array([float(r[0]), float(r[1])]))
     spread = np.array(off) - np.mean(off, axis=0)
     assert np.sqrt((spread**2).sum(1).mean()) < 0.8

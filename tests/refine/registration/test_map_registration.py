@@ -9,7 +9,7 @@ import pytest
 
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.refine.bundle.block_arrays import Rig
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.features.patch_matching import gradient_field, match, texture_field
 from orthoswarm.refine.registration.absolute_orientation import accepted, edge_pull, mode_shift
@@ -68,27 +68,27 @@ def pictures_of(world, offset):
     """Six nadir pictures whose record is `offset` metres away from where they were taken."""
     true = np.array([[x, 10.0, 100.0] for x in np.linspace(-60, 60, 6)])
     rotation = np.repeat(rotation_from_angles([0.0], [-np.pi / 2], [0.0]), 6, axis=0)
-    rig = Rig(true, rotation, np.zeros(6, np.int32), np.array([[300.0, 0, 0, 0, 0, 0, 320, 240]]))
+    cameras = CameraBlock(true, rotation, np.zeros(6, np.int32), np.array([[300.0, 0, 0, 0, 0, 0, 320, 240]]))
     columns, rows = np.meshgrid(np.arange(320), np.arange(240))
     images = []
     for i in range(6):
-        ground = rig.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float))
+        ground = cameras.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float))
         u, v = (ground[..., 0] + 250) / GSD - 0.5, (250 - ground[..., 1]) / GSD - 0.5
         image = cv2.remap(world.values, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
         images.append(np.clip(255 - 0.7 * image, 0, 255).astype(np.uint8))  # light and dark have changed places
-    return Rig(true + np.array([*offset, 0.0]), rotation, rig.lens_id, rig.lens), images
+    return CameraBlock(true + np.array([*offset, 0.0]), rotation, cameras.lens_id, cameras.lens), images
 
 
 def test_a_strip_is_found_although_light_and_dark_changed_places(world):
-    rig, images = pictures_of(world, (17.0, -9.0))
-    found = register(rig, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=40.0, gsd_m=1.0)
+    cameras, images = pictures_of(world, (17.0, -9.0))
+    found = register(cameras, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=40.0, gsd_m=1.0)
     np.testing.assert_allclose(found.shift, (-17.0, 9.0), atol=0.3)
     assert found.ratio < 0.6
 
 
 def test_a_map_elsewhere_gives_no_match(world):
-    rig, images = pictures_of(world, (0.0, 0.0))
-    away = Rig(rig.position + np.array([900.0, 0, 0]), rig.rotation, rig.lens_id, rig.lens)
+    cameras, images = pictures_of(world, (0.0, 0.0))
+    away = CameraBlock(cameras.position + np.array([900.0, 0, 0]), cameras.rotation, cameras.lens_id, cameras.lens)
     assert register(away, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0) is None
 
 
@@ -142,19 +142,19 @@ def test_strips_of_other_ground_are_not_found_together(seed):
 
 
 def raised_ground(height_m):
-    """Rig, pictures and map of ground that is `height_m` above where it is believed, seen from 100 m."""
+    """CameraBlock, pictures and map of ground that is `height_m` above where it is believed, seen from 100 m."""
     world = FlatMap(texture(1000, seed=3))
     rotation = np.repeat(rotation_from_angles([0.0], [-np.pi / 2], [0.0]), 5, axis=0)
     position = np.array([[x, 0.0, 100.0] for x in np.linspace(-60, 60, 5)])
-    rig = Rig(position, rotation, np.zeros(5, np.int32), np.array([[160.0, 0, 0, 0, 0, 0, 320, 320]]))
+    cameras = CameraBlock(position, rotation, np.zeros(5, np.int32), np.array([[160.0, 0, 0, 0, 0, 0, 320, 320]]))
     columns, rows = np.meshgrid(np.arange(320), np.arange(320))
     images = []
     for i in range(5):
-        ground = rig.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float), height_m)
+        ground = cameras.camera(i, np.zeros(2)).to_ground(np.stack([columns, rows], -1).astype(float), height_m)
         u, v = (ground[..., 0] + 250) / GSD - 0.5, (250 - ground[..., 1]) / GSD - 0.5
         images.append(cv2.remap(world.values, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR))
     flight = SimpleNamespace(
-        rig=lambda: rig,
+        cameras=lambda: cameras,
         leg=np.zeros(5, np.int32),
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: np.clip(images[i], 0, 255).astype(np.uint8)),
     )
@@ -186,25 +186,25 @@ def test_ground_that_another_vehicle_sees_better_is_left_to_it():
 
 def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
     inverted = FlatMap((255 - world.values).astype(np.float32))
-    rig, images = pictures_of(inverted, (1.5, -0.8))
+    cameras, images = pictures_of(inverted, (1.5, -0.8))
     points = np.array([[x, y, 0.0] for x in (-40.0, 0.0, 40.0) for y in (-5.0, 10.0, 25.0)])
     points += np.array([1.5, -0.8, 0.0])
-    camera = np.abs(points[:, None, 0] - rig.position[None, :, 0]).argmin(1).astype(np.int32)
+    camera = np.abs(points[:, None, 0] - cameras.position[None, :, 0]).argmin(1).astype(np.int32)
     ground = LoadedMap.load(inverted, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
     flipped = [255 - im for im in images]
-    found = match_points(rig, points, np.arange(9), camera, lambda i: flipped[i], ground, 16, 10, np.zeros(9))
+    found = match_points(cameras, points, np.arange(9), camera, lambda i: flipped[i], ground, 16, 10, np.zeros(9))
     assert len(found.point) == 9
     np.testing.assert_allclose(found.shift, np.tile([-1.5, 0.8], (9, 1)), atol=0.1)
     assert (found.ratio < 0.8).all()
 
 
 def test_raised_corners_are_tied_by_the_ground_around_them(world):
-    rig, images = pictures_of(world, (0.0, 0.0))
+    cameras, images = pictures_of(world, (0.0, 0.0))
     raised = np.array([[30.0, 20.0, 3.0], [-25.0, -8.0, 2.0]])
     camera = np.array([2, 2], np.int32)
     ground = LoadedMap.load(world, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
     plain = [255 - im for im in images]
-    found = match_points(rig, raised, np.arange(2), camera, lambda i: plain[i], ground, 16, 10, np.zeros(2))
+    found = match_points(cameras, raised, np.arange(2), camera, lambda i: plain[i], ground, 16, 10, np.zeros(2))
     np.testing.assert_allclose(found.shift, 0.0, atol=0.1)
 
 
@@ -254,20 +254,20 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
     ground = 60.0 + 0.4 * texture(1000, 3)
     things = rng.integers(300, 700, (2500, 2))
     before, after = FlatMap(in_light(ground, things, 0.0, 3.0)), FlatMap(in_light(ground, things, 3.0, 0.0))
-    rig, images = pictures_of(after, (0.0, 0.0))
+    cameras, images = pictures_of(after, (0.0, 0.0))
     points = np.array([[x, y, 0.0] for x in range(-84, 85, 8) for y in range(-16, 36, 8)], float)
-    camera = np.abs(points[:, None, 0] - rig.position[None, :, 0]).argmin(1).astype(np.int32)
+    camera = np.abs(points[:, None, 0] - cameras.position[None, :, 0]).argmin(1).astype(np.int32)
     flight = SimpleNamespace(
-        adjustment=SimpleNamespace(rig=rig, points=points),
+        adjustment=SimpleNamespace(cameras=cameras, points=points),
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: 255 - images[i]),
-        sights=lambda: SimpleNamespace(camera=camera),
+        best_views=lambda: SimpleNamespace(camera=camera),
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
     loaded = LoadedMap.load(before, np.zeros(2), (-160.0, -120.0, 160.0, 140.0), GSD)
     chosen = np.arange(len(points))
     found = accepted(
         match_points(
-            rig, points, chosen, camera, flight.pictures.gray, loaded, 20, 10, np.zeros(len(points)), texture_field
+            cameras, points, chosen, camera, flight.pictures.gray, loaded, 20, 10, np.zeros(len(points)), texture_field
         )
     )
     off = found.shift.mean(0)

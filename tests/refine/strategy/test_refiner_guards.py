@@ -10,8 +10,8 @@ from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle import height_consistency
-from orthoswarm.refine.bundle.covariance import unexplained
-from orthoswarm.refine.bundle.height_consistency import height_doubt
+from orthoswarm.refine.bundle.covariance import systematic_tie_offset
+from orthoswarm.refine.bundle.height_consistency import height_disagreement
 from orthoswarm.refine.bundle.snapshot import Snapshot
 from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
@@ -36,7 +36,7 @@ def opened(frames):
 
 
 def fov_deg(flight):
-    return float(np.degrees(fov_rad(flight.adjustment.rig.lens[0, 0], flight.pictures.size[0])))
+    return float(np.degrees(fov_rad(flight.adjustment.cameras.lens[0, 0], flight.pictures.size[0])))
 
 
 def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up):
@@ -52,7 +52,7 @@ def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up):
 
 def test_without_an_answer_of_the_flow_nothing_is_called_a_runaway(made_up):
     flight = opened(made_up[0])
-    flight.adjustment.rig.lens[:, 0] *= 0.5
+    flight.adjustment.cameras.lens[:, 0] *= 0.5
     assert ran_away(flight)
     flight.calibration = replace(flight.calibration, pairs=2)
     assert not ran_away(flight)
@@ -69,19 +69,19 @@ def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_
     def wandering(flight, surface, count):
         surface, focal_px = steps(flight, surface, count)
         if not doubted(flight.adjustment).any():
-            flight.adjustment.rig.lens[:, 0] *= 0.7
+            flight.adjustment.cameras.lens[:, 0] *= 0.7
             focal_px = [f * 0.96**k for k, f in enumerate(focal_px)]
         return surface, focal_px
 
     for module in (vehicle_passes, height_consistency):
-        monkeypatch.setattr(module, "contradicted", doubted)
+        monkeypatch.setattr(module, "contradicted_heights", doubted)
     for how in (steps, wandering):  # set free it stays where it is, or comes to no rest: both contradict nothing
         monkeypatch.setattr(vehicle_passes, "_steps", how)
         flight = opened(frames)
         relative(flight)
         assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
         assert flight.warnings == [] and flight.calibration.trusted_height
-        assert doubted(flight.adjustment).all() and height_doubt(flight.adjustment) < 0.05
+        assert doubted(flight.adjustment).all() and height_disagreement(flight.adjustment) < 0.05
 
 
 def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):
@@ -90,7 +90,7 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
 
     def bent(flight, *args):
         settled = settle(flight, *args)
-        flight.adjustment.rig.lens[:, 0] *= 0.7
+        flight.adjustment.cameras.lens[:, 0] *= 0.7
         return settled
 
     monkeypatch.setattr(vehicle_passes, "settle", bent)
@@ -106,12 +106,12 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
 def test_a_snapshot_goes_back_and_stays(made_up):
     flight = opened(made_up[0])
     before = Snapshot.of(flight.adjustment)
-    position = flight.adjustment.rig.position.copy()
+    position = flight.adjustment.cameras.position.copy()
     for _ in range(2):
         relative(flight)
-        assert np.abs(flight.adjustment.rig.position - position).max() > 1e-3
+        assert np.abs(flight.adjustment.cameras.position - position).max() > 1e-3
         flight.adjustment = before.restored()
-        np.testing.assert_array_equal(flight.adjustment.rig.position, position)
+        np.testing.assert_array_equal(flight.adjustment.cameras.position, position)
         assert not flight.adjustment.common.any()
 
 
@@ -159,14 +159,14 @@ def test_a_leg_that_lies_about_right_or_shows_chaos_keeps_the_common_shift():
 def test_ties_that_agree_beside_a_picture_tell_of_its_error_and_single_ones_do_not():
     leg, camera, _, rng = legs_and_matches()
     residual = rng.normal(0, 0.1, (len(camera), 2))
-    assert unexplained(leg, camera, residual).max() < 0.1
+    assert systematic_tie_offset(leg, camera, residual).max() < 0.1
     alone = residual.copy()
     alone[::9] += 4.0
-    assert unexplained(leg, camera, alone).max() < 0.2
+    assert systematic_tie_offset(leg, camera, alone).max() < 0.2
     residual[np.isin(camera, np.arange(22, 28))] += (1.2, 0.0)
-    off = unexplained(leg, camera, residual)
+    off = systematic_tie_offset(leg, camera, residual)
     assert off[22:26].min() > 0.8
     assert off[:20].max() < 0.1 and off[32:].max() < 0.1  # neither the leg before the corner nor the rest of its own
     order = rng.permutation(len(camera))
-    np.testing.assert_array_equal(unexplained(leg, camera[order], residual[order]), off)
-    assert not unexplained(leg, camera[:0], residual[:0]).any()
+    np.testing.assert_array_equal(systematic_tie_offset(leg, camera[order], residual[order]), off)
+    assert not systematic_tie_offset(leg, camera[:0], residual[:0]).any()

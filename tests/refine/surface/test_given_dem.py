@@ -147,7 +147,7 @@ def fit_points(before, p, sigma):
     from orthoswarm.refine.surface import vehicle_ground as ground
 
     adjustment = object.__new__(Adjustment)
-    adjustment.rig = type("Rig", (), {"position": cameras() - (*ORIGIN, 0.0)})()
+    adjustment.cameras = type("CameraBlock", (), {"position": cameras() - (*ORIGIN, 0.0)})()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ground, "ground_points", lambda _: (p, sigma))
         return ground.fit_surface(adjustment, before)

@@ -20,9 +20,9 @@ def hall(xy):
 
 def flight_over(surface):
     """What `dense_points` asks of a flight: two legs at 100 m, their pictures rendered."""
-    rig, leg = rig_of()
-    pictures = SimpleNamespace(gray=Pictures(rig, surface), size=(WIDTH, HEIGHT))
-    return SimpleNamespace(rig=lambda: rig, leg=leg, pictures=pictures)
+    cameras, leg = rig_of()
+    pictures = SimpleNamespace(gray=Pictures(cameras, surface), size=(WIDTH, HEIGHT))
+    return SimpleNamespace(cameras=lambda: cameras, leg=leg, pictures=pictures)
 
 
 @pytest.fixture(scope="module")
@@ -52,20 +52,22 @@ def test_nothing_high_is_seen_over_level_ground():
 
 
 def test_low_flights_search_nothing_between_the_two_ranges():
-    rig, leg = rig_of(height=0.9 * HIGH_FROM_M / HIGH_SHARE)
-    gray = Pictures(rig, lambda xy: np.zeros(xy.shape[:-1]))
-    flight = SimpleNamespace(rig=lambda: rig, leg=leg, pictures=SimpleNamespace(gray=gray, size=(WIDTH, HEIGHT)))
+    cameras, leg = rig_of(height=0.9 * HIGH_FROM_M / HIGH_SHARE)
+    gray = Pictures(cameras, lambda xy: np.zeros(xy.shape[:-1]))
+    flight = SimpleNamespace(
+        cameras=lambda: cameras, leg=leg, pictures=SimpleNamespace(gray=gray, size=(WIDTH, HEIGHT))
+    )
     assert len(dense_points(flight, GroundModel())[2]) == 0
 
 
 def test_spaced_pictures_are_those_between_legs_and_some_of_each_leg():
-    rig, leg = rig_of(per_leg=24, spacing=5.0)
+    cameras, leg = rig_of(per_leg=24, spacing=5.0)
     leg = leg.copy()
     leg[[0, 24]] = -1
-    some = spaced_pictures(SimpleNamespace(rig=lambda: rig, leg=leg), GroundModel())
+    some = spaced_pictures(SimpleNamespace(cameras=lambda: cameras, leg=leg), GroundModel())
     assert some[[0, 24]].all()
     for k in range(2):
-        along = np.sort(rig.position[some & (leg == k), 1])
+        along = np.sort(cameras.position[some & (leg == k), 1])
         assert 5 <= len(along) < 14
         gaps = np.sort(np.diff(along))
         assert gaps[1] > 9.0 and gaps[-1] < 17.0  # the last picture of a leg may be near the one before it
