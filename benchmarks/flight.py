@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid
@@ -66,4 +67,4 @@ def area(frames: list[PlacedFrame]) -> GroundGrid:
     boxes = footprint_boxes(cameras, 0.0, 0.0)
     west, south = (float(v) for v in boxes[:, :2].min(0))
     east, north = (float(v) for v in boxes[:, 2:].max(0))
-    return GroundGrid.around(32648, (west, south, east, north), default_gsd(cameras))
+    return GroundGrid.around(32648, BoundingBox(west, south, east, north), default_gsd(cameras))

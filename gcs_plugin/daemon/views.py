@@ -5,10 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from gcs_plugin.daemon.intake.picture_sources import Source
-from gcs_plugin.daemon.layers.layers import Bounds, Layer, drawn_bounds, union
+from gcs_plugin.daemon.layers.layers import Layer, drawn_bounds
 from gcs_plugin.daemon.settings import VehicleSettings
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 
@@ -114,7 +115,7 @@ def layer_rows(layers: Mapping[str, Layer], basemap: Basemap | None) -> list[dic
     rows = []
     if basemap is not None:
         rows.append(_layer_row("basemap", 1, basemap.epsg, basemap.bounds, basemap.native_gsd_m))
-    shown: list[tuple[int, int | None, Bounds, float | None]] = []
+    shown: list[tuple[int, int | None, BoundingBox, float | None]] = []
     for name, layer in layers.items():
         with layer.reading() as canvas:
             version = 0 if canvas is None else canvas.version
@@ -124,14 +125,16 @@ def layer_rows(layers: Mapping[str, Layer], basemap: Basemap | None) -> list[dic
         if bounds is not None:
             shown.append((version, epsg, bounds, gsd))
     if shown:
-        bounds = union([b for _, _, b, _ in shown])
+        bounds = BoundingBox.around([b for _, _, b, _ in shown])
         rows.append(_layer_row("best", sum(v for v, *_ in shown), shown[0][1], bounds, shown[0][3]))
     else:
         rows.append(_layer_row("best", 0, None, None, None))
     return rows
 
 
-def _layer_row(name: str, version: int, epsg: int | None, bounds: Bounds | None, gsd_m: float | None) -> dict[str, Any]:
+def _layer_row(
+    name: str, version: int, epsg: int | None, bounds: BoundingBox | None, gsd_m: float | None
+) -> dict[str, Any]:
     row: dict[str, Any] = {
         "name": name, "version": version, "empty": bounds is None, "epsg": epsg, "gsd_m": gsd_m, "bounds": None,
         "tiles": f"/tiles/{name}/{{z}}/{{x}}/{{y}}.webp", "maxzoom": 22,

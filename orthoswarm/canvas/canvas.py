@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from orthoswarm.canvas.overviews import FACTORS, Overview, reduce_rgba
 from orthoswarm.canvas.tile_store import Key, Tile, TileStore
 from orthoswarm.canvas.tile_versions import VersionIndex
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 
@@ -266,7 +267,7 @@ class Canvas:
         order = np.argsort(self._index.values[rows, cols], kind="stable")
         return [(int(r), int(c)) for r, c in zip(rows[order], cols[order])]
 
-    def newest(self, bounds: tuple[float, float, float, float]) -> int:
+    def newest(self, bounds: BoundingBox) -> int:
         """The newest version of the tiles under bounds (west, south, east, north); 0 where nothing was drawn."""
         self._follow()
         r0, r1, c0, c1 = self.window(bounds)
@@ -274,11 +275,11 @@ class Canvas:
         part = self._index.values[r0 // t : -(-r1 // t), c0 // t : -(-c1 // t)]
         return int(part.max()) if part.size else 0
 
-    def tile_bounds(self, key: Key) -> tuple[float, float, float, float]:
+    def tile_bounds(self, key: Key) -> BoundingBox:
         """West, south, east, north of a tile (the last row and column reach beyond the grid)."""
         side = self.tile_px * self.grid.gsd_m
         west, north = self.grid.west + key[1] * side, self.grid.north - key[0] * side
-        return west, north - side, west + side, north
+        return BoundingBox(west, north - side, west + side, north)
 
     @property
     def drawn(self) -> tuple[int, int, int, int]:
@@ -301,7 +302,7 @@ class Canvas:
 
     # -- reading --------------------------------------------------------------------------------------------------
 
-    def window(self, bounds: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
+    def window(self, bounds: BoundingBox) -> tuple[int, int, int, int]:
         """Rows and columns (row0, row1, col0, col1), clipped to the grid, of all pixels that touch bounds."""
         west, south, east, north = bounds
         g, s = self.grid, self.grid.gsd_m
@@ -343,9 +344,7 @@ class Canvas:
         part = self.read(*window) if base == 1 else self._read_overview(base, *window)
         return part if rest == 1 else reduce_rgba(part, rest)
 
-    def read_ground(
-        self, bounds: tuple[float, float, float, float], gsd_m: float | None = None
-    ) -> tuple[Bytes, GroundGrid]:
+    def read_ground(self, bounds: BoundingBox, gsd_m: float | None = None) -> tuple[Bytes, GroundGrid]:
         """Colours of the pixels that touch bounds, at a pixel no coarser than asked, and their grid.
 
         Args:

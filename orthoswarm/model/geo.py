@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 
 Array = NDArray[np.float64]
@@ -103,7 +104,7 @@ class GroundGrid:
     height: int
 
     @classmethod
-    def around(cls, epsg: int, bounds: tuple[float, float, float, float], gsd_m: float) -> "GroundGrid":
+    def around(cls, epsg: int, bounds: BoundingBox, gsd_m: float) -> "GroundGrid":
         """The smallest grid that holds bounds (west, south, east, north), its edges on multiples of the GSD."""
         west, south, east, north = bounds
         left, top = float(np.floor(west / gsd_m)), float(np.ceil(north / gsd_m))
@@ -112,9 +113,9 @@ class GroundGrid:
         return cls(epsg, left * gsd_m, top * gsd_m, gsd_m, width, height)
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> BoundingBox:
         """West, south, east, north edges in metres."""
-        return (
+        return BoundingBox(
             self.west,
             self.north - self.height * self.gsd_m,
             self.west + self.width * self.gsd_m,

@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.oldpickles import set_fields
@@ -143,16 +144,14 @@ class MapWindow(Protocol):
     epsg: int
 
     @property
-    def bounds(self) -> tuple[float, float, float, float]:
+    def bounds(self) -> BoundingBox:
         """West, south, east, north of the map in the area's grid."""
 
     @property
     def native_gsd_m(self) -> float:
         """Size of the map's own pixel."""
 
-    def gray(
-        self, bounds: tuple[float, float, float, float], gsd_m: float
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Grey values (rows, columns), 0 to 255, and validity of a window; see GroundGrid.around for its frame."""
 
 

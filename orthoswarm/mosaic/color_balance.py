@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -111,10 +112,9 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) ->
     if len(boxes) == 0:
         return np.zeros((1, 1), np.int32), GroundGrid(0, 0.0, 0.0, 1.0, 1, 1)
     side = float(np.median(boxes[:, 2:] - boxes[:, :2]))
-    west, south = (float(x) for x in boxes[:, :2].min(0))
-    east, north = (float(x) for x in boxes[:, 2:].max(0))
-    cell = max(side / _CELLS_ACROSS, float(np.sqrt((east - west) * (north - south) / _MAX_CELLS)), 1e-3)
-    grid = GroundGrid.around(0, (west, south, east, north), cell)
+    box = BoundingBox.around(boxes)
+    cell = max(side / _CELLS_ACROSS, float(np.sqrt(box.width * box.height / _MAX_CELLS)), 1e-3)
+    grid = GroundGrid.around(0, box, cell)
     labels = np.zeros((grid.height, grid.width), np.int32)
     for (r, c), ids in by_tile(cameras, grid, _TILE, terrain).items():
         part = np.zeros((min(_TILE, grid.height - r), min(_TILE, grid.width - c)), np.int32)

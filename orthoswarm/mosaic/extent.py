@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
-
-Bounds = tuple[float, float, float, float]
 
 MISLAID_M = 15.0
 """Receivers without correction are good to some metres; a map this far off is another matter."""
@@ -18,8 +17,8 @@ RAISED_M = 2.0
 """Corners lie no higher than this over the ground around them (rubble, bushes, cars)."""
 
 
-def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bounds:
-    """West, south, east, north of all ground between two heights that any picture sees.
+def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> BoundingBox:
+    """All ground between two heights that any picture sees.
 
     Raises:
         OrthoSwarmError: if none looks at the ground.
@@ -28,9 +27,7 @@ def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bou
     boxes = boxes[np.isfinite(boxes).all(axis=1)]
     if not len(boxes):
         raise OrthoSwarmError("no picture looks at the ground; check the pitch angles (-90 is straight down)")
-    west, south = boxes[:, :2].min(axis=0)
-    east, north = boxes[:, 2:].max(axis=0)
-    return float(west), float(south), float(east), float(north)
+    return BoundingBox.around(boxes)
 
 
 def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:

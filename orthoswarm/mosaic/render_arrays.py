@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.footprint import MAX_OFF_NADIR_RAD
@@ -108,7 +109,7 @@ def _weights(cubic: tuple[NDArray[np.intp], Array], nodes: NDArray[np.intp]) -> 
     return matrix
 
 
-def crop(terrain: Terrain, bounds: tuple[float, float, float, float]) -> Terrain:
+def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
     """The part of a terrain that heights within bounds (west, south, east, north) depend on."""
     rows, cols = terrain.z.shape
     c0 = int(np.clip(np.floor((bounds[0] - terrain.west) / terrain.step_m) - 2, 0, cols - 2))

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -42,7 +43,6 @@ from orthoswarm.raster.picture_file import read_rgb
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
-Bounds = tuple[float, float, float, float]
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a module-level function to every argument, in this process or in others; results in any order. It should
 take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
@@ -98,7 +98,7 @@ class Layer:
     terrain: Terrain
     canvas: Canvas
     gains: Mapping[str, ArrayLike] = field(default_factory=dict)
-    bounds: Bounds | None = None
+    bounds: BoundingBox | None = None
 
 
 def render(
@@ -107,7 +107,7 @@ def render(
     canvas: Canvas,
     *,
     gains: Mapping[str, ArrayLike] | None = None,
-    bounds: Bounds | None = None,
+    bounds: BoundingBox | None = None,
     read: Read = read_rgb,
     run: Run = serial,
     progress: Progress | None = None,
@@ -200,7 +200,7 @@ def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
         yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read)
 
 
-def _tiles_within(canvas: Canvas, bounds: Bounds) -> set[Key]:
+def _tiles_within(canvas: Canvas, bounds: BoundingBox) -> set[Key]:
     r0, r1, c0, c1 = canvas.window(bounds)
     t = canvas.tile_px
     return {(r, c) for r in range(r0 // t, -(-r1 // t)) for c in range(c0 // t, -(-c1 // t))}

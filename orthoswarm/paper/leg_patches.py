@@ -135,10 +135,7 @@ def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -
     may differ by part of a pixel, which the returned grid tells exactly.
     """
     gsd = own.gsd_m
-    west, south, east, north = own.bounds
-    margin = reach * gsd
-    bounds = (west - margin + origin[0], south - margin + origin[1], east + margin + origin[0],
-              north + margin + origin[1])  # fmt: skip
+    bounds = own.bounds.grown(reach * gsd).moved(float(origin[0]), float(origin[1]))
     grid = GroundGrid.around(basemap.epsg, bounds, gsd)
     gray, known = basemap.gray(bounds, gsd)
     rows, cols = own.height + 2 * reach, own.width + 2 * reach

@@ -11,27 +11,27 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.gdal_map import RasterMap, luma
-from orthoswarm.raster.map_check import common, sample_windows
+from orthoswarm.raster.map_check import sample_windows
 from orthoswarm.raster.tile_folder import TileFolder
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Bounds = tuple[float, float, float, float]
 
 
 class _Source(Protocol):
     """Where pixels come from: a raster file or a folder of tiles."""
 
     native_gsd_m: float
-    bounds: Bounds
+    bounds: BoundingBox
 
     def gsds(self) -> list[float]:
         """A pixel size for each of the resolutions that are stored, metres."""
 
-    def require_whole(self, bounds: Bounds) -> None:
+    def require_whole(self, bounds: BoundingBox) -> None:
         """Raise UnreadableMapError if the file is shorter than what it says to hold within bounds."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
@@ -46,7 +46,7 @@ class Basemap:
         epsg: the area's grid, in which windows are asked for and returned.
     """
 
-    def __init__(self, path: Path, epsg: int, near: Bounds | None) -> None:
+    def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
         self.path = path
         self.epsg = epsg
         self._near = near
@@ -58,7 +58,7 @@ class Basemap:
         return kind(self.path, self.epsg, self._near)
 
     @classmethod
-    def open(cls, path: str | Path, epsg: int, near: Bounds | None = None) -> "Basemap":
+    def open(cls, path: str | Path, epsg: int, near: BoundingBox | None = None) -> "Basemap":
         """Open a map for an area.
 
         Args:
@@ -77,7 +77,7 @@ class Basemap:
         return basemap
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> BoundingBox:
         """West, south, east, north of the map in the area's grid; of a huge map, of the part near the area."""
         return self._source.bounds
 
@@ -86,11 +86,11 @@ class Basemap:
         """Size of the map's own pixel on the ground of the area, metres."""
         return self._source.native_gsd_m
 
-    def require_overlap(self, near: Bounds) -> None:
+    def require_overlap(self, near: BoundingBox) -> None:
         """Raise InputError, saying how far away the map is, unless it touches the bounds."""
         west, south, east, north = self.bounds
-        dx = max(west - near[2], near[0] - east, 0.0)
-        dy = max(south - near[3], near[1] - north, 0.0)
+        dx = max(west - near.east, near.west - east, 0.0)
+        dy = max(south - near.north, near.south - north, 0.0)
         if dx or dy:
             away = float(np.hypot(dx, dy))
             size = f"{away / 1000:,.1f} km" if away >= 1000 else f"{away:.0f} m"
@@ -98,21 +98,21 @@ class Basemap:
                 f"the basemap {self.path.name} does not overlap the flight, it is {size} away; give a map of this area"
             )
 
-    def require_readable(self, near: Bounds) -> None:
+    def require_readable(self, near: BoundingBox) -> None:
         """Raise UnreadableMapError if a map that was opened is cut short or damaged where it is needed.
 
         Args:
             near: west, south, east, north of the area in its grid, metres. Only what the map has of it counts.
         """
-        bounds = common(near, self.bounds)
-        if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+        bounds = near.intersection(self.bounds)
+        if bounds.empty:
             return
         self._source.require_whole(bounds)
         for gsd in self._source.gsds():
             for window in sample_windows(bounds, gsd):
                 self.gray(window, gsd)
 
-    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], Mask]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], Mask]:
         """Grey values and validity of a window.
 
         Args:
@@ -128,7 +128,7 @@ class Basemap:
         gray[~valid] = 0.0
         return gray, valid
 
-    def rgb(self, bounds: Bounds, gsd_m: float) -> tuple[Bytes, Mask]:
+    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Mask]:
         """Colours uint8 (rows, columns, 3) and validity of a window; the grid is that of `gray`."""
         data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=False)
         out = np.array(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0), order="C")  # never a view

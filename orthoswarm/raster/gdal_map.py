@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.map_check import UnreadableMapError, ends_early
@@ -19,7 +20,6 @@ from orthoswarm.raster.resampling import resample
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Bounds = tuple[float, float, float, float]
 
 # GDAL keeps 5 % of the machine's memory in blocks otherwise, in every process; it reads this at its first block.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
@@ -49,7 +49,7 @@ class RasterMap:
         bounds: west, south, east, north in the area's grid; of a huge map, of the part near the area.
     """
 
-    def __init__(self, path: Path, epsg: int, near: Bounds | None) -> None:
+    def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
         import rasterio
         from rasterio.errors import RasterioError
 
@@ -98,7 +98,7 @@ class RasterMap:
         """A pixel size for each stored resolution, metres."""
         return [self.native_gsd_m, *(2.0 * f * self.native_gsd_m for f in self._factors)]
 
-    def require_whole(self, bounds: Bounds) -> None:
+    def require_whole(self, bounds: BoundingBox) -> None:
         """Raise UnreadableMapError if the file is too short for its blocks within bounds (in the area's grid)."""
         from rasterio.warp import transform_bounds
 
@@ -280,7 +280,7 @@ def _band_roles(source: Any) -> tuple[list[int], int | None, Bytes | None]:
     return (plain[:3] if len(plain) >= 3 else plain[:1]), alpha, None
 
 
-def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None) -> tuple[float, Bounds]:
+def _placement(source: Any, crs: Any, path: Path, epsg: int, near: BoundingBox | None) -> tuple[float, BoundingBox]:
     """Pixel size on the ground and bounds in the area's grid; of a huge map, of the part around the area."""
     from rasterio.errors import CRSError, RasterioError
     from rasterio.warp import transform, transform_bounds
@@ -288,17 +288,16 @@ def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None
     target = f"EPSG:{epsg}"
     affine = _affine_of(source)
     corners = np.array([_apply(affine, *p) for p in _ring(source.width, source.height)])
-    own = (corners[:, 0].min(), corners[:, 1].min(), corners[:, 0].max(), corners[:, 1].max())
+    own = BoundingBox.around_points(corners)
     try:
         if near is not None:
-            margin = max(5000.0, 2 * (near[2] - near[0]), 2 * (near[3] - near[1]))
-            wide = (near[0] - margin, near[1] - margin, near[2] + margin, near[3] + margin)
-            there = transform_bounds(target, crs, *wide, densify_pts=5)
-            cut = (max(own[0], there[0]), max(own[1], there[1]), min(own[2], there[2]), min(own[3], there[3]))
-            if cut[0] < cut[2] and cut[1] < cut[3]:
+            margin = max(5000.0, 2 * near.width, 2 * near.height)
+            there = BoundingBox(*transform_bounds(target, crs, *near.grown(margin), densify_pts=5))
+            cut = own.intersection(there)
+            if not cut.empty:
                 own = cut
-        bounds = tuple(float(v) for v in transform_bounds(crs, target, *own, densify_pts=21))
-        middle = _apply(~affine, 0.5 * (own[0] + own[2]), 0.5 * (own[1] + own[3]))
+        bounds = BoundingBox(*(float(v) for v in transform_bounds(crs, target, *own, densify_pts=21)))
+        middle = _apply(~affine, *own.center)
         steps = [_apply(affine, middle[0] + dx, middle[1] + dy) for dx, dy in ((0, 0), (1, 0), (0, 1))]
         x, y = (np.array(v) for v in transform(crs, target, *zip(*steps, strict=True)))
     except (CRSError, RasterioError) as error:
@@ -308,7 +307,7 @@ def _placement(source: Any, crs: Any, path: Path, epsg: int, near: Bounds | None
     size = np.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
     if not (np.isfinite(bounds).all() and np.isfinite(size) and size > 0):
         raise InputError(f"the basemap {path.name} lies outside the area's grid; give a map of this area")
-    return float(size), (bounds[0], bounds[1], bounds[2], bounds[3])
+    return float(size), bounds
 
 
 def _affine_of(source: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 
@@ -24,8 +25,6 @@ MOST_BURIED = 0.05
 """Part of the cameras that a DEM may bury: a few recorded heights can be wrong."""
 LEAST_COVER = 0.02
 """A DEM with heights on less of the area than this is of another place."""
-
-Bounds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ class HeightModel:
     cover: float
 
     @classmethod
-    def open(cls, path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> "HeightModel":
+    def open(cls, path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) -> "HeightModel":
         """Look at a DEM before the work begins.
 
         Args:
@@ -91,20 +90,20 @@ class HeightModel:
             _refuse_buried(path, below - zero, at[:, 2])
         return cls(Path(path).absolute(), epsg, zero, cover)
 
-    def window(self, bounds: Bounds, most_nodes: int = 250_000) -> KnownGround:
+    def window(self, bounds: BoundingBox, most_nodes: int = 250_000) -> KnownGround:
         """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many."""
         return _window_over(self, bounds, most_nodes)
 
 
 @lru_cache(maxsize=6)
-def _window_over(model: HeightModel, bounds: Bounds, most_nodes: int) -> KnownGround:
+def _window_over(model: HeightModel, bounds: BoundingBox, most_nodes: int) -> KnownGround:
     ground = _window(model.path, model.epsg, bounds, most_nodes)
     t = ground.terrain
     return KnownGround(Terrain(t.west, t.south, t.step_m, t.z - np.float32(model.zero_m)), ground.known)
 
 
-def _window(path: Path, epsg: int, bounds: Bounds, most_nodes: int) -> KnownGround:
-    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+def _window(path: Path, epsg: int, bounds: BoundingBox, most_nodes: int) -> KnownGround:
+    area = bounds.width * bounds.height
     z, left, low, step = _on_area(Path(path), epsg, bounds, None, max(_FINEST_M, float(np.sqrt(area / most_nodes))))
     known = np.isfinite(z)
     z = _filled(z, known) if known.any() else np.zeros(z.shape)
@@ -114,7 +113,7 @@ def _window(path: Path, epsg: int, bounds: Bounds, most_nodes: int) -> KnownGrou
 def read_dem(
     path: Path,
     epsg: int,
-    bounds: Bounds,
+    bounds: BoundingBox,
     *,
     takeoff: ArrayLike | None = None,
     level_m: float | None = None,
@@ -155,7 +154,7 @@ def read_dem(
     return Terrain(left, low, step, (z - level_m).astype(np.float32))
 
 
-def _no_cover(path: Path, epsg: int, bounds: Bounds, cover: float) -> str:
+def _no_cover(path: Path, epsg: int, bounds: BoundingBox, cover: float) -> str:
     west, south, east, north = bounds
     return (
         f"{Path(path).name} has heights for only {100 * cover:.0f} % of the area of the flight "
@@ -174,7 +173,7 @@ def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
         )
 
 
-def check_dem(path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> None:
+def check_dem(path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) -> None:
     """Look at a DEM before the work begins.
 
     Args:
@@ -192,7 +191,7 @@ def check_dem(path: Path, epsg: int, bounds: Bounds, cameras: ArrayLike) -> None
 
 
 def _on_area(
-    path: Path, epsg: int, bounds: Bounds, step_m: float | None, finest_m: float = _FINEST_M
+    path: Path, epsg: int, bounds: BoundingBox, step_m: float | None, finest_m: float = _FINEST_M
 ) -> tuple[Array, float, float, float]:
     """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step."""
     import rasterio
@@ -252,11 +251,11 @@ def _nodata(dataset: Any) -> float | None:
     return lowest if lowest < -1000.0 else None
 
 
-def _pixel_m(dataset: Any, epsg: int, bounds: Bounds) -> float:
+def _pixel_m(dataset: Any, epsg: int, bounds: BoundingBox) -> float:
     """Side of the DEM's own pixel in metres, about the area's middle."""
     from rasterio.warp import transform
 
-    x, y = 0.5 * (bounds[0] + bounds[2]), 0.5 * (bounds[1] + bounds[3])
+    x, y = bounds.center
     (px, pe, pn), (qx, qe, qn) = transform(f"EPSG:{epsg}", dataset.crs, [x, x + 100.0, x], [y, y, y + 100.0])
     inverse = ~dataset.transform
     a, b, c = (np.array(inverse * p) for p in ((px, qx), (pe, qe), (pn, qn)))
@@ -264,8 +263,8 @@ def _pixel_m(dataset: Any, epsg: int, bounds: Bounds) -> float:
     return 100.0 / float(np.sqrt(area)) if np.isfinite(area) and area > 0 else 1.0
 
 
-def _own_step(dataset: Any, epsg: int, bounds: Bounds, finest_m: float) -> float:
-    area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
+def _own_step(dataset: Any, epsg: int, bounds: BoundingBox, finest_m: float) -> float:
+    area = bounds.width * bounds.height
     return float(max(finest_m, round(_pixel_m(dataset, epsg, bounds), 1), np.sqrt(area / _MOST_NODES)))
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
-
-Bounds = tuple[float, float, float, float]
 
 TILE_PX = 128
 
@@ -23,7 +22,7 @@ class TiledMap:
         self._tiles: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> BoundingBox:
         """West, south, east, north of the map in the area's grid."""
         return self._basemap.bounds
 
@@ -32,7 +31,7 @@ class TiledMap:
         """Size of the map's own pixel."""
         return self._basemap.native_gsd_m
 
-    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Grey values and validity of a window, as the map itself gives them."""
         if gsd_m != self._gsd_m:
             return self._basemap.gray(bounds, gsd_m)
@@ -54,6 +53,6 @@ class TiledMap:
             side = TILE_PX * self._gsd_m
             # from the middles of the outermost pixels, so that rounding cannot add a row or a column
             inset = 0.5 * self._gsd_m
-            bounds = (j * side + inset, -(i + 1) * side + inset, (j + 1) * side - inset, -i * side - inset)
-            self._tiles[i, j] = self._basemap.gray(bounds, self._gsd_m)
+            tile = BoundingBox(j * side, -(i + 1) * side, (j + 1) * side, -i * side)
+            self._tiles[i, j] = self._basemap.gray(tile.grown(-inset), self._gsd_m)
         return self._tiles[i, j]

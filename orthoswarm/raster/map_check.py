@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
-
-Bounds = tuple[float, float, float, float]
-"""West, south, east, north in metres."""
 
 _SIDE = 5
 _WINDOW_PX = 4.0
@@ -22,18 +20,13 @@ class UnreadableMapError(InputError):
     """A map's pixels cannot be read, although it was opened: damaged, cut short, or no longer there."""
 
 
-def common(a: Bounds, b: Bounds) -> Bounds:
-    """What two bounds share; upside down where that is nothing."""
-    return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
-
-
-def sample_windows(bounds: Bounds, gsd_m: float) -> list[Bounds]:
+def sample_windows(bounds: BoundingBox, gsd_m: float) -> list[BoundingBox]:
     """Small windows of some pixels spread over bounds, few enough to be read in a fraction of a second."""
     west, south, east, north = bounds
     half = 0.5 * _WINDOW_PX * gsd_m
     share = (np.arange(_SIDE) + 0.5) / _SIDE
     return [
-        (float(x) - half, float(y) - half, float(x) + half, float(y) + half)
+        BoundingBox(float(x), float(y), float(x), float(y)).grown(half)
         for y in north + share * (south - north)
         for x in west + share * (east - west)
     ]

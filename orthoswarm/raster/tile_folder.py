@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-Bounds = tuple[float, float, float, float]
 
 _WORLD_M = 2 * np.pi * 6378137.0
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -26,7 +26,7 @@ class TileFolder:
         bounds: west, south, east, north of the tiles near the area, in its grid.
     """
 
-    def __init__(self, path: Path, epsg: int, near: Bounds | None) -> None:
+    def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
         self._path = path
         self._epsg = epsg
         zooms = sorted(int(p.name) for p in path.iterdir() if p.is_dir() and p.name.isdigit())
@@ -42,8 +42,7 @@ class TileFolder:
         self._size = len(first[0])
         self._tms = near is not None and self._rows_from_south(near)
         self.bounds = self._ground_bounds(near)
-        west, south, east, north = near or self.bounds
-        x, y = 0.5 * (west + east), 0.5 * (south + north)
+        x, y = (near or self.bounds).center
         per_metre = np.diff(self._mercator(np.array([[x, y], [x + 100.0, y]])), axis=0)
         self.native_gsd_m = float(_WORLD_M / 2**self._zoom / self._size / np.hypot(*per_metre[0]) * 100.0)
 
@@ -51,7 +50,7 @@ class TileFolder:
         x, y = _transformer(self._epsg).transform(east_north[:, 0], east_north[:, 1])
         return np.stack([np.asarray(x), np.asarray(y)], axis=1)
 
-    def _tile_range(self, bounds: Bounds, zoom: int) -> tuple[int, int, int, int]:
+    def _tile_range(self, bounds: BoundingBox, zoom: int) -> tuple[int, int, int, int]:
         """First and last column, first and last row (from the north) of the tiles that bounds need, inclusive."""
         west, south, east, north = bounds
         s = np.linspace(0.0, 1.0, 9)
@@ -67,7 +66,7 @@ class TileFolder:
         row = np.floor((_WORLD_M / 2 - xy[:, 1]) / side)
         return int(column.min()), int(column.max()), int(row.min()), int(row.max())
 
-    def _rows_from_south(self, near: Bounds) -> bool:
+    def _rows_from_south(self, near: BoundingBox) -> bool:
         """True if the area has tiles only when rows count from the south."""
         left, right, top, bottom = self._tile_range(near, self._zoom)
         flip = 2**self._zoom - 1
@@ -78,29 +77,28 @@ class TileFolder:
 
         return hits(top, bottom) == 0 and hits(flip - bottom, flip - top) > 0
 
-    def _ground_bounds(self, near: Bounds | None) -> Bounds:
+    def _ground_bounds(self, near: BoundingBox | None) -> BoundingBox:
         """Bounds of the finest tiles in the grid, those within some kilometres of the area."""
         side, flip = _WORLD_M / 2**self._zoom, 2**self._zoom - 1
         tiles = np.array(
             [(c, flip - r if self._tms else r) for c, rows in self._columns[self._zoom].items() for r in rows]
         )
         if near is not None:
-            margin = max(5000.0, near[2] - near[0], near[3] - near[1])
-            wide = (near[0] - margin, near[1] - margin, near[2] + margin, near[3] + margin)
-            left, right, top, bottom = self._tile_range(wide, self._zoom)
+            margin = max(5000.0, near.width, near.height)
+            left, right, top, bottom = self._tile_range(near.grown(margin), self._zoom)
             close = (tiles[:, 0] >= left) & (tiles[:, 0] <= right) & (tiles[:, 1] >= top) & (tiles[:, 1] <= bottom)
             tiles = tiles[close] if close.any() else tiles
         x = np.array([tiles[:, 0].min(), tiles[:, 0].max() + 1]) * side - _WORLD_M / 2
         y = _WORLD_M / 2 - np.array([tiles[:, 1].max() + 1, tiles[:, 1].min()]) * side
         corners = np.array([[a, b] for a in (*x, x.mean()) for b in (*y, y.mean())])
         east, north = _transformer(self._epsg).transform(corners[:, 0], corners[:, 1], direction="INVERSE")
-        return float(np.min(east)), float(np.min(north)), float(np.max(east)), float(np.max(north))
+        return BoundingBox.around_points(np.column_stack([east, north]))
 
     def gsds(self) -> list[float]:
         """A pixel size for each zoom level, metres."""
         return [self.native_gsd_m * 2 ** (self._zoom - zoom) for zoom in self._columns]
 
-    def require_whole(self, bounds: Bounds) -> None:
+    def require_whole(self, bounds: BoundingBox) -> None:
         """Nothing to compare: each tile is a file of its own, and one that cannot be decoded is a hole in the map."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
@@ -133,7 +131,7 @@ class TileFolder:
         )
         return out[:3], out[3] > 127
 
-    def _assemble(self, bounds: Bounds, zoom: int, shrink: int) -> tuple[Bytes | None, tuple[float, float], float]:
+    def _assemble(self, bounds: BoundingBox, zoom: int, shrink: int) -> tuple[Bytes | None, tuple[float, float], float]:
         """The tiles under bounds as one RGBA picture (4, rows, columns), its upper left corner and pixel size."""
         import cv2
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orthoswarm import __version__
 from orthoswarm.export.product_files import write_text
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame
@@ -179,7 +180,7 @@ def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) ->
         r, c = np.unravel_index(int(score.argmax()), score.shape)
         middle = overview.to_ground([float(c), float(r)])
         half = 0.5 * side * gsd
-        window = (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half)
+        window = BoundingBox.around_points(middle, half)
         picture = _with_edges(best, MapView.read(basemap, view_grid(epsg, window, side, gsd)))
         figures.append(Figure("", data_uri(picture.rgb, 88), ""))
         score[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.resampling import resample
 
 Bytes = NDArray[np.uint8]
 Array = NDArray[np.float64]
-Bounds = tuple[float, float, float, float]
 Colour = tuple[int, int, int]
 
 PAPER: Colour = (238, 240, 243)
@@ -54,13 +54,13 @@ def _regrid(
     return resample(bands, valid, first, (scale, scale), (new.width, new.height))
 
 
-def view_grid(epsg: int, bounds: Bounds, most_px: int, least_gsd_m: float = 0.0) -> GroundGrid:
+def view_grid(epsg: int, bounds: BoundingBox, most_px: int, least_gsd_m: float = 0.0) -> GroundGrid:
     """A grid of at most so many pixels a side over bounds, no finer than a ground pixel."""
-    side = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    side = max(bounds.width, bounds.height)
     return GroundGrid.around(epsg, bounds, max(side / (most_px - 2), least_gsd_m, 1e-3))
 
 
-def product_bounds(path: Path) -> Bounds:
+def product_bounds(path: Path) -> BoundingBox:
     """West, south, east, north of what is drawn in a product."""
     import rasterio
 
@@ -70,10 +70,10 @@ def product_bounds(path: Path) -> Bounds:
         alpha = source.read(4, out_shape=shape)
         rows, cols = np.nonzero(alpha.any(axis=1))[0], np.nonzero(alpha.any(axis=0))[0]
         if not len(rows):
-            return tuple(source.bounds)
+            return BoundingBox(*source.bounds)
         left, top = source.bounds.left, source.bounds.top
         dx, dy = (source.bounds.right - left) / shape[1], (top - source.bounds.bottom) / shape[0]
-        return (
+        return BoundingBox(
             left + float(cols[0]) * dx,
             top - float(rows[-1] + 1) * dy,
             left + float(cols[-1] + 1) * dx,

@@ -19,6 +19,7 @@ from gcs_plugin.daemon.layers.web_tiles import (
 )
 from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.mosaic.realtime import RealtimeMosaic
@@ -98,9 +99,9 @@ def test_a_grown_canvas_shows_what_the_small_one_showed(tmp_path):
     area = small_area()
     old = drawn(tmp_path / "old", area, camera_at(), camera_at(40, 60))
     west, south, east, north = area.bounds
-    wide = area.grown((west - 700, south, east, north + 1200))
+    wide = area.grown(BoundingBox(west - 700, south, east, north + 1200))
     new = successor(old, tmp_path / "new", wide.grid, "orthogonality", share=False)
-    box = (EAST - 100, NORTH - 100, EAST + 100, NORTH + 150)
+    box = BoundingBox(EAST - 100, NORTH - 100, EAST + 100, NORTH + 150)
     before, grid = old.read_ground(box)
     after, other = new.read_ground(box)
     assert before[..., 3].any()
@@ -115,7 +116,7 @@ def test_a_grown_canvas_shows_what_the_small_one_showed(tmp_path):
 def test_a_generation_shares_tiles_but_not_changes(tmp_path):
     area = small_area()
     old = drawn(tmp_path / "old", area, camera_at(), camera_at(900, 900))
-    box = (EAST - 60, NORTH - 60, EAST + 60, NORTH + 60)
+    box = BoundingBox(EAST - 60, NORTH - 60, EAST + 60, NORTH + 60)
     before = old.read_ground(box)[0]
     new = successor(old, tmp_path / "new", area.grid, "orthogonality", share=True)
     staged = new.staging("staging")
@@ -124,7 +125,7 @@ def test_a_generation_shares_tiles_but_not_changes(tmp_path):
     new.adopt(staged, [key])
     np.testing.assert_array_equal(old.read_ground(box)[0], before)
     assert new.newest(old.tile_bounds(key)) > old.newest(old.tile_bounds(key))
-    far = (EAST + 880, NORTH + 880, EAST + 920, NORTH + 920)
+    far = BoundingBox(EAST + 880, NORTH + 880, EAST + 920, NORTH + 920)
     assert new.newest(far) == old.newest(far)  # an unchanged tile keeps its version, and so its ETag
     assert new.read_reduced(8, *[v // 8 for v in old.window(far)])[..., 3].any()
     old.close()
@@ -146,12 +147,12 @@ def test_a_layer_is_kept_open_while_it_is_read_and_removed_after(tmp_path):
 
 def test_an_area_does_not_grow_without_end():
     with pytest.raises(OrthoSwarmError, match="too far"):
-        small_area(0.01).grown((EAST - 90_000, NORTH - 90_000, EAST, NORTH))
+        small_area(0.01).grown(BoundingBox(EAST - 90_000, NORTH - 90_000, EAST, NORTH))
 
 
 def test_tiles_of_512_pixels_stay_aligned_when_an_area_grows():
     area = small_area(0.137)
-    grown = area.grown((area.bounds[0] - 1000, area.bounds[1], area.bounds[2], area.bounds[3] + 333))
+    grown = area.grown(BoundingBox(area.bounds[0] - 1000, area.bounds[1], area.bounds[2], area.bounds[3] + 333))
     side = 512 * area.gsd_m
     for a, b in zip(area.bounds, grown.bounds, strict=True):
         assert ((a - b) / side) == pytest.approx(round((a - b) / side), abs=1e-6)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid
@@ -73,7 +74,7 @@ def small_lens(**terms: float) -> Lens:
 
 def grid(size_m=200.0, gsd_m=1.0, east=0.0, north=0.0) -> GroundGrid:
     half = size_m / 2
-    bounds = (EAST + east - half, NORTH + north - half, EAST + east + half, NORTH + north + half)
+    bounds = BoundingBox(EAST + east - half, NORTH + north - half, EAST + east + half, NORTH + north + half)
     return GroundGrid.around(32648, bounds, gsd_m)
 
 

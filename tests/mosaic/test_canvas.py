@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.overviews import reduce_rgba
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.mosaic.realtime import RealtimeMosaic
@@ -190,7 +191,7 @@ def test_lone_pixel_is_not_lost_in_the_overview():
     gsd=st.floats(0.3, 40),
 )  # fmt: skip
 def test_read_ground_covers_what_is_asked_at_the_asked_pixel(shared_canvas, west, south, width, height, gsd):
-    bounds = (west, south, west + width, south + height)
+    bounds = BoundingBox(west, south, west + width, south + height)
     view, grid = shared_canvas.read_ground(bounds, gsd)
     assert view.shape == (grid.height, grid.width, 4)
     assert grid.gsd_m <= max(1.0, gsd * 1.001) < grid.gsd_m * 2.01

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
@@ -217,9 +218,8 @@ def test_bounds_renew_only_the_tiles_they_touch(canvas):
     before, old = canvas.version, whole(canvas)
     west, _, _, north = canvas.grid.bounds
     dark = {f.frame.image: np.full(3, 0.5) for f in flight.frames}
-    stats = render(
-        flight.frames, FLAT, canvas, read=flight.read, gains=dark, bounds=(west, north - 50, west + 50, north)
-    )
+    corner = BoundingBox(west, north - 50, west + 50, north)
+    stats = render(flight.frames, FLAT, canvas, read=flight.read, gains=dark, bounds=corner)
     assert canvas.changed_since(before) == [(0, 0)]
     new = whole(canvas)
     assert (new[128:] == old[128:]).all() and (new[:, 128:] == old[:, 128:]).all()
@@ -294,7 +294,7 @@ def test_cropped_terrain_gives_the_same_heights():
     terrain = scene.terrain_of(scene.hills)
     for east, north in ((0.0, 0.0), (590.0, 590.0), (-700.0, 50.0)):
         west, top = scene.EAST + east, scene.NORTH + north
-        bounds = (west, top - 128.0, west + 128.0, top)
+        bounds = BoundingBox(west, top - 128.0, west + 128.0, top)
         part, full = (heights(t, west, top, 1.0, 128) for t in (crop(terrain, bounds), terrain))
         assert np.abs(part - full).max() < 1e-5
 

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthoswarm.matchers.matcher import Matches
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.paper import Options, PaperRefiner, refine_all
@@ -226,7 +227,7 @@ class NoMap:
 
     def __init__(self, epsg):
         self.epsg = epsg
-        self.bounds = (0.0, 0.0, 1.0, 1.0)
+        self.bounds = BoundingBox(0.0, 0.0, 1.0, 1.0)
 
     def gray(self, bounds, gsd_m):
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)

@@ -14,6 +14,7 @@ import rasterio.warp
 from rasterio.crs import CRS
 from rasterio.transform import Affine, from_origin
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.raster.basemap import Basemap
@@ -21,7 +22,7 @@ from orthoswarm.raster.map_check import UnreadableMapError
 
 EPSG = 32633
 EAST, NORTH = 412_000.0, 5_320_000.0
-AREA = (EAST + 60.0, NORTH - 140.0, EAST + 140.0, NORTH - 60.0)
+AREA = BoundingBox(EAST + 60.0, NORTH - 140.0, EAST + 140.0, NORTH - 60.0)
 
 
 def ground(east, north):
@@ -154,9 +155,8 @@ def test_palette_maps_are_averaged_as_colours(tmp_path):
 def test_a_rotated_map(tmp_path):
     affine = Affine.translation(EAST - 60, NORTH - 40) * Affine.rotation(31.0) * Affine.scale(0.4, -0.4)
     basemap = Basemap.open(write(tmp_path / "m.tif", picture(affine, 800, 800).astype(np.uint8), affine), EPSG)
-    near = (basemap.bounds[0], basemap.bounds[1], basemap.bounds[2], basemap.bounds[3])
-    middle = ((near[0] + near[2]) / 2, (near[1] + near[3]) / 2)
-    bounds = (middle[0] - 30, middle[1] - 30, middle[0] + 30, middle[1] + 30)
+    near = basemap.bounds
+    bounds = BoundingBox.around_points(near.center, 30.0)
     gray, valid = basemap.gray(bounds, 0.5)
     assert valid.all()
     assert np.sqrt(np.mean((gray - expected(bounds, 0.5)) ** 2)) < 3
@@ -252,13 +252,13 @@ def test_a_plain_picture_is_refused(tmp_path):
 
 def test_a_map_elsewhere_is_refused_with_its_distance(gray_tif):
     with pytest.raises(InputError, match=r"does not overlap the flight, it is 9\.\d km away"):
-        Basemap.open(gray_tif, EPSG, tuple(np.add(AREA, (0, 9500, 0, 9500))))
+        Basemap.open(gray_tif, EPSG, BoundingBox(*np.add(AREA, (0, 9500, 0, 9500))))
 
 
 def test_a_map_on_another_continent_is_refused(gray_tif):
     there = LocalGrid(32755).to_grid(-37.8, 145.0)
     with pytest.raises(InputError, match=r"does not overlap|outside the area"):
-        Basemap.open(gray_tif, 32755, (there[0], there[1], there[0] + 500, there[1] + 500))
+        Basemap.open(gray_tif, 32755, BoundingBox(there[0], there[1], there[0] + 500, there[1] + 500))
 
 
 def test_a_world_map_covers_any_area(tmp_path):
@@ -336,7 +336,7 @@ def test_damage_outside_the_area_does_not_matter(tmp_path):
     path = noisy(tmp_path / "m.tif", compress="deflate", tiled=True)
     with path.open("r+b") as file:
         file.truncate(int(0.6 * path.stat().st_size))
-    north = (AREA[0], AREA[3] - 5, AREA[2], AREA[3])
+    north = BoundingBox(AREA[0], AREA[3] - 5, AREA[2], AREA[3])
     Basemap.open(path, EPSG, north).require_readable(north)
 
 

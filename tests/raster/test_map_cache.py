@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.map_cache import TiledMap
 
@@ -14,14 +15,12 @@ class _Plane:
 
     epsg = 32632
     native_gsd_m = 0.3
-    bounds = (0.0, 0.0, 1e6, 1e7)
+    bounds = BoundingBox(0.0, 0.0, 1e6, 1e7)
 
     def __init__(self) -> None:
         self.reads = 0
 
-    def gray(
-        self, bounds: tuple[float, float, float, float], gsd_m: float
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         self.reads += 1
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)
         east = grid.west + (np.arange(grid.width) + 0.5) * gsd_m
@@ -40,7 +39,7 @@ def test_a_tiled_map_gives_what_the_map_gives(
     if width * height > 4e5 * gsd * gsd:
         width = height = 300 * gsd
     plane = _Plane()
-    bounds = (west, north - height, west + width, north)
+    bounds = BoundingBox(west, north - height, west + width, north)
     gray, valid = TiledMap(plane, gsd).gray(bounds, gsd)
     expected, known = plane.gray(bounds, gsd)
     assert np.array_equal(valid, known)
@@ -53,10 +52,10 @@ def test_tiles_are_read_once_and_other_sizes_go_to_the_map() -> None:
     plane = _Plane()
     tiled = TiledMap(plane, 2.0)
     for shift in range(0, 60, 10):
-        tiled.gray((500_000.0 + shift, 5_000_000.0, 500_200.0 + shift, 5_000_200.0), 2.0)
+        tiled.gray(BoundingBox(500_000.0 + shift, 5_000_000.0, 500_200.0 + shift, 5_000_200.0), 2.0)
     assert plane.reads <= 6
     reads = plane.reads
-    tiled.gray((500_000.0, 5_000_000.0, 500_010.0, 5_000_010.0), 1.0)
+    tiled.gray(BoundingBox(500_000.0, 5_000_000.0, 500_010.0, 5_000_010.0), 1.0)
     assert plane.reads == reads + 1
     assert tiled.bounds == plane.bounds
     assert tiled.native_gsd_m == plane.native_gsd_m

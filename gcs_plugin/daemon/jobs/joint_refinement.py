@@ -19,15 +19,16 @@ from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refine
 from gcs_plugin.daemon.jobs.publisher import Press
 from gcs_plugin.daemon.jobs.worker_pool import Crew
 from gcs_plugin.daemon.jobs.worker_tasks import AgainTask, Solved, solve_again
-from gcs_plugin.daemon.layers.layers import Bounds, new_name
+from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 
 _LEAST_PX: Final = 0.1
 """What moves less, in pixels of the layer, is not drawn again."""
 
 
-def together_jobs(journal: Journal, job: Job, box: Bounds) -> list[Callable[[Any], Job]]:
+def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable[[Any], Job]]:
     """The changes that queue what has to be solved again once a job's sortie was refined: its neighbours, then it."""
     others = others_near(journal, job, box, 0.0)
     own = [(str(job.vehicle), job.sortie)] if others else []
@@ -82,7 +83,8 @@ class Together:
         if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
             return _note(job, "it was not refined on the map")
         detail = json.loads(row["detail"])
-        others = [self.press.kept / other["path"] for other in others_near(self.journal, job, detail["bounds"], 0.0)]
+        bounds = BoundingBox(*detail["bounds"])
+        others = [self.press.kept / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
         if not others:
             return _note(job, "it has no neighbours")
         tell(0.05, f"solving again beside {len(others)} neighbour{'s' * (len(others) > 1)}")

@@ -17,14 +17,15 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell
-from gcs_plugin.daemon.jobs.placed_sorties import apart_m, detail_of, sortie_frames
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Press
 from gcs_plugin.daemon.jobs.worker_pool import Crew
-from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, coarse_after, joined, near, place
+from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, coarse_after, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.product_files import finite
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -113,7 +114,7 @@ class Coarse:
         box = near(frames, self.press.area().epsg)
         mine = (packed(str(job.vehicle)), job.sortie)
         shown = self.press.shown("coarse").items()
-        return [path for key, (path, bounds) in shown if key != mine and apart_m(bounds, box) < _REACH_M]
+        return [path for key, (path, bounds) in shown if key != mine and bounds.gap_m(box) < _REACH_M]
 
     def _is_refined(self, job: Job) -> bool:
         """Whether a refinement has taken, or is about to take, the place of what would be made."""
@@ -154,8 +155,7 @@ class Coarse:
         old = self._row(job)
         changed = solved.changed
         if old is not None and "after" in job.detail:
-            west, south, east, north = json.loads(old["detail"])["bounds"]
-            changed = joined([changed, (west, south, east, north)])
+            changed = BoundingBox.around([changed, BoundingBox(*json.loads(old["detail"])["bounds"])])
         detail = json.dumps(detail_of(solved, legs))
 
         def change(rejected: dict[str, str]) -> Change:

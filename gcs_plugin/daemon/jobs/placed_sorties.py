@@ -9,11 +9,11 @@ from typing import Any
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.solution_file import Bytes, thumbnail_of
 from gcs_plugin.daemon.jobs.worker_tasks import Solved
-from gcs_plugin.daemon.layers.layers import Bounds
 from gcs_plugin.daemon.layers.realtime_layer import frame_of_row
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.product_files import finite
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 
@@ -48,11 +48,6 @@ def detail_of(solved: Solved, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def apart_m(one: Bounds, other: Bounds) -> float:
-    """How far two boxes lie apart along an axis; negative where they overlap."""
-    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
-
-
 def solution_row(journal: Journal, job: Job) -> Any:
     """What is kept of a job's sortie since it was refined, None if it was not."""
     return journal.one(
@@ -60,13 +55,14 @@ def solution_row(journal: Journal, job: Job) -> Any:
     )
 
 
-def others_near(journal: Journal, job: Job, box: Bounds, reach_m: float) -> list[Any]:
+def others_near(journal: Journal, job: Job, box: BoundingBox, reach_m: float) -> list[Any]:
     """Rows of the refined sorties, but a job's own, whose ground comes nearer to a box than this."""
     mine = (packed(str(job.vehicle)), job.sortie)
     return [
         row
         for row in journal.rows("SELECT * FROM solutions ORDER BY vehicle, sortie")
-        if (row["vehicle"], row["sortie"]) != mine and apart_m(json.loads(row["detail"])["bounds"], box) < reach_m
+        if (row["vehicle"], row["sortie"]) != mine
+        and BoundingBox(*json.loads(row["detail"])["bounds"]).gap_m(box) < reach_m
     ]
 
 

@@ -16,10 +16,11 @@ from typing import Any
 
 from gcs_plugin.daemon.jobs.worker_pool import Crew
 from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
-from gcs_plugin.daemon.layers.layers import Area, Bounds, Layer, new_name
+from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 
 REFINED = ("coarse", "fine")
@@ -116,7 +117,7 @@ class Press:
         crew: Crew,
         sortie: tuple[str, int | None],
         target: Path,
-        changed: Bounds,
+        changed: BoundingBox,
         change: Callable[[dict[str, str]], Change],
     ) -> tuple[int, int]:
         """Draw a kept sortie into the next generation of a layer and publish it; the layer's turn must be held.
@@ -149,7 +150,7 @@ class Press:
         self.layers[layer].replace(Canvas.open(self.folder / name))
         return before, self.layers[layer].version
 
-    def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, Bounds]]:
+    def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, BoundingBox]]:
         """(vehicle, sortie) -> kept file and bounds of all that show on a layer; a refined one hides its coarse one."""
         refined = {(r["vehicle"], r["sortie"]): r for r in self._rows("solutions")}
         rows = {key: row for key, row in refined.items() if json.loads(row["detail"])["layer"] == layer}
@@ -163,9 +164,11 @@ class Press:
         later.daemon = True
         later.start()
 
-    def _task(self, layer: str, name: str, sortie: tuple[str, int | None], target: Path, changed: Bounds) -> DrawTask:
+    def _task(
+        self, layer: str, name: str, sortie: tuple[str, int | None], target: Path, changed: BoundingBox
+    ) -> DrawTask:
         mine = (packed(sortie[0]), sortie[1])
-        others = [path for key, (path, box) in self.shown(layer).items() if key != mine and _meet(box, changed)]
+        others = [path for key, (path, box) in self.shown(layer).items() if key != mine and box.overlaps(changed)]
         canvas = self.layers[layer].canvas
         old = None if canvas is None else canvas.path
         return DrawTask(old, self.folder / name, self.area().grid, [*others, target], target, changed)
@@ -174,10 +177,5 @@ class Press:
         return self.journal.rows(f"SELECT * FROM {table} ORDER BY vehicle, sortie")
 
 
-def _bounds(row: Any) -> Bounds:
-    west, south, east, north = json.loads(row["detail"])["bounds"]
-    return west, south, east, north
-
-
-def _meet(one: Bounds, other: Bounds) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+def _bounds(row: Any) -> BoundingBox:
+    return BoundingBox(*json.loads(row["detail"])["bounds"])

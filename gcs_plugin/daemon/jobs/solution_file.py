@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.layers.layers import Bounds, union
 from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.color_balance import estimate_gains
 from orthoswarm.mosaic.footprint import footprint_boxes
@@ -65,14 +65,14 @@ def thumbnail_of(data: bytes) -> Bytes:
     return np.frombuffer(data, np.uint8).reshape(_THUMBNAIL)
 
 
-def seen(placed: list[PlacedFrame], terrain: Terrain) -> Bounds:
-    """West, south, east, north of what frames see."""
+def seen(placed: list[PlacedFrame], terrain: Terrain) -> BoundingBox:
+    """The ground that frames see."""
     boxes = footprint_boxes([p.camera for p in placed], float(terrain.z.min()), float(terrain.z.max()))
     boxes = boxes[np.isfinite(boxes).all(1)]
-    return union(boxes) if len(boxes) else (0.0, 0.0, 0.0, 0.0)
+    return BoundingBox.around(boxes) if len(boxes) else BoundingBox(0.0, 0.0, 0.0, 0.0)
 
 
-def touches(placed: PlacedFrame, bounds: Bounds) -> bool:
+def touches(placed: PlacedFrame, bounds: BoundingBox) -> bool:
     """Whether a frame may see ground within bounds; generous."""
     reach = 3.0 * float(placed.camera.position[2]) + _OVERLAP_M
     x, y = (float(v) for v in placed.camera.position[:2])

@@ -14,11 +14,12 @@ from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Press
 from gcs_plugin.daemon.jobs.worker_pool import Crew
-from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, joined, lay_beside, near, solve
-from gcs_plugin.daemon.layers.layers import Bounds, new_name
+from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, lay_beside, near, solve
+from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.model.bounding_box import BoundingBox
 
 _REACH_M: Final = 400.0
 _DRAWN_S: Final = 3.0
@@ -94,7 +95,7 @@ class Refinement:
             shown = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
             changed = solved.changed
             if before is None and shown is not None:  # it leaves where it was
-                changed = joined([changed, shown[1]])
+                changed = BoundingBox.around([changed, shown[1]])
             job.detail["version_before"], job.detail["version"] = self.press.print(
                 layer, self.crew, (vehicle, job.sortie), target, changed,
                 lambda rejected: self._publish(job, layer, target, solved, rejected, before),
@@ -129,7 +130,7 @@ class Refinement:
         refined = None if row is None else json.loads(row["detail"]).get("refined")
         return row if refined is not None and count - refined < _AGAIN else None
 
-    def _neighbours(self, job: Job, box: Bounds) -> list[Path]:
+    def _neighbours(self, job: Job, box: BoundingBox) -> list[Path]:
         """Solutions of others whose ground comes near."""
         return [self.press.kept / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from gcs_plugin.daemon.jobs.solution_file import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
-from gcs_plugin.daemon.layers.layers import Bounds, drawn_bounds, successor, union
+from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
@@ -61,8 +62,8 @@ class Solved:
     fov_deg: float
     fov_sigma_deg: float
     warnings: list[str]
-    bounds: Bounds
-    changed: Bounds
+    bounds: BoundingBox
+    changed: BoundingBox
     cpu_s: float
     wall_s: float
 
@@ -71,7 +72,7 @@ class _Watch:
     def __init__(self) -> None:
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def solved(self, solution: Solution, frames: Sequence[Frame], kept: Kept, changed: Bounds) -> Solved:
+    def solved(self, solution: Solution, frames: Sequence[Frame], kept: Kept, changed: BoundingBox) -> Solved:
         return Solved(
             {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
             [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
@@ -166,7 +167,7 @@ def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
         return None
     kept = replace(before, solution=solution)
     kept.write(task.target)
-    changed = joined([seen(p.solution.placed, p.terrain) for p in (before, kept)])
+    changed = BoundingBox.around([seen(p.solution.placed, p.terrain) for p in (before, kept)])
     return watch.solved(solution, frames, kept, changed), _moved_m(before.solution, solution)
 
 
@@ -237,11 +238,10 @@ def _basemap(task: SolveTask) -> Basemap | None:
     return None if task.basemap is None else Basemap.open(task.basemap, task.epsg, near(task.frames, task.epsg))
 
 
-def near(frames: Sequence[Frame], epsg: int) -> Bounds:
-    """West, south, east, north of where pictures were taken, by their records."""
+def near(frames: Sequence[Frame], epsg: int) -> BoundingBox:
+    """Where pictures were taken, by their records."""
     ground = LocalGrid(epsg).to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
-    (west, south), (east, north) = ground.min(0), ground.max(0)
-    return float(west), float(south), float(east), float(north)
+    return BoundingBox.around_points(ground)
 
 
 def _in_units(frames: Sequence[Frame]) -> list[Frame]:
@@ -280,7 +280,7 @@ class DrawTask:
     grid: GroundGrid
     solutions: list[Path]
     changed: Path
-    bounds: Bounds
+    bounds: BoundingBox
 
 
 def draw(task: DrawTask) -> dict[str, str]:
@@ -317,8 +317,3 @@ def draw(task: DrawTask) -> dict[str, str]:
 def load_solution(path: Path) -> Solution:
     """The solution of a kept sortie."""
     return load_kept(path).solution
-
-
-def joined(boxes: Sequence[Bounds | None]) -> Bounds:
-    """The box around those boxes that there are."""
-    return union([box for box in boxes if box is not None])

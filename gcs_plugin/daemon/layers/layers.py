@@ -12,16 +12,16 @@ import os
 import shutil
 import threading
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import TILE_PX, Canvas, Plane
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 
@@ -31,8 +31,6 @@ _HALF_M: Final = (1_500.0, 6_000.0)
 _MOST_TILES: Final = 4_000_000
 _GSD_M: Final = (0.005, 5.0)
 _ORIGIN_STEP_M: Final = 16.0
-
-Bounds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +46,7 @@ class Area:
     epsg: int
     gsd_m: float
     origin: tuple[float, float]
-    bounds: Bounds
+    bounds: BoundingBox
 
     @classmethod
     def around(cls, epsg: int, east: float, north: float, gsd_m: float) -> "Area":
@@ -56,9 +54,9 @@ class Area:
         gsd = _round_gsd(gsd_m)
         half = float(np.clip(_HALF_PX * gsd, *_HALF_M))
         origin = (round(east / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, round(north / _ORIGIN_STEP_M) * _ORIGIN_STEP_M)
-        return cls(epsg, gsd, origin, _on_tiles((east - half, north - half, east + half, north + half), gsd))
+        return cls(epsg, gsd, origin, _on_tiles(BoundingBox(east, north, east, north).grown(half), gsd))
 
-    def grown(self, bounds: Bounds) -> "Area":
+    def grown(self, bounds: BoundingBox) -> "Area":
         """The area with room for bounds, and as much again beyond, as they were not expected.
 
         Raises:
@@ -66,17 +64,17 @@ class Area:
         """
         reach = _HALF_M[0]
         west, south, east, north = self.bounds
-        if bounds[0] < west:
-            west = bounds[0] - reach
-        if bounds[1] < south:
-            south = bounds[1] - reach
-        if bounds[2] > east:
-            east = bounds[2] + reach
-        if bounds[3] > north:
-            north = bounds[3] + reach
-        wide = _on_tiles((west, south, east, north), self.gsd_m)
+        if bounds.west < west:
+            west = bounds.west - reach
+        if bounds.south < south:
+            south = bounds.south - reach
+        if bounds.east > east:
+            east = bounds.east + reach
+        if bounds.north > north:
+            north = bounds.north + reach
+        wide = _on_tiles(BoundingBox(west, south, east, north), self.gsd_m)
         side = TILE_PX * self.gsd_m
-        if (wide[2] - wide[0]) * (wide[3] - wide[1]) > _MOST_TILES * side * side:
+        if wide.width * wide.height > _MOST_TILES * side * side:
             raise OrthoSwarmError("it lies too far from the other pictures for one map; use a workspace of its own")
         return Area(self.epsg, self.gsd_m, self.origin, wide)
 
@@ -85,11 +83,6 @@ class Area:
         """The grid of its layers."""
         return GroundGrid.around(self.epsg, self.bounds, self.gsd_m)
 
-    def holds(self, bounds: Bounds) -> bool:
-        """True if bounds lie within."""
-        w, s, e, n = self.bounds
-        return w <= bounds[0] and s <= bounds[1] and bounds[2] <= e and bounds[3] <= n
-
     def document(self) -> dict[str, Any]:
         """As JSON values."""
         return asdict(self)
@@ -97,10 +90,8 @@ class Area:
     @classmethod
     def from_document(cls, values: dict[str, Any]) -> "Area":
         """What `document` gave."""
-        bounds, origin = values["bounds"], values["origin"]
-        return cls(
-            values["epsg"], values["gsd_m"], (origin[0], origin[1]), (bounds[0], bounds[1], bounds[2], bounds[3])
-        )
+        origin = values["origin"]
+        return cls(values["epsg"], values["gsd_m"], (origin[0], origin[1]), BoundingBox(*values["bounds"]))
 
 
 def _round_gsd(gsd_m: float) -> float:
@@ -110,11 +101,11 @@ def _round_gsd(gsd_m: float) -> float:
     return max(round(gsd, digits), 10.0**-digits)
 
 
-def _on_tiles(bounds: Bounds, gsd_m: float) -> Bounds:
+def _on_tiles(bounds: BoundingBox, gsd_m: float) -> BoundingBox:
     side = TILE_PX * gsd_m
     west, south = (math.floor(v / side) * side for v in bounds[:2])
     east, north = (math.ceil(v / side) * side for v in bounds[2:])
-    return west, south, east, north
+    return BoundingBox(west, south, east, north)
 
 
 class Layer:
@@ -241,20 +232,12 @@ def _share(source: Path, target: Path, *, share: bool) -> None:
     shutil.copyfile(source, target)
 
 
-def drawn_bounds(canvas: Canvas) -> Bounds | None:
+def drawn_bounds(canvas: Canvas) -> BoundingBox | None:
     """West, south, east, north of the tiles that were drawn; None where nothing was."""
     row0, row1, col0, col1 = canvas.drawn
     if row1 <= row0 or col1 <= col0:
         return None
     g = canvas.grid
-    return (
+    return BoundingBox(
         g.west + col0 * g.gsd_m, g.north - row1 * g.gsd_m, g.west + col1 * g.gsd_m, g.north - row0 * g.gsd_m
     )  # fmt: skip
-
-
-def union(boxes: Sequence[Bounds] | NDArray[np.float64]) -> Bounds:
-    """The box around boxes."""
-    b = np.asarray(boxes, float).reshape(-1, 4)
-    west, south = b[:, :2].min(0)
-    east, north = b[:, 2:].max(0)
-    return float(west), float(south), float(east), float(north)

@@ -25,6 +25,7 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Drawn, Journal, fact_change, frames_drawn, packed, unpacked
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
@@ -337,13 +338,13 @@ class Drawer:
         assert self.area is not None
         east, north, height = (float(v) for v in camera.position)
         far = _SEEN_HEIGHTS * abs(height)
-        if self.area.holds((east - far, north - far, east + far, north + far)):
+        if self.area.bounds.contains(BoundingBox(east, north, east, north).grown(far)):
             return None  # the usual case, without a look at the footprint
         if rejection(camera, 0.0, self.area.gsd_m) is not None:
             return None  # the mosaic will say so
         box = footprint_boxes([camera], 0.0, 0.0)[0]
-        bounds = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
-        if not np.isfinite(box).all() or self.area.holds(bounds):
+        bounds = BoundingBox(*(float(v) for v in box))
+        if not np.isfinite(box).all() or self.area.bounds.contains(bounds):
             return None
         try:
             area = self.area.grown(bounds)

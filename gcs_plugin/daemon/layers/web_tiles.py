@@ -18,6 +18,7 @@ from pyproj import Transformer
 
 from gcs_plugin.daemon.layers.layers import Layer
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.basemap import Basemap
@@ -82,12 +83,10 @@ def _from_mercator(epsg: int) -> Transformer:
     return known[epsg]
 
 
-def _box(patch: Array) -> tuple[float, float, float, float] | None:
+def _box(patch: Array) -> BoundingBox | None:
     if not np.isfinite(patch).all():
         return None
-    west, south = patch.min((0, 1))
-    east, north = patch.max((0, 1))
-    return float(west), float(south), float(east), float(north)
+    return BoundingBox.around_points(patch)
 
 
 def canvas_tile(canvas: Canvas, tile: TileAddress) -> Bytes | None:
@@ -97,23 +96,19 @@ def canvas_tile(canvas: Canvas, tile: TileAddress) -> Bytes | None:
     if box is None or not math.isfinite(gsd) or canvas.newest(box) == 0:
         return None
     margin = 2.0 * max(gsd, canvas.grid.gsd_m)
-    wide = (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
-    source, grid = canvas.read_ground(wide, gsd)
+    source, grid = canvas.read_ground(box.grown(margin), gsd)
     return resampled(source, grid, patch)
 
 
 def basemap_tile(basemap: Basemap, tile: TileAddress) -> Bytes | None:
     """Colours of the basemap in a tile; None where it has none."""
     patch, gsd = ground_patch(tile, basemap.epsg)
-    box, whole = _box(patch), basemap.bounds
-    if box is None or box[0] > whole[2] or box[2] < whole[0] or box[1] > whole[3] or box[3] < whole[1]:
+    box = _box(patch)
+    if box is None or box.gap_m(basemap.bounds) > 0.0:
         return None
     pixel = max(gsd, basemap.native_gsd_m * 0.999)
     margin = 2.0 * pixel  # neighbouring tiles meet without a seam
-    box = (
-        max(box[0] - margin, whole[0]), max(box[1] - margin, whole[1]), min(box[2] + margin, whole[2]),
-        min(box[3] + margin, whole[3]),
-    )  # fmt: skip
+    box = box.grown(margin).intersection(basemap.bounds)
     rgb, valid = basemap.rgb(box, pixel)
     grid = GroundGrid.around(basemap.epsg, box, pixel)
     return resampled(np.dstack([rgb, valid.astype(np.uint8) * np.uint8(255)]), grid, patch)

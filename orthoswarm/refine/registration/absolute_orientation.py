@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
@@ -58,8 +59,7 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
     cameras = flight.cameras()
     height = float(np.median(cameras.position[:, 2]))
     reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0]) + 40.0
-    low, high = cameras.position[:, :2].min(0) - reach, cameras.position[:, :2].max(0) + reach
-    return LoadedMap.load(basemap, origin, (float(low[0]), float(low[1]), float(high[0]), float(high[1])), gsd_m)
+    return LoadedMap.load(basemap, origin, BoundingBox.around_points(cameras.position[:, :2], reach), gsd_m)
 
 
 def tie_round(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 
@@ -27,12 +28,10 @@ class LoadedMap:
     valid: NDArray[np.bool_]
 
     @classmethod
-    def load(
-        cls, basemap: MapWindow, origin: Array, bounds: tuple[float, float, float, float], gsd_m: float
-    ) -> "LoadedMap":
+    def load(cls, basemap: MapWindow, origin: Array, bounds: BoundingBox, gsd_m: float) -> "LoadedMap":
         """Read local bounds (west, south, east, north) of a map; origin (2,) is added to reach its grid."""
         east, north = float(origin[0]), float(origin[1])
-        world = (bounds[0] + east, bounds[1] + north, bounds[2] + east, bounds[3] + north)
+        world = bounds.moved(east, north)
         gray, valid = basemap.gray(world, gsd_m)
         grid = GroundGrid.around(basemap.epsg, world, gsd_m)
         return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
@@ -18,7 +19,6 @@ from orthoswarm.refine.registration.neighbour_ties import Held, held_cameras, li
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
 Array = NDArray[np.float64]
-Bounds = tuple[float, float, float, float]
 
 REACH_PX = 24
 """How far points are searched in held pictures once strips agree: relief moves them by metres across a border."""
@@ -45,13 +45,12 @@ class HeldMosaic:
         self.native_gsd_m = float(np.median(cameras.position[:, 2] / focal))
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> BoundingBox:
         """West, south, east, north of what the cameras may see, in the area's grid."""
         xy = self._held.cameras.position[:, :2] + self._origin[:2]
-        low, high = (xy - self._reach_m[:, None]).min(0), (xy + self._reach_m[:, None]).max(0)
-        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+        return BoundingBox.around(np.hstack([xy - self._reach_m[:, None], xy + self._reach_m[:, None]]))
 
-    def gray(self, bounds: Bounds, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Grey values (rows, columns), 0 to 255, and validity of a window."""
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)
         gray, valid = np.zeros((grid.height, grid.width), np.float32), np.zeros((grid.height, grid.width), bool)

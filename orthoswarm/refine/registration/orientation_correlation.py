@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.subpixel_peak import vertex
@@ -184,7 +185,7 @@ def strip_and_map(
     gray, valid, west, north = mosaic
     reach = int(np.ceil(reach_m / gsd_m))
     rows, cols = gray.shape
-    bounds = (
+    bounds = BoundingBox(
         origin[0] + west - reach * gsd_m,
         origin[1] + north - (rows + reach) * gsd_m,
         origin[0] + west + (cols + reach) * gsd_m,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Terrain
@@ -97,8 +98,7 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
         return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
     reach = 1.1 * float(np.median(path[:, 2]))
-    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    bounds = BoundingBox.around_points(path[:, :2], reach)
     lift = float(np.median([s.surface.lift_m for s in states]))
     fit, off = None, 0.0
     how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
 from orthoswarm.refine.surface.corner_lift import mode
@@ -19,7 +20,6 @@ from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
 
 Array = NDArray[np.float64]
-Bounds = tuple[float, float, float, float]
 
 BLOCK_M = 64.0
 """Windows lie on multiples of this, so that a path that moves by metres does not have the file read again."""
@@ -49,11 +49,11 @@ class Given:
     model: HeightModel
     origin: tuple[float, float]
 
-    def over(self, bounds: Bounds, most_nodes: int = NODES) -> KnownGround:
+    def over(self, bounds: BoundingBox, most_nodes: int = NODES) -> KnownGround:
         """Heights over the model's zero on bounds, both in the local frame."""
         low = [float(np.floor((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[:2], self.origin)]
         high = [float(np.ceil((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[2:], self.origin)]
-        ground = self.model.window((low[0], low[1], high[0], high[1]), most_nodes)
+        ground = self.model.window(BoundingBox(*low, *high), most_nodes)
         t = ground.terrain
         return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
 
@@ -63,7 +63,7 @@ class Given:
         if not ok.any():
             return np.zeros(len(xy))
         low, high = np.quantile(xy[ok], [0.01, 0.99], axis=0)
-        ground = self.over((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+        ground = self.over(BoundingBox.around_points([low, high]))
         return ground.terrain.height(np.where(ok[:, None], xy, low))
 
 
@@ -93,7 +93,7 @@ class GivenFit:
     """
 
     given: Given
-    bounds: Bounds
+    bounds: BoundingBox
     most_nodes: int
     shift_m: float
     rest: Terrain
@@ -128,7 +128,7 @@ def fit_given(
     given: Given,
     points: Array,
     sigma_z: Array,
-    bounds: Bounds,
+    bounds: BoundingBox,
     *,
     kappa: float | None = None,
     settings: FitSettings | None = None,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.bounding_box import BoundingBox
 
 Array = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ class _Grid:
     rows: int
 
     @classmethod
-    def over(cls, bounds: tuple[float, float, float, float], step: float) -> "_Grid":
+    def over(cls, bounds: BoundingBox, step: float) -> "_Grid":
         """The nodes on multiples of the step that cover bounds (west, south, east, north)."""
         west, south = (float(np.floor(v / step) * step) for v in bounds[:2])
         columns, rows = (int(np.ceil((v - first) / step)) + 1 for v, first in zip(bounds[2:], (west, south)))
@@ -206,7 +207,7 @@ class Nodes:
 def fit_nodes(
     points: Array,
     sigma_z: Array,
-    bounds: tuple[float, float, float, float],
+    bounds: BoundingBox,
     kappa: float | None,
     s: FitSettings,
     *,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
@@ -69,7 +70,7 @@ class TerrainFit:
 def fit_terrain(
     points: Array,
     sigma_z: Array,
-    bounds: tuple[float, float, float, float],
+    bounds: BoundingBox,
     *,
     kappa: float | None = None,
     settings: FitSettings | None = None,

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.oldpickles import set_fields
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
@@ -89,8 +90,7 @@ def fit_surface(
         return before
     position = adjustment.cameras.position[:, :2]
     reach = 0.9 * float(np.median(adjustment.cameras.position[:, 2])) * 1.2
-    low, high = position.min(0) - reach, position.max(0) + reach
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    bounds = BoundingBox.around_points(position, reach)
     if before.given is not None:
         fit, off = fit_given(before.given, points, sigma, bounds, kappa=kappa, settings=settings)
         if fit is not None:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
@@ -48,7 +49,7 @@ class FlatMap:
 
     @property
     def bounds(self):
-        return (-250.0, -250.0, 250.0, 250.0)
+        return BoundingBox(-250.0, -250.0, 250.0, 250.0)
 
     def gray(self, bounds, gsd_m):
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)
@@ -158,7 +159,7 @@ def raised_ground(height_m):
         leg=np.zeros(5, np.int32),
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: np.clip(images[i], 0, 255).astype(np.uint8)),
     )
-    return flight, LoadedMap.load(world, np.zeros(2), (-240.0, -240.0, 240.0, 240.0), GSD)
+    return flight, LoadedMap.load(world, np.zeros(2), BoundingBox(-240.0, -240.0, 240.0, 240.0), GSD)
 
 
 @pytest.mark.parametrize("height_m", [-2.5, 0.0, 3.0])
@@ -190,7 +191,7 @@ def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
     points = np.array([[x, y, 0.0] for x in (-40.0, 0.0, 40.0) for y in (-5.0, 10.0, 25.0)])
     points += np.array([1.5, -0.8, 0.0])
     camera = np.abs(points[:, None, 0] - cameras.position[None, :, 0]).argmin(1).astype(np.int32)
-    ground = LoadedMap.load(inverted, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
+    ground = LoadedMap.load(inverted, np.zeros(2), BoundingBox(-120.0, -80.0, 120.0, 100.0), GSD)
     flipped = [255 - im for im in images]
     found = match_points(cameras, points, np.arange(9), camera, lambda i: flipped[i], ground, 16, 10, np.zeros(9))
     assert len(found.point) == 9
@@ -202,7 +203,7 @@ def test_raised_corners_are_tied_by_the_ground_around_them(world):
     cameras, images = pictures_of(world, (0.0, 0.0))
     raised = np.array([[30.0, 20.0, 3.0], [-25.0, -8.0, 2.0]])
     camera = np.array([2, 2], np.int32)
-    ground = LoadedMap.load(world, np.zeros(2), (-120.0, -80.0, 120.0, 100.0), GSD)
+    ground = LoadedMap.load(world, np.zeros(2), BoundingBox(-120.0, -80.0, 120.0, 100.0), GSD)
     plain = [255 - im for im in images]
     found = match_points(cameras, raised, np.arange(2), camera, lambda i: plain[i], ground, 16, 10, np.zeros(2))
     np.testing.assert_allclose(found.shift, 0.0, atol=0.1)
@@ -263,7 +264,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
         best_views=lambda: SimpleNamespace(camera=camera),
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
-    loaded = LoadedMap.load(before, np.zeros(2), (-160.0, -120.0, 160.0, 140.0), GSD)
+    loaded = LoadedMap.load(before, np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)
     chosen = np.arange(len(points))
     found = accepted(
         match_points(

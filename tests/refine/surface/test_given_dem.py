@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.refine.bundle.adjustment import Adjustment
@@ -15,8 +16,8 @@ from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 EPSG = 32632
 ORIGIN = (500_000.0, 5_400_000.0)
-BOUNDS = (-100.0, -100.0, 500.0, 400.0)
-AREA = (ORIGIN[0] - 50.0, ORIGIN[1] - 50.0, ORIGIN[0] + 450.0, ORIGIN[1] + 350.0)
+BOUNDS = BoundingBox(-100.0, -100.0, 500.0, 400.0)
+AREA = BoundingBox(ORIGIN[0] - 50.0, ORIGIN[1] - 50.0, ORIGIN[0] + 450.0, ORIGIN[1] + 350.0)
 DATUM = 437.0
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.strategy.vehicle_group import coarse_terrain
@@ -14,7 +15,7 @@ from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes, sol
 from orthoswarm.refine.surface.terrain import fit_terrain, lower_flank
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
-BOUNDS = (0.0, 0.0, 900.0, 700.0)
+BOUNDS = BoundingBox(0.0, 0.0, 900.0, 700.0)
 
 
 def level(xy):
@@ -107,7 +108,7 @@ def test_weights_tell_ground_from_roofs():
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("bounds", [(0.0, 0.0, 900.0, 700.0), (0.0, 0.0, 870.0, 900.0)])
+@pytest.mark.parametrize("bounds", [BoundingBox(0.0, 0.0, 900.0, 700.0), BoundingBox(0.0, 0.0, 870.0, 900.0)])
 def test_the_axes_are_not_confused(axis, bounds):
     fit = fit_terrain(*town(lambda xy: 0.05 * xy[:, axis]), bounds)
     error = fit.terrain.height(probe()) - 0.05 * probe()[:, axis]
@@ -179,7 +180,7 @@ def test_large_areas_are_solved_in_tiles_without_seams():
     rng = np.random.default_rng(0)
     xy = rng.uniform((20, 20), (2180, 880), (9000, 2))
     points = np.c_[xy, relief(xy) + rng.normal(0, 0.2, len(xy))]
-    sigma, bounds = np.full(len(xy), 0.2), (0.0, 0.0, 2200.0, 900.0)
+    sigma, bounds = np.full(len(xy), 0.2), BoundingBox(0.0, 0.0, 2200.0, 900.0)
     tiled = fit_nodes(points, sigma, bounds, 0.8, FitSettings())
     whole = fit_nodes(points, sigma, bounds, 0.8, FitSettings(), core=1000)
     assert tiled is not None and whole is not None
@@ -190,7 +191,7 @@ def test_large_areas_are_solved_in_tiles_without_seams():
 def test_tiles_without_points_go_on_from_their_neighbours():
     rng = np.random.default_rng(0)
     xy = rng.uniform((20, 20), (600, 600), (2000, 2))
-    fit = fit_terrain(np.c_[xy, np.full(len(xy), 5.0)], np.full(len(xy), 0.2), (0.0, 0.0, 4000.0, 900.0))
+    fit = fit_terrain(np.c_[xy, np.full(len(xy), 5.0)], np.full(len(xy), 0.2), BoundingBox(0.0, 0.0, 4000.0, 900.0))
     np.testing.assert_allclose(fit.terrain.z, 5.0, atol=0.2)
 
 

@@ -5,12 +5,13 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.height_model import check_dem, read_dem
 
 EPSG = 32632
 WEST, SOUTH = 500_000.0, 5_400_000.0
-BOUNDS = (WEST, SOUTH, WEST + 400.0, SOUTH + 300.0)
+BOUNDS = BoundingBox(WEST, SOUTH, WEST + 400.0, SOUTH + 300.0)
 
 
 def ground(east, north):
@@ -122,7 +123,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path):
         read_dem(tmp_path / "text.tif", EPSG, BOUNDS)
     with pytest.raises(InputError, match="no CRS"):
         read_dem(write(tmp_path / "bare.tif", z, None, transform), EPSG, BOUNDS)
-    away = (WEST + 10_000.0, SOUTH, WEST + 10_400.0, SOUTH + 300.0)
+    away = BoundingBox(WEST + 10_000.0, SOUTH, WEST + 10_400.0, SOUTH + 300.0)
     with pytest.raises(InputError, match="covers"):
         read_dem(write(tmp_path / "away.tif", z, transform=transform), EPSG, away)
     picture = tmp_path / "rgb.tif"
@@ -138,7 +139,7 @@ def test_a_real_ground_model_is_read(real_data):
     path = real_data("autzen") / "autzen_ground_approx_0.5m_utm10_cm.tif"
     with rasterio.open(path) as dataset:
         b = dataset.bounds
-    bounds = (b.left + 200, b.bottom + 300, b.right - 200, b.top - 300)
+    bounds = BoundingBox(b.left + 200, b.bottom + 300, b.right - 200, b.top - 300)
     terrain = read_dem(path, 32610, bounds)
     middle = terrain.height(np.array([[0.5 * (b.left + b.right), 0.5 * (b.bottom + b.top)]]))
     assert np.isfinite(middle).all()
