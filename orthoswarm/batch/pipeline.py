@@ -39,7 +39,7 @@ from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem, read_dem
 from orthoswarm.raster.map_check import UnreadableMapError
-from orthoswarm.refine.flight.carried_pictures import carry, sort_out
+from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
 from orthoswarm.report.page import write_page
 
 Array = NDArray[np.float64]
@@ -222,7 +222,7 @@ class _Batch:
 
     def refine(self, state: _State) -> Refinement | None:
         """Coarse and fine cameras of all vehicles; None where the refiner could make nothing of them."""
-        by_kind = sort_out(state.recorded.placed)
+        by_kind = split_refinable(state.recorded.placed)
         state.still, state.odd = by_kind.still, by_kind.odd
         state.warnings += by_kind.warnings
         if not by_kind.fit:
@@ -248,7 +248,8 @@ class _Batch:
                 state.warnings.append(f"{state.fault}; the map is the real-time one")
                 return None
         for solutions in (refinement.coarse, refinement.fine):
-            append_carried(solutions, carry(by_kind.odd, by_kind.fit, [p for s in solutions for p in s.placed]))
+            placed = [p for s in solutions for p in s.placed]
+            append_carried(solutions, place_by_neighbours(by_kind.odd, by_kind.fit, placed))
         stages = split_time(stage, refinement, self.options.until, state.basemap is not None)
         self.clock.stages += stages
         self.space.remember("refinement", (refinement, stages))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
-from orthoswarm.oldpickles import set_fields
 
 Array = NDArray[np.float64]
 Stage = Literal["realtime", "coarse", "fine"]
@@ -71,10 +70,6 @@ class Terrain:
     z: NDArray[np.float32]
     bare: NDArray[np.float32] | None = None
 
-    def __setstate__(self, state: Any) -> None:
-        """From a pickle, perhaps of an earlier version."""
-        set_fields(self, state)
-
     @classmethod
     def flat(cls, z_m: float = 0.0) -> "Terrain":
         """A level plane."""
@@ -132,10 +127,6 @@ class Solution:
     warnings: list[str] = field(default_factory=list)
     timings: dict[str, float] = field(default_factory=dict)
     gsd_m: float = float("nan")
-
-    def __setstate__(self, state: Any) -> None:
-        """From a pickle, perhaps of an earlier version."""
-        set_fields(self, state)
 
 
 class MapWindow(Protocol):

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, angles_from_rotation, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.mosaic.recorded_pose import THETA_HAT_RAD, area_grid, course, recorded_cameras
-from orthoswarm.refine.flight.carried_pictures import carry, hovering, odd_ones
+from orthoswarm.mosaic.recorded_pose import area_grid, course, recorded_cameras
+from orthoswarm.refine.flight.unsolved_pictures import few_of_their_kind, hovering_vehicles, place_by_neighbours
 
 GRID = LocalGrid(32632)
 MIDDLE = np.array([465_000.0, 5_250_000.0])
@@ -34,7 +35,7 @@ def test_what_is_recorded_is_taken():
     np.testing.assert_allclose(placed.camera.position, [*np.add(MIDDLE, (10, 20)), 77.0], atol=1e-6)
     fix = placed.frame.fix
     assert yaw_of(placed) == pytest.approx(0.5 - float(GRID.convergence_rad(fix.lat_deg, fix.lon_deg)))
-    assert placed.camera.lens.fov_rad == pytest.approx(THETA_HAT_RAD)
+    assert placed.camera.lens.fov_rad == pytest.approx(np.radians(active().records.theta_hat_deg))
     assert placed.stage == "realtime" and not made.warnings and not made.rejected
     assert area_grid([placed.frame]).epsg == 32632
 
@@ -90,8 +91,8 @@ def test_a_position_that_cannot_be_is_left_out():
 def test_odd_pictures_follow_their_neighbours():
     frames = [frame(i, 0, 20.0 * i) for i in range(6)] + [replace(frame(6, 30, 50), width=800, height=600)]
     recorded = recorded_cameras(frames, GRID).placed
-    assert odd_ones(frames).tolist() == [False] * 6 + [True]
-    assert not odd_ones(frames[6:]).any()
+    assert few_of_their_kind(frames).tolist() == [False] * 6 + [True]
+    assert not few_of_their_kind(frames[6:]).any()
 
     def refined(p):
         turned = rotation_from_angles(0.1, 0, 0) @ rotation_from_angles(0, 0, 0).T
@@ -99,22 +100,22 @@ def test_odd_pictures_follow_their_neighbours():
         camera = Camera(np.add(p.camera.position, (3.0, -2.0, 5.0)), turned @ p.camera.rotation, lens)
         return replace(p, camera=camera, stage="fine", sigma_m=0.1)
 
-    (made,) = carry(recorded[6:], recorded, [refined(p) for p in recorded[:6]])
+    (made,) = place_by_neighbours(recorded[6:], recorded, [refined(p) for p in recorded[:6]])
     wanted = refined(recorded[6]).camera
     np.testing.assert_allclose(made.camera.position, wanted.position)
     np.testing.assert_allclose(made.camera.rotation, wanted.rotation)
     assert made.camera.lens == wanted.lens and made.stage == "fine" and made.weak and made.sigma_m > 1
-    assert carry(recorded[6:], recorded, []) == recorded[6:]  # nothing to follow: it stays where it was recorded
+    assert place_by_neighbours(recorded[6:], recorded, []) == recorded[6:]  # stays as recorded
 
 
 def test_pictures_of_one_spot_are_known():
     frames = [frame(i, 0.3 * (i % 2), 0.2 * (i % 3)) for i in range(9)]
     frames += [frame(i, 0, 20.0 * i, vehicle="b") for i in range(9)] + [frame(0, 50, 50, vehicle="c")]
-    assert hovering(recorded_cameras(frames, GRID).placed) == {"a"}
+    assert hovering_vehicles(recorded_cameras(frames, GRID).placed) == {"a"}
 
 
 def test_a_receiver_that_wanders_about_one_spot_is_no_flight():
     rng = np.random.default_rng(4)
     frames = [frame(i, *rng.normal(0.0, 2.0, 2)) for i in range(20)]
     frames += [frame(i, 0.0, 0.8 * i, vehicle="b") for i in range(20)]  # slow, but it flies
-    assert hovering(recorded_cameras(frames, GRID).placed) == {"a"}
+    assert hovering_vehicles(recorded_cameras(frames, GRID).placed) == {"a"}

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,6 @@ from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way, split_legs
-from orthoswarm.oldpickles import set_fields
 from orthoswarm.refine.bundle.adjustment import Adjustment, log_rotation
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
@@ -63,10 +61,6 @@ class Flight:
     warnings: list[str]
     sparse: bool = False
     focal_sigma: float = 0.0
-
-    def __setstate__(self, state: Any) -> None:
-        """From a pickle, perhaps of an earlier version."""
-        set_fields(self, state)
 
     def cameras(self) -> CameraBlock:
         """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
@@ -132,19 +126,19 @@ def weigh_records(flight: Flight) -> None:
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
 
-def strong_lens(flight: Flight) -> bool:
+def distorts_strongly(flight: Flight) -> bool:
     """True if the lens distorts so much that two parameters do not describe it."""
     return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= STRONG_K1)
 
 
-def free_strong_lens(flight: Flight) -> bool:
+def free_full_lens(flight: Flight) -> bool:
     """Give a strongly distorting lens all its parameters; a weak one keeps two, which is better held.
 
     Returns:
         True if more parameters are free now (some more steps are due).
     """
     adj = flight.adjustment
-    if not strong_lens(flight):
+    if not distorts_strongly(flight):
         return False
     width = flight.pictures.size[0]
     sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.cameras.lens), 1))

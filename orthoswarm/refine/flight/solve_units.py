@@ -9,7 +9,7 @@ import numpy as np
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import Solution
 
-LONGEST = 600
+LONGEST_UNIT = 600
 """Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded."""
 _SMALL_PART = 6
 
@@ -25,7 +25,7 @@ def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
         for frame in frames:
             groups.setdefault((frame.camera, frame.width, frame.height), []).append(frame)
         for group in _absorb(groups):
-            parts = max(1, int(np.ceil(len(group) / LONGEST)))
+            parts = max(1, int(np.ceil(len(group) / LONGEST_UNIT)))
             units += [list(part) for part in _even(group, parts)]
     return units
 

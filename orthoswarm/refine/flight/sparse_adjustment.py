@@ -67,42 +67,42 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True, schedule: Sequen
         if k == 1:
             _free_lens(adjustment, start, full=False)
         if k >= 2:
-            _records_from_scatter(adjustment)
+            _widen_position_sigmas(adjustment)
         if k == len(schedule) - 1:
-            _attitude_from_scatter(adjustment)
+            _attitude_sigmas_from_residuals(adjustment)
             _free_lens(adjustment, start, full=full_lens)
         for _ in range(stage.steps):
-            ground = plane(adjustment) if k == 0 else datum(adjustment)
+            ground = plane_prior(adjustment) if k == 0 else datum_prior(adjustment)
             move = adjustment.step(stage.c, ground, damping=1e-4 if k == 0 else 1e-6)
-            if move < _settled_m(adjustment):
+            if move < _converged_m(adjustment):
                 break
         _rescale_sigmas(adjustment)
     if release_heights(adjustment).any():
         for _ in range(schedule[-1].steps):
-            if adjustment.step(schedule[-1].c, datum(adjustment)) < _settled_m(adjustment):
+            if adjustment.step(schedule[-1].c, datum_prior(adjustment)) < _converged_m(adjustment):
                 break
     return adjustment
 
 
-def believed_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
+def trusted_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
     """Photos whose recorded heights were believed to the end, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])
     return np.asarray(start.height_known & (sigma < FREE_SIGMA_M)[p.group])
 
 
-def _settled_m(adjustment: Adjustment) -> float:
+def _converged_m(adjustment: Adjustment) -> float:
     """A step that moves no camera farther than this is the last one."""
     return 2e-4 * float(np.median(np.abs(adjustment.cameras.position[:, 2])))
 
 
-def plane(adjustment: Adjustment) -> HeightPrior:
+def plane_prior(adjustment: Adjustment) -> HeightPrior:
     """Belief that all points lie near height 0."""
     zero = np.zeros(len(adjustment.points))
     return HeightPrior(zero, _PLANE_SIGMA_M, 20.0, c=1e3)
 
 
-def datum(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_SIGMA_M) -> HeightPrior:
+def datum_prior(adjustment: Adjustment, level_m: float = 0.0, sigma_m: float = _DATUM_SIGMA_M) -> HeightPrior:
     """Belief that the median of all points lies at a height; it says nothing of how they scatter about it.
 
     Each point is asked to move as the median must, all of them together with the weight of one observation.
@@ -168,7 +168,7 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
     adjustment.priors = replace(p, lens=lens, lens_sigma=sigma)
 
 
-def _records_from_scatter(adjustment: Adjustment) -> None:
+def _widen_position_sigmas(adjustment: Adjustment) -> None:
     """Larger sigmas for positions and heights that scatter more than theirs say.
 
     Heights that are worse than they are believed to be push the cameras up, where they matter less.
@@ -179,7 +179,7 @@ def _records_from_scatter(adjustment: Adjustment) -> None:
     adjustment.priors = replace(p, position_sigma=p.position_sigma * np.maximum(scatter, 1.0))
 
 
-def _attitude_from_scatter(adjustment: Adjustment) -> None:
+def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:
     """Sigmas of the attitude priors from how adjusted attitudes scatter about them."""
     p = adjustment.priors
     sigma = p.rotation_sigma.copy()

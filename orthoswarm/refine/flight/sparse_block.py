@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.refine.bundle import flight_records as dense
+from orthoswarm.refine.bundle import flight_records
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, F, Tracks
 from orthoswarm.refine.features.flow_calibration import Calibration
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.sparse_adjustment import believed_heights, datum, heights_above_ground, solve_sparse
-from orthoswarm.refine.flight.sparse_start import SparseStart, read_records, sparse_start
+from orthoswarm.refine.flight.sparse_adjustment import datum_prior, heights_above_ground, solve_sparse, trusted_heights
+from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import Progress, ReadGray, Run, serial
 from orthoswarm.refine.initial.planar_similarity import Array
 from orthoswarm.refine.initial.segments import photo_legs
@@ -44,14 +44,14 @@ def open_sparse_flight(
         progress: called with stage, done, all.
     """
     frames = [replace(frame, camera=frames[0].camera) for frame in frames]
-    start = sparse_start(frames, read_records(frames, grid, origin), read, run, progress)
+    start = sparse_start(frames, read_photo_records(frames, grid, origin), read, run, progress)
     adjustment = solve_sparse(start)
-    believed = believed_heights(adjustment, start)
+    believed = trusted_heights(adjustment, start)
     warnings = [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]
-    return flight_of(frames, grid, origin, read, start, np.arange(len(frames)), adjustment, believed, warnings)
+    return make_flight(frames, grid, origin, read, start, np.arange(len(frames)), adjustment, believed, warnings)
 
 
-def flight_of(
+def make_flight(
     frames: Sequence[Frame],
     grid: LocalGrid,
     origin: Array,
@@ -77,9 +77,9 @@ def flight_of(
         warnings: findings to be told with this vehicle.
         focal_sigma: of a lens that was found together with others, see `Flight`.
     """
-    records = dense.read_records(frames, grid, origin)
+    records = flight_records.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
-    adjustment = reduced(adjustment, pictures.scale, pictures.size)
+    adjustment = in_reduced_pixels(adjustment, pictures.scale, pictures.size)
     number = {int(row): k for k, row in enumerate(rows)}
     pictures.damaged.update({number[k]: start.reasons[k] for k in sorted(start.damaged) if k in number})
     yaw = wrap_rad(start.plane.yaw[rows])
@@ -100,7 +100,7 @@ def flight_of(
     )  # fmt: skip
 
 
-def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
+def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
     """The same in pixels of pictures reduced `step` times to a size (columns, rows), its weights computed anew."""
     cameras, t, p = adjustment.cameras, adjustment.tracks, adjustment.priors
     lens, lens_prior, lens_sigma = cameras.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
@@ -115,5 +115,5 @@ def reduced(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjus
     out.common[:] = adjustment.common
     common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
     common_lens[:, 4:] /= step
-    out.step(9.0, datum(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0))
+    out.step(9.0, datum_prior(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0))
     return out

@@ -19,9 +19,9 @@ from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.sparse_adjustment import believed_heights, datum, solve_sparse
-from orthoswarm.refine.flight.sparse_block import flight_of, open_sparse_flight
-from orthoswarm.refine.flight.sparse_start import SparseStart, read_records, sparse_start
+from orthoswarm.refine.flight.sparse_adjustment import datum_prior, solve_sparse, trusted_heights
+from orthoswarm.refine.flight.sparse_block import make_flight, open_sparse_flight
+from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import Progress, ReadGray, Run, serial
 from orthoswarm.refine.initial.planar_similarity import Array
 
@@ -65,27 +65,27 @@ def open_sparse_flights(
         return [open_sparse_flight(units[0], grid, origin, read, run, progress)]
     units = [[replace(frame, camera=part[0].camera) for frame in part] for part in units]
     frames = [frame for part in units for frame in part]
-    records = read_records(frames, grid, origin, share_lenses=True)
+    records = read_photo_records(frames, grid, origin, share_lenses=True)
     start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
-    believed = believed_heights(adjustment, start)
+    believed = trusted_heights(adjustment, start)
     focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
     if int(records.vehicle.max()) < _MOST_LENSES:
         adjustment = own_lenses(adjustment, start)
         focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
     found = height_findings(frames, start.records, start.plane, adjustment)
-    told = _told([*start.warnings, *found], [part[0].vehicle for part in units])
+    told = _by_unit([*start.warnings, *found], [part[0].vehicle for part in units])
     flights, first = [], 0
     for part, warnings in zip(units, told, strict=True):
         rows = np.arange(first, first + len(part))
         first += len(part)
-        alone = _apart(adjustment, start, rows)
+        alone = _extract_block(adjustment, start, rows)
         sigma = float(focal_sigma[rows[0]])
-        flights.append(flight_of(part, grid, origin, read, start, rows, alone, believed, warnings, sigma))
+        flights.append(make_flight(part, grid, origin, read, start, rows, alone, believed, warnings, sigma))
     return flights
 
 
-def _told(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
+def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
     """Findings by unit; those that concern several go with the first one."""
     told: list[list[str]] = [[] for _ in names]
     for text in warnings:
@@ -109,11 +109,11 @@ def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
     own = Adjustment.begin(cameras, adjustment.tracks, priors, adjustment.points)
     own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
     for _ in range(_OWN_LENS_STEPS):
-        own.step(9.0, datum(own))
+        own.step(9.0, datum_prior(own))
     return own
 
 
-def _apart(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
+def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
     """The adjustment of some photos by themselves, as found together with all others."""
     local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)

@@ -71,7 +71,7 @@ class SparseStart:
     pairs: tuple[int, int]
 
 
-def read_records(
+def read_photo_records(
     frames: Sequence[Frame], grid: LocalGrid, origin: Array, *, share_lenses: bool = False
 ) -> PhotoRecords:
     """What frames recorded, as arrays in the local frame.
@@ -123,7 +123,7 @@ def sparse_start(
 
     Args:
         frames: N photos, of a vehicle in order of time.
-        records: see `read_records`.
+        records: see `read_photo_records`.
         read_gray: gives a photo's grey values, uint8 (rows, columns), at any size (a reduced decode is welcome); may
             raise PictureError.
         run: where features are found and matched; the result does not depend on it.

@@ -16,7 +16,7 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.coarse_registration import shift_cameras
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import MapMatches, link_legs, match_points
-from orthoswarm.refine.surface.ground_densification import refit
+from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 Array = NDArray[np.float64]
@@ -262,14 +262,14 @@ def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundMod
     matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
-        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, c)
+        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, c)
         if k in (1, 3):
-            surface = refit(flight, surface, as_smooth=k == 3)
+            surface = refit_ground(flight, surface, as_smooth=k == 3)
     roofs = roof_round(flight, surface, ground)
     ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
-    flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    surface = refit(flight, surface, as_smooth=True)
+    flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 6.0)
+    surface = refit_ground(flight, surface, as_smooth=True)
     surface, ties, matches = _second_round(flight, ground, surface, 3)
     return Settled(surface, ties, matches, roofs, ground_shift, links)
 
@@ -286,8 +286,8 @@ def resettle(
     pictures: bool (N,), the ones to compare with the map, None for all.
     """
     for _ in range(2):
-        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 6.0)
-    return _second_round(flight, ground, refit(flight, surface), 4, pictures)
+        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 6.0)
+    return _second_round(flight, ground, refit_ground(flight, surface), 4, pictures)
 
 
 def _second_round(
@@ -302,11 +302,11 @@ def _second_round(
     matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, NEAR_M))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
-        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
+        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
         if k in (0, 1):
             ties = weighed(ties, flight.adjustment.tie_residual)
         if k == rounds - 2:
-            surface = refit(flight, surface, as_smooth=True)
+            surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
 
 

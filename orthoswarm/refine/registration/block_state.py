@@ -2,18 +2,16 @@
 
 from dataclasses import dataclass, field, replace
 from time import process_time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
-from orthoswarm.oldpickles import set_fields
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.weak_pictures import ENOUGH, observations_per_camera
+from orthoswarm.refine.flight.weakly_held_pictures import ENOUGH, observations_per_camera
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
 
@@ -63,10 +61,6 @@ class VehicleState:
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unfound: bool = False
-
-    def __setstate__(self, state: Any) -> None:
-        """From a pickle, perhaps of an earlier version."""
-        set_fields(self, state)
 
 
 def lies_on_map(state: VehicleState) -> bool:

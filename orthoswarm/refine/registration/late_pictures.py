@@ -20,7 +20,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.bundle.covariance import RADIAL
-from orthoswarm.refine.flight.carried_pictures import carry
+from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -58,7 +58,7 @@ def lay_late(
     late = {frame.image for frame in frames}
     everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))
     recorded = recorded_cameras(everyone, LocalGrid(epsg))
-    guesses = carry(
+    guesses = place_by_neighbours(
         [p for p in recorded.placed if p.frame.image in late],
         [p for p in recorded.placed if p.frame.image not in late],
         refined.placed,

@@ -114,7 +114,7 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
         return state
     adj = flight.adjustment
     for c in SCHEDULE:
-        adj.step(c, out.surface.belief(adj.points))
+        adj.step(c, out.surface.height_prior(adj.points))
     linked = adj.tracks.camera >= len(flight.frames)
     agree = int((adj.obs_weight[linked] > 0.3).sum())
     if agree < max(FEWEST_LINKS, LEAST_SHARE * found):

@@ -19,11 +19,11 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
-from orthoswarm.refine.flight.carried_pictures import hovering
 from orthoswarm.refine.flight.relative_block import Flight, open_flight
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
-from orthoswarm.refine.flight.weak_pictures import ENOUGH, observations_per_camera
+from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
+from orthoswarm.refine.flight.weakly_held_pictures import ENOUGH, observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit
 from orthoswarm.refine.strategy.vehicle_group import local_origin
@@ -66,7 +66,7 @@ def place_in_flight(
     Raises:
         OrthoSwarmError: the pictures do not hold together (yet); the sentence says why.
     """
-    if frames and hovering(recorded_cameras(frames, LocalGrid(epsg)).placed):
+    if frames and hovering_vehicles(recorded_cameras(frames, LocalGrid(epsg)).placed):
         raise OrthoSwarmError("all its pictures were taken at one spot; they stay as they were recorded")
     units = split_units({frames[0].vehicle: frames} if frames else {})
     found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= FEWEST_SPARSE]

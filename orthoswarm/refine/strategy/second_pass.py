@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.covariance import common_map_sigma, frame_sigmas, systematic_tie_offset
-from orthoswarm.refine.flight.weak_pictures import steady_weak
+from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, resettle, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.refine.registration.map_heights import map_heights
@@ -48,12 +48,12 @@ def second_pass(
         state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
     else:
         for _ in range(4):
-            flight.adjustment.step(9.0, state.surface.belief(flight.adjustment.points))
+            flight.adjustment.step(9.0, state.surface.height_prior(flight.adjustment.points))
     watch.lap("second adjustment")
     _own_errors(state, others, ground)
     release(flight)
     if not flight.sparse:
-        steady_weak(flight, state.sigma_m)
+        interpolate_weak(flight, state.sigma_m)
     watch.lap("sigma")
     _denser_ground(state, others, ground, pictures)
     watch.lap("denser terrain")
@@ -72,7 +72,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     floor = 0.05
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
-    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.belief(adj.points), ties, 6.0, floor)
+    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.height_prior(adj.points), ties, 6.0, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     if not lies_on_map(state):

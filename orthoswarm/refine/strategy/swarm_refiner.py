@@ -18,8 +18,8 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
-from orthoswarm.refine.flight.carried_pictures import carry, follow, sort_out
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours, place_by_neighbours, split_refinable
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import lay_beside
 from orthoswarm.refine.strategy.first_pass import first_passes
@@ -87,12 +87,12 @@ class SwarmRefiner:
         if not frames:
             raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
         recorded = recorded_cameras(frames, LocalGrid(self.epsg))
-        kinds = sort_out(recorded.placed)
+        kinds = split_refinable(recorded.placed)
         if kinds.fit:
             solution = self._refined(hint_lone_photos(kinds.fit), neighbours, basemap)
         else:
             solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
-        odd = carry(kinds.odd, kinds.fit, solution.placed)
+        odd = place_by_neighbours(kinds.odd, kinds.fit, solution.placed)
         return replace(
             solution,
             placed=[*solution.placed, *odd],
@@ -130,7 +130,7 @@ class SwarmRefiner:
         own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]  # what was left out stays out
         return replace(
             now,
-            placed=[*own_frames, *follow(extra, solution.placed, now.placed)],
+            placed=[*own_frames, *move_with_neighbours(extra, solution.placed, now.placed)],
             dropped=dict(solution.dropped),
             warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in told)])),
         )
@@ -146,7 +146,7 @@ class SwarmRefiner:
             beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
             item = (own[k], beside, float(network.correction_m[k]) - anchor)
             done[k] = second_pass(item, basemap=basemap, origin=self.origin)
-        terrain = _shifted(common_terrain([*done, *others], self.options.ground(self.origin).given)[0], self.origin)
+        terrain = _shifted(common_terrain([*done, *others], self.options.ground(self.origin).dem)[0], self.origin)
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
 
@@ -194,7 +194,7 @@ def refine_all(
     coarse = [to_solution(s, origin, below, coarse=True) for s in states]
     states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
     _level(states)
-    given = options.ground(origin).given
+    given = options.ground(origin).dem
     terrain, warnings = common_terrain(states, given)
     terrain = _shifted(terrain, origin)
     lean = pooled_lean(states)

@@ -13,10 +13,10 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.registration.block_state import VehicleState, seen_from_above
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
-from orthoswarm.refine.surface.given_dem import Given, fit_given
+from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import dense_cell, flying_height
 from orthoswarm.refine.surface.smooth_surface import FitSettings
-from orthoswarm.refine.surface.tall_surfaces import with_broad_tops
+from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
@@ -84,7 +84,7 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
 
 
-def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -> tuple[Terrain | None, list[str]]:
+def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None) -> tuple[Terrain | None, list[str]]:
     """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
 
     A given shape of the ground is brought to their level; where the points contradict it, a warning says so.
@@ -99,15 +99,15 @@ def common_terrain(states: Sequence[VehicleState], given: Given | None = None) -
     path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
     reach = 1.1 * float(np.median(path[:, 2]))
     bounds = BoundingBox.around_points(path[:, :2], reach)
-    lift = float(np.median([s.surface.lift_m for s in states]))
+    lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
     how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN
     if given is not None:
-        fit, off = fit_given(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
+        fit, off = fit_over_dem(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
     tops = np.concatenate([seen_from_above(s) for s in states])
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
-    drawn = with_broad_tops(drawn, tops, cell, DRAWN_NODES)
+    drawn = with_tall_surfaces(drawn, tops, cell, DRAWN_NODES)
     return drawn, _doubts(given, fit is None, off, states) if given is not None else []
 
 
@@ -138,7 +138,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     return Terrain(float(low[0]), float(low[1]), step, z)
 
 
-def _doubts(given: Given, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
+def _doubts(given: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
     """What has to be said of a height model."""
     name = given.model.path.name
     if unused:

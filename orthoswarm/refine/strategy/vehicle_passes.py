@@ -23,9 +23,9 @@ from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
     FEW,
     Flight,
-    free_strong_lens,
+    distorts_strongly,
+    free_full_lens,
     open_flight,
-    strong_lens,
     weigh_records,
 )
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
@@ -33,7 +33,7 @@ from orthoswarm.refine.registration.absolute_orientation import settle
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit, second_look, shift_cameras
 from orthoswarm.refine.registration.tie_points import MapMatches
-from orthoswarm.refine.surface.given_dem import Given
+from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ class Options:
         """What is known of the ground before a picture is looked at, in the frame with this origin."""
         if self.dem is None:
             return GroundModel()
-        return GroundModel(given=Given(self.dem, (float(origin[0]), float(origin[1]))))
+        return GroundModel(dem=LocalDem(self.dem, (float(origin[0]), float(origin[1]))))
 
 
 def read_frame(frame: Frame) -> NDArray[np.uint8]:
@@ -128,7 +128,7 @@ def followed(
         surface = relative(flight, options.ground(origin))
         if not NARROWEST_RAD < fov_rad(float(flight.cameras().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
             return None  # the recorded height that is behind such a lens cannot be right
-        if len(frames) < FEW and strong_lens(flight):
+        if len(frames) < FEW and distorts_strongly(flight):
             return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
         return from_flight(flight, surface, origin, basemap, watch, learned)
     except AdjustmentError:
@@ -153,7 +153,7 @@ def from_flight(
 ) -> VehicleState:
     """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
     adj = flight.adjustment
-    belief = surface.belief(adj.points)
+    belief = surface.height_prior(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
     coarse = replace(
         adj.cameras,
@@ -217,11 +217,11 @@ def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -
     for k, c in enumerate(schedule):
         first = k < 2
         flight.adjustment.step(
-            c, surface.belief(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
+            c, surface.height_prior(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
         )
         if k == 3:
             weigh_records(flight)
-            if free_strong_lens(flight):
+            if free_full_lens(flight):
                 schedule += [9.0] * 4
         if k >= 3:
             surface = fit_surface(flight.adjustment, surface)
@@ -250,7 +250,8 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     seen = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
     if not at_rest or abs(seen - said) < AGREES * said:
         flight.adjustment, flight.calibration = believed.restored(), calibration
-        flight.adjustment.step(9.0, was.belief(flight.adjustment.points))  # what is asked of a step is not restored
+        # what is asked of a step is not restored
+        flight.adjustment.step(9.0, was.height_prior(flight.adjustment.points))
         return was
     flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
     return surface
@@ -260,7 +261,7 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     """So many steps near the end, with the focal length after each."""
     focal_px = []
     for _ in range(count):
-        flight.adjustment.step(9.0, surface.belief(flight.adjustment.points))
+        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points))
         surface = fit_surface(flight.adjustment, surface)
         focal_px.append(float(flight.adjustment.cameras.lens[0, F]))
     return surface, focal_px
@@ -336,7 +337,7 @@ def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
         return ONE_WAY_FOV_SIGMA_DEG
     cameras = flight.cameras()
     held = flight.focal_sigma
-    share = float(np.hypot(held, DECENTRED_SHARE if strong_lens(flight) else 0.0))
+    share = float(np.hypot(held, DECENTRED_SHARE if distorts_strongly(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
         level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(cameras.position[:, 2])), 1.0)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.surface.corner_lift import draw_positions, ground_lift
+from orthoswarm.refine.surface.ground_offset import draw_positions, measure_ground_offset
 from orthoswarm.refine.surface.terrain import TerrainFit
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
-from orthoswarm.refine.surface.vertical_line_locus import LARGE, SMALL, dense_ground, spaced
+from orthoswarm.refine.surface.vertical_line_locus import LARGE, SMALL, dense_ground, spaced_cameras
 
 Array = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ HIGH_SMALL, HIGH_LARGE = (replace(s, baselines_m=(25.0, 50.0, 75.0)) for s in (S
 """What stands high is near the cameras: fewer pictures show it."""
 
 
-def refit(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
+def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
     """The ground fitted to the points now and to heights at free positions between them.
 
     Corners sit on raised things; small patches at free positions tell the ground itself, so that what is left over
@@ -36,9 +36,9 @@ def refit(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> G
         cameras.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M
     )
     gray = flight.pictures.gray
-    free = ground_lift(cameras, gray, positions, surface.terrain(), flight.leg).points
+    free = measure_ground_offset(cameras, gray, positions, surface.terrain(), flight.leg).points
     kappa = surface.fit.kappa if as_smooth and isinstance(surface.fit, TerrainFit) else None
-    surface = replace(surface, lift_m=0.0)
+    surface = replace(surface, ground_offset_m=0.0)
     return fit_surface(flight.adjustment, surface, kappa=kappa, extra=(free.points, free.sigma_z))
 
 
@@ -65,7 +65,9 @@ def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
 
     They show all that there is to see: what needs no more than these has fewer to decode.
     """
-    _, camera, _ = spaced(flight.cameras(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m)
+    _, camera, _ = spaced_cameras(
+        flight.cameras(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m
+    )
     out = np.asarray(flight.leg < 0)
     out[camera] = True
     return out

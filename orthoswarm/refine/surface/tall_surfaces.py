@@ -38,7 +38,7 @@ WALL_NODES = 0.7
 _AT_ONCE = 20_000
 
 
-def with_broad_tops(ground: Terrain, points: Array, cell_m: float, most_nodes: int) -> Terrain:
+def with_tall_surfaces(ground: Terrain, points: Array, cell_m: float, most_nodes: int) -> Terrain:
     """The ground with the tops of what is broad, as the pictures show it from above.
 
     Args:

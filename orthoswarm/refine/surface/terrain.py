@@ -28,7 +28,7 @@ class TerrainFit:
         sd_m: standard deviation of T over nodes with data; median_m: its median there.
         ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
             the mode of the heights (rubble, cars and bushes only lift points, nothing digs them in).
-        pull_m: how far the robust centre (scale 2 m) of the points lies over that ground; a height prior around
+        points_above_m: how far the robust centre (scale 2 m) of the points lies over that ground; a height prior around
             level + pull lets the ground itself settle at the level.
         support: bool (rows, columns), nodes that have data in a cell next to them.
         settings: how it was fitted.
@@ -40,7 +40,7 @@ class TerrainFit:
     sd_m: float
     median_m: float
     ground_m: float
-    pull_m: float
+    points_above_m: float
     support: NDArray[np.bool_]
     settings: FitSettings = field(default_factory=FitSettings)
 
@@ -61,10 +61,10 @@ class TerrainFit:
         """
         return _about(self.terrain, self.median_m, self.shrink, z0_m)
 
-    def rendering(self, lift_m: float = 0.0) -> Terrain:
+    def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
         """T shrunk about its own median for rectifying pictures (never about zero), plus a lift."""
         s = _shrink(self.sd_m, self.settings.render_flat_sd_m)
-        return _about(self.terrain, self.median_m, s, self.median_m + lift_m)
+        return _about(self.terrain, self.median_m, s, self.median_m + ground_offset_m)
 
 
 def fit_terrain(

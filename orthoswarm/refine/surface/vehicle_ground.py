@@ -1,16 +1,14 @@
 """The ground under one vehicle during its adjustment: fitted to the points, used as their height prior."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
-from orthoswarm.oldpickles import set_fields
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
-from orthoswarm.refine.surface.given_dem import Given, GivenFit, fit_given
+from orthoswarm.refine.surface.dem_surface import DemFit, LocalDem, fit_over_dem
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import TerrainFit, fit_terrain
 
@@ -25,42 +23,39 @@ class GroundModel:
         fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`, or has
             the given shape).
         level_m: height that the middle of the ground should have (0: the takeoff level).
-        lift_m: ground between the points over the fitted surface (corners sit on raised things, so it is negative).
-        given: shape of the ground from outside, None to find it from the points.
-        contradicted_m: how far the ground is from the shape that was given but is not used any more, median.
+        ground_offset_m: height of the open ground over the surface through the corners; corners sit on raised things,
+            so it is usually negative.
+        dem: height model that gives the ground's shape, None to find it from the points.
+        contradicted_m: median difference from a height model that is not used any more, as it contradicts the points.
     """
 
-    fit: TerrainFit | GivenFit | None = None
+    fit: TerrainFit | DemFit | None = None
     level_m: float = 0.0
-    lift_m: float = 0.0
-    given: Given | None = None
+    ground_offset_m: float = 0.0
+    dem: LocalDem | None = None
     contradicted_m: float = 0.0
-
-    def __setstate__(self, state: Any) -> None:
-        """From a pickle, perhaps of an earlier version."""
-        set_fields(self, state)
 
     def height(self, xy: Array) -> Array:
         """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""
         if self.fit is None:
-            return self._begun(xy)
+            return self._initial_height(xy)
         return np.asarray(self.terrain().height(xy))
 
     def terrain(self) -> Terrain:
         """The ground for rectifying pictures."""
-        return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.lift_m)
+        return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.ground_offset_m)
 
-    def belief(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> HeightPrior:
+    def height_prior(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> HeightPrior:
         """The height prior of points (P, 3)."""
         if self.fit is None:
-            expected = self._begun(points[:, :2])
+            expected = self._initial_height(points[:, :2])
         else:
-            expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.pull_m
+            expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.points_above_m
         return HeightPrior(expected, sigma_m, 20.0, c)
 
-    def _begun(self, xy: Array) -> Array:
+    def _initial_height(self, xy: Array) -> Array:
         level = np.full(len(xy), self.level_m)
-        return level if self.given is None else level + self.given.height(xy)
+        return level if self.dem is None else level + self.dem.height(xy)
 
 
 def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:
@@ -91,9 +86,9 @@ def fit_surface(
     position = adjustment.cameras.position[:, :2]
     reach = 0.9 * float(np.median(adjustment.cameras.position[:, 2])) * 1.2
     bounds = BoundingBox.around_points(position, reach)
-    if before.given is not None:
-        fit, off = fit_given(before.given, points, sigma, bounds, kappa=kappa, settings=settings)
+    if before.dem is not None:
+        fit, off = fit_over_dem(before.dem, points, sigma, bounds, kappa=kappa, settings=settings)
         if fit is not None:
             return replace(before, fit=fit)
-        before = replace(before, given=None, contradicted_m=off)  # for good: its level is another than the points' own
+        before = replace(before, dem=None, contradicted_m=off)  # for good: its level is another than the points' own
     return replace(before, fit=fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings))

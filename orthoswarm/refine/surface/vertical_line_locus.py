@@ -161,7 +161,7 @@ class _Keys:
     order: NDArray[np.int64]
 
 
-def spaced(
+def spaced_cameras(
     cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
     """Cameras at least so far apart along their legs, and each leg's last one: leg, camera and way along it, sorted."""
@@ -186,7 +186,7 @@ def spaced(
 
 
 def _key_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
-    leg, camera, along = spaced(cameras, leg_of_camera, spacing)
+    leg, camera, along = spaced_cameras(cameras, leg_of_camera, spacing)
     order = np.full(len(cameras), -1, np.int64)
     order[camera] = np.arange(len(camera))
     return _Keys(camera, leg, along, order)

@@ -16,15 +16,15 @@ from orthoswarm.refine.bundle.height_consistency import (
     offsets_without_height_prior,
 )
 from orthoswarm.refine.flight.record_findings import height_findings
-from orthoswarm.refine.flight.sparse_adjustment import believed_heights, solve_sparse
-from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_records
+from orthoswarm.refine.flight.sparse_adjustment import solve_sparse, trusted_heights
+from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
 from orthoswarm.refine.initial.lens_groups import _groups, lens_per_vehicle, split_unlike_lenses
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
 
 
 def begin(world: World, frames) -> SparseStart:
-    records = read_records(frames, GRID, ORIGIN)
+    records = read_photo_records(frames, GRID, ORIGIN)
     start = find_initial_orientation(records, world.pairs, world.features)
     return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
 
@@ -78,8 +78,8 @@ def test_heights_that_are_twice_too_much_are_not_believed_any_more():
     world = crosshatch(tilt_deg=10.0)
     adjustment, start, _ = solved(world, [recorded(f, 2.0 * f.fix.height_m) for f in world.frames])
     assert adjustment.priors.models[0].height_sigma == FREE_SIGMA_M
-    assert start.height_known.all() and not believed_heights(adjustment, start).any()
-    assert believed_heights(*solved(world, world.frames)[:2]).all()
+    assert start.height_known.all() and not trusted_heights(adjustment, start).any()
+    assert trusted_heights(*solved(world, world.frames)[:2]).all()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -134,7 +134,7 @@ def two_cameras(second_fov_deg: float):
 @pytest.mark.parametrize(("second_fov_deg", "lenses"), [(80.0, 1), (95.0, 2)])
 def test_unlike_cameras_of_one_name_get_lenses_of_their_own(second_fov_deg, lenses):
     frames, features, pairs = two_cameras(second_fov_deg)
-    records = read_records(frames, GRID, ORIGIN, share_lenses=True)
+    records = read_photo_records(frames, GRID, ORIGIN, share_lenses=True)
     assert records.lens.max() == 0
     kept = split_unlike_lenses(records, find_initial_orientation(lens_per_vehicle(records), pairs, features))
     assert int(kept.lens.max()) + 1 == lenses == len(kept.fov_hint)

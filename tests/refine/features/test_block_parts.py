@@ -12,8 +12,8 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import split_legs
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.flight.solve_units import LONGEST, merge_units, split_units
-from orthoswarm.refine.flight.weak_pictures import steady_weak
+from orthoswarm.refine.flight.solve_units import LONGEST_UNIT, merge_units, split_units
+from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 
 
 def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):
@@ -82,9 +82,9 @@ def test_a_stray_camera_name_does_not_split_a_flight():
 
 
 def test_long_flights_are_cut_into_even_stretches():
-    units = split_units({"a": [frame(i) for i in range(LONGEST * 2 + 10)]})
+    units = split_units({"a": [frame(i) for i in range(LONGEST_UNIT * 2 + 10)]})
     assert len(units) == 3
-    assert max(map(len, units)) <= LONGEST
+    assert max(map(len, units)) <= LONGEST_UNIT
 
 
 def solution(vehicle, first, count):
@@ -144,7 +144,7 @@ def weak_at(position, recorded, leg, weak):
         ),
     )
     sigma = np.full(n, 0.1)
-    assert np.flatnonzero(steady_weak(flight, sigma)).tolist() == list(weak)
+    assert np.flatnonzero(interpolate_weak(flight, sigma)).tolist() == list(weak)
     return flight.adjustment.cameras.position, sigma
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad, rotation_from_angles
-from orthoswarm.refine.flight.sparse_start import read_records
+from orthoswarm.refine.flight.sparse_start import read_photo_records
 from orthoswarm.refine.initial.heading import circular_mode
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.planar_similarity import level_from_nadir, rotation_of
@@ -24,7 +24,9 @@ def crosshatch(**options) -> World:
 
 
 def begin(world: World, frames=None) -> InitialOrientation:
-    return find_initial_orientation(read_records(frames or world.frames, GRID, ORIGIN), world.pairs, world.features)
+    return find_initial_orientation(
+        read_photo_records(frames or world.frames, GRID, ORIGIN), world.pairs, world.features
+    )
 
 
 def yaw_error_deg(start: InitialOrientation, world: World) -> float:
@@ -134,7 +136,7 @@ def test_parts_without_overlap_are_told_apart_and_both_placed():
 
 def test_no_pair_at_all_leaves_the_tags():
     world = crosshatch()
-    start = find_initial_orientation(read_records(world.frames, GRID, ORIGIN), [], world.features)
+    start = find_initial_orientation(read_photo_records(world.frames, GRID, ORIGIN), [], world.features)
     assert not start.yaw_known.any()
     assert yaw_error_deg(start, world) < 2.0
     assert np.isfinite(start.position).all()

@@ -17,7 +17,7 @@ from orthoswarm.refine.flight.record_findings import runs
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight, reduced
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
-from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_records, sparse_start
+from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records, sparse_start
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
 from orthoswarm.refine.initial.pair_graph import serial
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
@@ -25,7 +25,7 @@ from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, t
 
 def begin(world: World, frames=None) -> SparseStart:
     frames = frames or world.frames
-    records = read_records(frames, GRID, ORIGIN)
+    records = read_photo_records(frames, GRID, ORIGIN)
     start = find_initial_orientation(records, world.pairs, world.features)
     return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
 
@@ -151,7 +151,7 @@ def two_vehicles():
 
 def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then():
     world, frames = two_vehicles()
-    records = read_records(frames, GRID, ORIGIN, share_lenses=True)
+    records = read_photo_records(frames, GRID, ORIGIN, share_lenses=True)
     plane = find_initial_orientation(records, world.pairs, world.features)
     start = assemble(frames, records, world.features, world.pairs, plane, {}, len(world.pairs))
     assert len(start.cameras.lens) == 1
@@ -178,7 +178,7 @@ def flat_flight(count: int = 5):
 
 def test_pictures_in_memory_go_all_the_way_and_threads_change_nothing():
     frames, pictures = flat_flight()
-    records = read_records(frames, GRID, ORIGIN)
+    records = read_photo_records(frames, GRID, ORIGIN)
     with ThreadPoolExecutor(2) as pool:
         runs_in = (serial, lambda function, items: pool.map(function, items))
         results = [sparse_start(frames, records, lambda f: pictures[f.image], run) for run in runs_in]
@@ -215,7 +215,7 @@ def test_damaged_and_mismatched_pictures_are_left_out_with_their_reason():
             raise PictureError("p001.jpg is damaged; copy it again")
         return pictures[frame.image].T.copy() if frame.image == "p003.jpg" else pictures[frame.image]
 
-    start = sparse_start(frames, read_records(frames, GRID, ORIGIN), read)
+    start = sparse_start(frames, read_photo_records(frames, GRID, ORIGIN), read)
     assert start.reasons[1] == "p001.jpg is damaged; copy it again"
     assert "not as its header says" in start.reasons[3]
     assert start.damaged == {1, 3}
@@ -225,7 +225,7 @@ def test_damaged_and_mismatched_pictures_are_left_out_with_their_reason():
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_or_two_photos_are_no_error(count):
     frames, pictures = flat_flight()
-    start = sparse_start(frames[:count], read_records(frames[:count], GRID, ORIGIN), lambda f: pictures[f.image])
+    start = sparse_start(frames[:count], read_photo_records(frames[:count], GRID, ORIGIN), lambda f: pictures[f.image])
     adjustment = solve_sparse(start)
     assert np.isfinite(adjustment.cameras.position).all()
     assert adjustment.cameras.position[0, 2] == pytest.approx(60.0, abs=3.0)
@@ -234,7 +234,7 @@ def test_one_or_two_photos_are_no_error(count):
 def test_many_photos_of_one_spot_are_no_error():
     frames, pictures = flat_flight(1)
     many = [replace(frames[0], image=f"s{k}.jpg", time_s=float(k)) for k in range(9)]
-    start = sparse_start(many, read_records(many, GRID, ORIGIN), lambda f: pictures["p000.jpg"])
+    start = sparse_start(many, read_photo_records(many, GRID, ORIGIN), lambda f: pictures["p000.jpg"])
     adjustment = solve_sparse(start)
     assert np.ptp(adjustment.cameras.position, axis=0).max() < 1.0
 
@@ -250,7 +250,7 @@ def solved(frames):
     grid = LocalGrid(area_epsg(*zip(*positions)))
     origin = np.round(grid.to_grid(*zip(*positions)).mean(0))
     begun = time.process_time()
-    start = sparse_start(frames, read_records(frames, grid, origin), lambda f: read_gray(f.path))
+    start = sparse_start(frames, read_photo_records(frames, grid, origin), lambda f: read_gray(f.path))
     adjustment = solve_sparse(start)
     return start, adjustment, grid, origin, time.process_time() - begun
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.surface.tall_surfaces import NODE_M, RISE_M, with_broad_tops
+from orthoswarm.refine.surface.tall_surfaces import NODE_M, RISE_M, with_tall_surfaces
 
 CELL_M = 14.0
 MANY = 4_000_000
@@ -32,7 +32,7 @@ def hall(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def test_hall_is_drawn_on_its_roof_and_the_street_beside_it_on_the_ground() -> None:
     ground = slope()
-    drawn = with_broad_tops(ground, sights(ground, hall), CELL_M, MANY)
+    drawn = with_tall_surfaces(ground, sights(ground, hall), CELL_M, MANY)
     inside = np.stack(np.meshgrid(np.linspace(280.0, 320.0, 9), np.linspace(190.0, 210.0, 5)), -1)
     assert np.abs(drawn.height(inside) - ground.height(inside) - 12.0).max() < 1.0
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 600.0, 5.0), np.arange(0.0, 600.0, 5.0)))
@@ -49,7 +49,7 @@ def test_stand_keeps_its_slope() -> None:
         return np.where((np.abs(x - 300.0) < 50.0) & (np.abs(y - 300.0) < 100.0), 0.2 * (x - 250.0), 0.0)
 
     ground = slope()
-    drawn = with_broad_tops(ground, sights(ground, stand), CELL_M, MANY)
+    drawn = with_tall_surfaces(ground, sights(ground, stand), CELL_M, MANY)
     x = np.arange(265.0, 331.0, 5.0)
     at = np.column_stack([x, np.full(len(x), 300.0)])
     assert np.abs(drawn.height(at) - ground.height(at) - 0.2 * (x - 250.0)).max() < 2.5
@@ -60,7 +60,7 @@ def test_houses_and_trees_leave_the_ground_as_it_is() -> None:
         return np.where((x % 42.0 < 13.0) & (y % 42.0 < 13.0), 8.0, 0.0)
 
     ground = slope()
-    assert with_broad_tops(ground, sights(ground, houses), CELL_M, MANY) is ground
+    assert with_tall_surfaces(ground, sights(ground, houses), CELL_M, MANY) is ground
 
 
 def test_lone_wrong_heights_on_a_roof_do_not_dent_it() -> None:
@@ -71,21 +71,21 @@ def test_lone_wrong_heights_on_a_roof_do_not_dent_it() -> None:
     points = sights(ground, big)
     middle = np.abs(points[:, :2] - (300.0, 200.0)).max(1) < 30.0
     points[np.flatnonzero(middle)[::7], 2] += 9.0
-    drawn = with_broad_tops(ground, points, CELL_M, MANY)
+    drawn = with_tall_surfaces(ground, points, CELL_M, MANY)
     inside = np.stack(np.meshgrid(np.linspace(270.0, 330.0, 9), np.linspace(170.0, 230.0, 9)), -1)
     assert np.abs(drawn.height(inside) - ground.height(inside) - 12.0).max() < 1.0
 
 
 def test_pit_is_drawn_at_its_bottom() -> None:
     ground = slope()
-    drawn = with_broad_tops(ground, sights(ground, lambda x, y: -0.6 * hall(x, y)), CELL_M, MANY)
+    drawn = with_tall_surfaces(ground, sights(ground, lambda x, y: -0.6 * hall(x, y)), CELL_M, MANY)
     middle = np.array([300.0, 200.0])
     assert abs(float(drawn.height(middle) - ground.height(middle)) + 7.2) < 1.0
 
 
 def test_number_of_nodes_stays_bounded() -> None:
     ground = slope()
-    drawn = with_broad_tops(ground, sights(ground, hall), CELL_M, 4 * ground.z.size)
+    drawn = with_tall_surfaces(ground, sights(ground, hall), CELL_M, 4 * ground.z.size)
     assert ground.z.size < drawn.z.size <= 4 * ground.z.size
 
 
@@ -95,4 +95,4 @@ def test_ground_that_is_only_rough_is_given_back(seed: int, rough: float, count:
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0.0, 600.0, (count, 2))
     z = ground.height(xy) + rng.uniform(-RISE_M * rough, RISE_M * rough, count)
-    assert with_broad_tops(ground, np.column_stack([xy, z]), CELL_M, MANY) is ground
+    assert with_tall_surfaces(ground, np.column_stack([xy, z]), CELL_M, MANY) is ground

@@ -153,7 +153,7 @@ def test_a_height_prior_moved_by_the_pull_lets_the_ground_settle_at_zero():
     for _ in range(50):  # what a robust prior of 2 m around a plane holds at the plane
         w = 1 / (1 + ((z - centre) / 2) ** 2) ** 2
         centre = (w * z).sum() / w.sum()
-    assert fit.pull_m == pytest.approx(centre, abs=0.03)
+    assert fit.points_above_m == pytest.approx(centre, abs=0.03)
 
 
 @settings(max_examples=25, deadline=None)

@@ -8,7 +8,7 @@ import pytest
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.surface.corner_lift import draw_positions, ground_lift, mode
+from orthoswarm.refine.surface.ground_offset import draw_positions, kernel_mode, measure_ground_offset
 from orthoswarm.refine.surface.vertical_line_kernels import _leaves
 from orthoswarm.refine.surface.vertical_line_locus import LARGE, dense_ground
 from tests.kit.draped import HEIGHT, WIDTH, Pictures, rig_of
@@ -147,15 +147,15 @@ def test_the_lift_tells_the_level_of_the_ground(hilly):
     east, north = np.meshgrid(-300 + 5.0 * np.arange(120), -300 + 5.0 * np.arange(160))
     for offset in (0.0, 0.4):
         surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
-        lift = ground_lift(cameras, gray, positions, surface, leg)
+        lift = measure_ground_offset(cameras, gray, positions, surface, leg)
         assert lift.count > 200
-        assert lift.lift_m == pytest.approx(-offset, abs=0.08)
+        assert lift.ground_offset_m == pytest.approx(-offset, abs=0.08)
 
 
 def test_too_few_heights_give_no_lift(hilly):
     cameras, leg, gray = hilly
-    lift = ground_lift(cameras, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
-    assert lift.lift_m == 0.0
+    lift = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
+    assert lift.ground_offset_m == 0.0
 
 
 def test_positions_are_drawn_alike_every_time():
@@ -169,7 +169,7 @@ def test_positions_are_drawn_alike_every_time():
 def test_the_mode_ignores_a_long_tail():
     rng = np.random.default_rng(0)
     values = np.r_[rng.normal(-0.3, 0.1, 300), rng.uniform(-0.5, 8, 500)]
-    assert mode(values, 0.2) == pytest.approx(-0.28, abs=0.08)
+    assert kernel_mode(values, 0.2) == pytest.approx(-0.28, abs=0.08)
 
 
 def test_a_wall_in_the_terrain_reads_no_pixel_outside_a_picture():

@@ -10,7 +10,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.refine.bundle.adjustment import Adjustment
-from orthoswarm.refine.surface.given_dem import Given, GivenFit, fit_given
+from orthoswarm.refine.surface.dem_surface import DemFit, LocalDem, fit_over_dem
 from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
@@ -51,7 +51,7 @@ def cameras(height=150.0):
 
 
 def opened(path, at=None):
-    return Given(HeightModel.open(path, EPSG, AREA, cameras() if at is None else at), ORIGIN)
+    return LocalDem(HeightModel.open(path, EPSG, AREA, cameras() if at is None else at), ORIGIN)
 
 
 def points(ground=hills, count=4000, level=1.5, seed=0):
@@ -73,8 +73,8 @@ def off(terrain, ground, level=1.5):
 
 def test_a_right_model_keeps_its_shape_and_gets_the_level_of_the_points(tmp_path):
     p, sigma = points()
-    fit, differs = fit_given(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
-    assert isinstance(fit, GivenFit) and differs < 0.15
+    fit, differs = fit_over_dem(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
+    assert isinstance(fit, DemFit) and differs < 0.15
     error = off(fit.rendering(), hills)
     assert abs(np.median(error)) < 0.1  # the datum of the file is 437 m away
     assert np.abs(error - np.median(error)).max() < 0.1
@@ -84,7 +84,7 @@ def test_a_right_model_keeps_its_shape_and_gets_the_level_of_the_points(tmp_path
 
 def test_the_lift_and_the_level_are_heights_over_the_same_shape(tmp_path):
     p, sigma = points()
-    fit, _ = fit_given(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
+    fit, _ = fit_over_dem(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
     np.testing.assert_allclose(fit.rendering(-0.4).height(probe()), fit.rendering().height(probe()) - 0.4, atol=1e-4)
     up = fit.prior(fit.shift_m).height(probe()) - fit.rendering().height(probe())
     assert np.abs(up).max() < 1e-3
@@ -95,7 +95,7 @@ def test_a_deposit_on_an_old_model_is_followed_and_the_rest_is_left_alone(tmp_pa
         return hills(xy) + 1.5 * np.clip((180.0 - xy[..., 0]) / 40.0, 0.0, 1.0)
 
     p, sigma = points(now)
-    fit, _ = fit_given(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
+    fit, _ = fit_over_dem(opened(write(tmp_path / "dem.tif")), p, sigma, BOUNDS)
     error = off(fit.rendering(), now)
     east = probe()[..., 0]
     assert abs(np.median(error[east < 120.0])) < 0.25
@@ -103,10 +103,10 @@ def test_a_deposit_on_an_old_model_is_followed_and_the_rest_is_left_alone(tmp_pa
 
 
 def test_beyond_the_model_the_ground_comes_from_the_points_without_a_step(tmp_path):
-    given = opened(write(tmp_path / "dem.tif", known=lambda xy: xy[..., 0] < 200.0))
-    assert 0.4 < given.model.cover < 0.6
+    dem = opened(write(tmp_path / "dem.tif", known=lambda xy: xy[..., 0] < 200.0))
+    assert 0.4 < dem.model.cover < 0.6
     p, sigma = points()
-    fit, _ = fit_given(given, p, sigma, BOUNDS)
+    fit, _ = fit_over_dem(dem, p, sigma, BOUNDS)
     terrain, found = fit.rendering(), fit_terrain(p, sigma, BOUNDS).rendering()
     error, alone = np.abs(off(terrain, hills)), np.abs(off(found, hills))
     east = probe()[..., 0]
@@ -119,7 +119,7 @@ def test_beyond_the_model_the_ground_comes_from_the_points_without_a_step(tmp_pa
 
 def test_a_displaced_model_is_no_worse_than_none(tmp_path):
     p, sigma = points()
-    fit, differs = fit_given(opened(write(tmp_path / "dem.tif", east_m=20.0)), p, sigma, BOUNDS)
+    fit, differs = fit_over_dem(opened(write(tmp_path / "dem.tif", east_m=20.0)), p, sigma, BOUNDS)
     alone = np.abs(off(fit_terrain(p, sigma, BOUNDS).rendering(), hills))
     error = np.abs(off(fit.rendering(), hills))
     assert differs > 0.3  # which is told
@@ -129,17 +129,17 @@ def test_a_displaced_model_is_no_worse_than_none(tmp_path):
 
 
 def test_a_model_of_other_ground_is_not_used(tmp_path):
-    fit, differs = fit_given(opened(write(tmp_path / "dem.tif", lambda xy: -hills(xy))), *points(), BOUNDS)
+    fit, differs = fit_over_dem(opened(write(tmp_path / "dem.tif", lambda xy: -hills(xy))), *points(), BOUNDS)
     assert fit is None and differs > 2.0
 
 
 def test_a_model_that_was_contradicted_is_left_out_for_good(tmp_path):
-    given = opened(write(tmp_path / "dem.tif", lambda xy: -hills(xy)))
+    dem = opened(write(tmp_path / "dem.tif", lambda xy: -hills(xy)))
     p, sigma = points()
-    before = GroundModel(given=given)
-    np.testing.assert_allclose(before.height(p[:, :2]), given.height(p[:, :2]))
+    before = GroundModel(dem=dem)
+    np.testing.assert_allclose(before.height(p[:, :2]), dem.height(p[:, :2]))
     after = fit_points(before, p, sigma)
-    assert after.given is None and after.contradicted_m > 2.0
+    assert after.dem is None and after.contradicted_m > 2.0
     assert np.percentile(np.abs(off(after.terrain(), hills)), 90) < 1.2
 
 
@@ -155,20 +155,13 @@ def fit_points(before, p, sigma):
 
 
 def test_what_travels_between_processes_is_small_and_gives_the_same_ground(tmp_path):
-    fit, _ = fit_given(opened(write(tmp_path / "dem.tif")), *points(), BOUNDS)
+    fit, _ = fit_over_dem(opened(write(tmp_path / "dem.tif")), *points(), BOUNDS)
     there = fit.rendering()
     data = pickle.dumps(fit)
     assert len(data) < 20_000 < there.z.nbytes
     again = pickle.loads(data)
     np.testing.assert_array_equal(again.rendering().z, there.z)
     np.testing.assert_array_equal(again.prior(1.0).height(probe()), fit.prior(1.0).height(probe()))
-
-
-def test_what_an_earlier_version_kept_is_read():
-    old = object.__new__(GroundModel)
-    old.__setstate__([None, 1.5, -0.2])
-    assert old == GroundModel(level_m=1.5, lift_m=-0.2)
-    assert pickle.loads(pickle.dumps(old)) == old
 
 
 def test_zero_is_the_ground_below_the_cameras_that_the_model_knows(tmp_path):

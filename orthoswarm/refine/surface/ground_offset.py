@@ -21,18 +21,18 @@ NEAR = replace(SMALL, reach_m=3.0, height_step_m=0.25, rival_m=np.inf)
 
 
 @dataclass(frozen=True, slots=True)
-class Lift:
+class GroundOffset:
     """Level of the ground against a surface.
 
     Attributes:
-        lift_m: to be added to the surface wherever height above ground matters (usually negative).
+        ground_offset_m: to be added to the surface wherever height above ground matters (usually negative).
         count: heights found; 0 lift below the minimum.
         points: what the level was taken from. They are good ground points by themselves: a surface fitted to them
             and the tracks together follows the ground where the lift differs from place to place (rubble here,
             streets there), and then the lift that is left is a few centimetres.
     """
 
-    lift_m: float
+    ground_offset_m: float
     count: int
     points: LocusPoints
 
@@ -48,7 +48,7 @@ def draw_positions(camera_xy: Array, *, count: int = 900, spread_m: float = 100.
     return np.asarray(at[:, :2] + rng.uniform(-spread_m, spread_m, (count, 2)))
 
 
-def ground_lift(
+def measure_ground_offset(
     cameras: CameraBlock,
     gray: Gray,
     positions: Array,
@@ -59,7 +59,7 @@ def ground_lift(
     least: int = 60,
     kernel_m: float = 0.2,
     limits_m: tuple[float, float] = (-1.5, 0.5),
-) -> Lift:
+) -> GroundOffset:
     """Level of the ground over the terrain at free positions (see `draw_positions`), with small patches.
 
     Args:
@@ -78,11 +78,11 @@ def ground_lift(
     )
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
     if len(above) < least:
-        return Lift(0.0, len(above), found)
-    return Lift(float(np.clip(mode(above, kernel_m), *limits_m)), len(above), found)
+        return GroundOffset(0.0, len(above), found)
+    return GroundOffset(float(np.clip(kernel_mode(above, kernel_m), *limits_m)), len(above), found)
 
 
-def mode(values: Array, kernel_m: float, rounds: int = 20) -> float:
+def kernel_mode(values: Array, kernel_m: float, rounds: int = 20) -> float:
     """Most frequent value: mean shift with a Gaussian kernel from the best of many starts."""
     starts = np.quantile(values, np.linspace(0.02, 0.98, 49))
     near = np.exp(-0.5 * ((values[None, :] - starts[:, None]) / kernel_m) ** 2)

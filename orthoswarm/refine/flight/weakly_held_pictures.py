@@ -22,7 +22,7 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
     return np.bincount(adj.tracks.camera[good], minlength=n)
 
 
-def without_leaps(recorded: Array, leg: NDArray[np.int32]) -> Array:
+def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
     """Records (N, 3) with single positions that leave their leg's own course sideways or along it put back (2 of 3).
 
     Within a long gap a position 5 to 20 m off looks like the aircraft's own way when only the gap's ends are asked.
@@ -43,7 +43,7 @@ def without_leaps(recorded: Array, leg: NDArray[np.int32]) -> Array:
     return out
 
 
-def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
+def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
     """Interpolate weakly held cameras from strong ones before and after, in place; returns which they are.
 
     Positions follow the record's own shape where it agrees with its neighbours, else a straight line in time; the
@@ -57,7 +57,7 @@ def steady_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
     if len(strong) < 2:
         return weak
     time = flight.records.time_s
-    recorded = without_leaps(adj.priors.position[:n], flight.leg)
+    recorded = without_outliers(adj.priors.position[:n], flight.leg)
     for i in np.flatnonzero(weak):
         k = int(np.searchsorted(strong, i))
         a, b = strong[max(k - 1, 0)], strong[min(k, len(strong) - 1)]

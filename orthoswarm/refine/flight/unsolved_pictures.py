@@ -22,7 +22,7 @@ _WANDER_SHARE, _WANDER_STEPS, _WANDER_FEWEST = 0.3, 0.9, 6
 
 
 @dataclass(frozen=True, slots=True)
-class Sorted:
+class RefinableSplit:
     """Recorded frames by what a refiner can make of them, each in the order of the frames.
 
     Attributes:
@@ -37,24 +37,24 @@ class Sorted:
     warnings: list[str]
 
 
-def sort_out(recorded: Sequence[PlacedFrame]) -> Sorted:
-    """Find the frames that a refiner would fail on, or worse, be sure of (see `hovering` and `odd_ones`)."""
-    spots = hovering(recorded)
+def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
+    """Find the frames on which a refiner would fail, or be wrong without noticing it."""
+    spots = hovering_vehicles(recorded)
     warnings = [
         f"{vehicle}: all pictures were taken at one spot; they are placed as recorded" for vehicle in sorted(spots)
     ]
     moving = [p for p in recorded if p.frame.vehicle not in spots]
-    few = odd_ones([p.frame for p in moving])
+    few = few_of_their_kind([p.frame for p in moving])
     odd = [p for p, alone in zip(moving, few, strict=True) if alone]
     if odd:
         some = len(odd) > 1
         who, follow = (f"{len(odd)} pictures", "follow their") if some else ("1 picture", "follows its")
         warnings.append(f"{who} of another camera or size, too few to be refined, {follow} neighbours")
     fit = [p for p, alone in zip(moving, few, strict=True) if not alone]
-    return Sorted(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
+    return RefinableSplit(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
 
 
-def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
     """Which frames have fewer than FEWEST of their vehicle, camera and size, where others have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
@@ -62,7 +62,7 @@ def odd_ones(frames: Sequence[Frame]) -> NDArray[np.bool_]:
     return few if not few.all() else np.zeros(len(frames), bool)
 
 
-def hovering(recorded: Sequence[PlacedFrame]) -> set[str]:
+def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     """Vehicles with several pictures, in order of time, that were all taken at one spot."""
     members: dict[str, list[PlacedFrame]] = {}
     for p in recorded:
@@ -86,7 +86,7 @@ def _stands(positions: NDArray[np.float64]) -> bool:
     return len(positions) >= _WANDER_FEWEST and spread < _WANDER_SHARE * height and steps > _WANDER_STEPS * wide
 
 
-def carry(
+def place_by_neighbours(
     odd: Sequence[PlacedFrame], recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
     """Place frames by what refinement changed in their nearest neighbours: position, attitude, focal length.
@@ -105,7 +105,7 @@ def carry(
     return [_carried(one, _near(one, pairs)) for one in odd] if pairs else list(odd)
 
 
-def follow(
+def move_with_neighbours(
     extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
     """Move frames by what changed in their nearest neighbours when those were placed again; as sure of them as before.
@@ -116,7 +116,7 @@ def follow(
         after: the others as they are.
     """
     own = {p.frame.image for p in extra}
-    moved = carry(extra, [p for p in before if p.frame.image not in own], after)
+    moved = place_by_neighbours(extra, [p for p in before if p.frame.image not in own], after)
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
-from orthoswarm.refine.surface.corner_lift import mode
+from orthoswarm.refine.surface.ground_offset import kernel_mode
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
 
@@ -39,7 +39,7 @@ SEAM_M = 90.0
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class LocalDem:
     """A height model in a local frame.
 
     Attributes:
@@ -68,7 +68,7 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Stacked:
+class SurfaceSum:
     """Ground as the sum of two surfaces."""
 
     lower: Terrain
@@ -80,24 +80,24 @@ class Stacked:
 
 
 @dataclass(frozen=True)
-class GivenFit:
-    """A given ground at the points' level; takes the place of a TerrainFit.
+class DemFit:
+    """A dem ground at the points' level; takes the place of a TerrainFit.
 
     Attributes:
-        given: the shape. bounds: of the nodes, local frame. most_nodes: how many at most.
+        dem: the shape. bounds: of the nodes, local frame. most_nodes: how many at most.
         shift_m: what has to be added to the model's heights.
         rest: where and by how much the ground differs from the model so shifted.
-        pull_m: how far the robust centre of the points lies over the ground (see TerrainFit).
+        points_above_m: how far the robust centre of the points lies over the ground (see TerrainFit).
         sd_m: standard deviation of the ground over nodes with data.
         beyond: ground over the model's zero where the model has no heights.
     """
 
-    given: Given
+    dem: LocalDem
     bounds: BoundingBox
     most_nodes: int
     shift_m: float
     rest: Terrain
-    pull_m: float
+    points_above_m: float
     sd_m: float
     beyond: Terrain | None = None
     _made: dict[str, Terrain] = field(default_factory=dict, repr=False, compare=False)
@@ -106,26 +106,26 @@ class GivenFit:
         """Without the nodes, which are read again from the file where they are needed."""
         return {**self.__dict__, "_made": {}}
 
-    def prior(self, z0_m: float = 0.0) -> Stacked:
+    def prior(self, z0_m: float = 0.0) -> SurfaceSum:
         """The surface around which point heights are held, the model's zero at z0."""
-        return Stacked(self._shape(), _raised(self.rest, z0_m))
+        return SurfaceSum(self._shape(), _raised(self.rest, z0_m))
 
-    def rendering(self, lift_m: float = 0.0) -> Terrain:
+    def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
         """The ground for rectifying pictures, plus a lift."""
         if "drawn" not in self._made:
             shape = self._shape()
             z = shape.z + self.rest.height(_nodes(shape)) + self.shift_m
             self._made["drawn"] = replace(shape, z=z.astype(np.float32))
-        return _raised(self._made["drawn"], lift_m) if lift_m else self._made["drawn"]
+        return _raised(self._made["drawn"], ground_offset_m) if ground_offset_m else self._made["drawn"]
 
     def _shape(self) -> Terrain:
         if "shape" not in self._made:
-            self._made["shape"] = _joined(self.given.over(self.bounds, self.most_nodes), self.beyond)
+            self._made["shape"] = _joined(self.dem.over(self.bounds, self.most_nodes), self.beyond)
         return self._made["shape"]
 
 
-def fit_given(
-    given: Given,
+def fit_over_dem(
+    dem: LocalDem,
     points: Array,
     sigma_z: Array,
     bounds: BoundingBox,
@@ -133,18 +133,18 @@ def fit_given(
     kappa: float | None = None,
     settings: FitSettings | None = None,
     most_nodes: int = NODES,
-) -> tuple[GivenFit | None, float]:
+) -> tuple[DemFit | None, float]:
     """Fit the ground under points over a height model (see `fit_terrain` for what is not said here).
 
     Args:
-        given: the model. points: float64 (P, 3), local frame. bounds: what the ground must cover.
+        dem: the model. points: float64 (P, 3), local frame. bounds: what the ground must cover.
         most_nodes: how finely the model is read.
 
     Returns:
         The fit, None where the model contradicts the points (or has nothing to say); and how far the ground differs
         from the model, the median over nodes with data.
     """
-    ground = given.over(bounds, most_nodes)
+    ground = dem.over(bounds, most_nodes)
     if not ground.known.any():
         return None, 0.0
     beyond = None
@@ -154,7 +154,7 @@ def fit_given(
         if int(on.sum()) < FEWEST:
             return None, 0.0
         above = points[on, 2] - ground.terrain.height(points[on, :2])
-        beyond = _raised(found.rendering(), -mode(above, LEVEL_KERNEL_M))
+        beyond = _raised(found.rendering(), -kernel_mode(above, LEVEL_KERNEL_M))
     shape = _joined(ground, beyond)
     over = points.copy()
     over[:, 2] -= shape.height(points[:, :2])
@@ -163,7 +163,7 @@ def fit_given(
     if not known.any():
         return None, 0.0
     sd = float((nodes.z + shape.height(_nodes(nodes)))[known].std())
-    shift = mode(nodes.z[known].astype(np.float64), LEVEL_KERNEL_M)
+    shift = kernel_mode(nodes.z[known].astype(np.float64), LEVEL_KERNEL_M)
     difference = nodes.z - np.float32(shift)
     off = float(np.median(np.abs(difference[known])))
     if float(difference[known].std()) > sd + ROUGHER_M:
@@ -171,7 +171,7 @@ def fit_given(
     rest = replace(nodes, z=difference * _believed(difference, left.support, off))
     good = np.isfinite(over).all(1) & (sigma_z > 0)
     pull = robust_centre(over[good, 2] - rest.height(over[good, :2]) - shift)
-    return GivenFit(given, bounds, most_nodes, shift, rest, pull, sd, beyond), off
+    return DemFit(dem, bounds, most_nodes, shift, rest, pull, sd, beyond), off
 
 
 def _believed(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
