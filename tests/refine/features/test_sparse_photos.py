@@ -15,7 +15,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F
 from orthoswarm.refine.flight.record_findings import runs
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse
-from orthoswarm.refine.flight.sparse_block import open_sparse_flight, reduced
+from orthoswarm.refine.flight.sparse_block import open_sparse_flight, in_reduced_pixels
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records, sparse_start
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
@@ -94,7 +94,7 @@ def test_observation_sigmas_end_as_large_as_the_noise():
 
 def test_reduced_pictures_have_the_same_cameras():
     full = solve_sparse(begin(crosshatch(tilt_deg=8.0)))
-    half = reduced(full, 2.0, (400, 300))
+    half = in_reduced_pixels(full, 2.0, (400, 300))
     assert half.cameras.lens[0, F] == pytest.approx(full.cameras.lens[0, F] / 2.0, rel=2e-3)
     assert np.abs(half.cameras.position - full.cameras.position).max() < 0.1
     assert half.cameras.lens[0, [WIDTH, HEIGHT]].tolist() == [400, 300]
