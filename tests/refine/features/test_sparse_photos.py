@@ -15,7 +15,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F
 from orthoswarm.refine.flight.record_findings import runs
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse
-from orthoswarm.refine.flight.sparse_block import open_sparse_flight, in_reduced_pixels
+from orthoswarm.refine.flight.sparse_block import in_reduced_pixels, open_sparse_flight
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records, sparse_start
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
