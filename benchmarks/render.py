@@ -18,7 +18,7 @@ from flight import area, fly
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.renderer import render, serial
 from orthoswarm.raster.picture_file import read_rgb
 
@@ -47,7 +47,7 @@ def measure(folder, frames, workers):
             read_rgb(placed.frame.path)
         decode = cpu() - before
         before = cpu()
-        estimate_gains(frames, stats.thumbnails, terrain)
+        estimate_fields(frames, stats.thumbnails, terrain)
         gains = cpu() - before
     kilobytes = (
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,

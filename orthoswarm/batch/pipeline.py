@@ -29,10 +29,10 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
-from orthoswarm.mosaic.color_balance import estimate_gains
 from orthoswarm.mosaic.extent import drawn_window, from_takeoff, ground_level, map_offset, partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import loose, strays, told
+from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, hint_lone_photos, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
@@ -324,7 +324,7 @@ class _Batch:
             state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
         if self.options.gains:
             with self.clock.stage("final: gains", len(fine)):
-                state.gains = estimate_gains(fine, state.thumbnails, terrain or Terrain.flat())
+                state.gains = estimate_fields(fine, state.thumbnails, terrain or Terrain.flat())
         if self.options.until != "fine":
             self.picture(state, COARSE, fine, terrain)
         elif with_map:

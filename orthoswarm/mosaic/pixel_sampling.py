@@ -68,7 +68,15 @@ def _level(lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, picture, factor, levels, weights):  # type: ignore[no-untyped-def]
+def _scaled(level, field, x, y):  # type: ignore[no-untyped-def]
+    """A level under a factor that varies over the picture, rounded, 0 to 255."""
+    half = np.float32(0.5)
+    factor = field[0] + x * (field[1] + field[3] * x + field[4] * y) + y * (field[2] + field[5] * y)
+    return np.int64(min(max(np.float32(level) * factor + half, np.float32(0.0)), np.float32(255.0)))
+
+
+@kernel
+def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, picture, factor, field, weights):  # type: ignore[no-untyped-def]
     """Colour a tile's pixels of one label from a picture by bicubic interpolation; gives their number.
 
     The projection is lattice.project, its sums over a row taken out of the loop (labels made sure that it is seen).
@@ -85,7 +93,7 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
         gsd: ground pixel, metres.
         picture: uint8 (H, W, 3).
         factor: by which the picture was reduced.
-        levels: uint8 (3, 256), what each level of red, green and blue becomes (gains).
+        field: float32 (3, 6), factors of red, green and blue over the picture, see radiometry.Field.
         weights: WEIGHTS.
     """
     height, width = picture.shape[0], picture.shape[1]
@@ -99,6 +107,10 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
         flat_ground = flat_ground and node == lattice[0, 0]
     focal, k1, k2, k3 = lens[F], lens[K1], lens[K2], lens[K3]
     distorted = k1 != 0.0 or k2 != 0.0 or k3 != 0.0
+    plain = True
+    for channel in range(3):
+        plain = plain and field[channel, 0] == 1.0 and not field[channel, 1:].any()
+    per_px, tall = 2.0 / width, (height - 1.0) / width
     m = rotation
     count = 0
     for r in range(window[0], window[1]):
@@ -132,9 +144,13 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
                 + _row(flat, y3, x0, x1, x2, x3, w0, w1, w2, w3) * wy[3]
                 + _BIAS2
             )
-            rgba[r, c, 0] = levels[0, _level(total)]
-            rgba[r, c, 1] = levels[1, _level(total >> 16)]
-            rgba[r, c, 2] = levels[2, _level(total >> 32)]
+            red, green, blue = _level(total), _level(total >> 16), _level(total >> 32)
+            if not plain:
+                x, y = np.float32(u * per_px - 1.0), np.float32(v * per_px - tall)
+                red = _scaled(red, field[0], x, y)
+                green = _scaled(green, field[1], x, y)
+                blue = _scaled(blue, field[2], x, y)
+            rgba[r, c, 0], rgba[r, c, 1], rgba[r, c, 2] = red, green, blue
             rgba[r, c, 3] = 255
             count += 1
     return count

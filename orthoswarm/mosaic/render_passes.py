@@ -24,7 +24,6 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
 Read = Callable[[Path], Bytes]
 
-_UNCHANGED = np.tile(np.arange(256, dtype=np.uint8), (3, 1))
 THUMBNAIL = (12, 16)
 """Rows and columns of a picture's thumbnail."""
 
@@ -119,14 +118,14 @@ class Shot:
 
     Attributes:
         layer: which of the task's layers. row: of its camera there. index: of its frame.
-        gain: float32 (3,), factor of its colours. factor: how much to reduce it first.
+        field: float32 (3, 6), factors of its colours, see radiometry. factor: how much to reduce it first.
         windows: where it won.
     """
 
     layer: int
     row: int
     index: int
-    gain: NDArray[np.float32]
+    field: NDArray[np.float32]
     factor: int
     windows: list[Window]
 
@@ -176,7 +175,7 @@ class _Ground:
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
     def draw(self, shot: Shot, small: Bytes, factor: int) -> None:
-        lens, levels = self.layer.shots.lens[shot.row], _levels(shot.gain)
+        lens = self.layer.shots.lens[shot.row]
         for w in shot.windows:
             tile = self.store.get(w.key)
             assert tile is not None
@@ -184,7 +183,7 @@ class _Ground:
             window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
             sample(
                 tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row], lens,
-                self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor, levels, WEIGHTS,
+                self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor, shot.field, WEIGHTS,
             )  # fmt: skip
 
 
@@ -214,13 +213,6 @@ def _read(read: Read, path: Path, size: Ints) -> Bytes:
             "do not change pictures while they are mapped"
         )
     return np.ascontiguousarray(picture[..., :3])
-
-
-def _levels(gain: NDArray[np.float32]) -> Bytes:
-    """What each level 0 to 255 becomes under gains (3,): uint8 (3, 256)."""
-    if (gain == 1.0).all():
-        return _UNCHANGED
-    return np.asarray(np.clip(np.rint(gain[:, None] * np.arange(256)), 0, 255), np.uint8)
 
 
 def thumbnail(picture: Bytes) -> Bytes:

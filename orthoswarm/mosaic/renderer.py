@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
@@ -25,6 +25,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.downsampling import reduction
 from orthoswarm.mosaic.footprint import rejections
+from orthoswarm.mosaic.radiometry import Field, uniform
 from orthoswarm.mosaic.render_arrays import Shots, crop
 from orthoswarm.mosaic.render_passes import (
     LabelTask,
@@ -50,6 +51,7 @@ Progress = Callable[[int, int], None]
 
 _FRAMES_PER_TASK = 64
 _STAGING = "staging"
+_UNCHANGED = uniform(np.ones(3))
 _COARSE_CELLS = 1_000_000
 
 
@@ -90,14 +92,14 @@ class Layer:
         frames: placed frames; their order breaks ties of distance.
         terrain: the ground's height, made smooth (bicubic) between its nodes.
         canvas: made with plane "frame"; gets colours, and per pixel the index of its frame in `frames` plus 1.
-        gains: image -> factor of red, green, blue (3,); 1 where absent.
+        gains: image -> factors of its colours (radiometry.Field); 1 where absent.
         bounds: renew only the tiles that touch these (west, south, east, north); all if None.
     """
 
     frames: Sequence[PlacedFrame]
     terrain: Terrain
     canvas: Canvas
-    gains: Mapping[str, ArrayLike] = field(default_factory=dict)
+    gains: Mapping[str, Field] = field(default_factory=dict)
     bounds: BoundingBox | None = None
 
 
@@ -106,7 +108,7 @@ def render(
     terrain: Terrain,
     canvas: Canvas,
     *,
-    gains: Mapping[str, ArrayLike] | None = None,
+    gains: Mapping[str, Field] | None = None,
     bounds: BoundingBox | None = None,
     read: Read = read_rgb,
     run: Run = serial,
@@ -274,10 +276,10 @@ class _Job:
     def shot(self, i: int, number: int, row: int) -> Shot:
         """A frame's share of this layer, whose number it is among those that are drawn."""
         frame = self.frames[i]
-        gain = np.ones(3, np.float32) * np.asarray(self.gains.get(frame.frame.image, 1.0), np.float32)
+        field = self.gains.get(frame.frame.image, _UNCHANGED)
         picture_gsd = float(frame.camera.position[2] - self.ground[i]) / frame.camera.lens.focal_px
         factor = reduction(self.canvas.grid.gsd_m, picture_gsd)
-        return Shot(number, row, i, gain, factor, self.windows[i])
+        return Shot(number, row, i, field, factor, self.windows[i])
 
     def layer_of(self, indices: list[int]) -> TaskLayer:
         """What a task has to know to draw some frames."""

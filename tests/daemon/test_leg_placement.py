@@ -229,8 +229,8 @@ def it_is_drawn_evenly(workspace):
     kept = [load_kept(path) for path in (workspace / "solutions").glob("solution*.pickle")]
     assert len(kept) == 1
     gains = np.array(list(kept[0].gains.values()))
-    assert gains.shape == (28, 3)
-    assert np.abs(gains - 1.0).max() < 0.1
+    assert gains.shape == (28, 3, 6)
+    assert np.abs(gains[..., 0] - 1.0).max() < 0.1
 
 
 def closeness_grows(workspace, ground):

@@ -12,6 +12,7 @@ from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.pixel_sampling import UNIT, cubic_weights
+from orthoswarm.mosaic.radiometry import uniform
 from orthoswarm.mosaic.render_arrays import crop, heights
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.mosaic.visible_ground import coverage
@@ -196,7 +197,7 @@ def test_gains_multiply_the_colours(canvas):
     name = flight.frames[0].frame.image
     render(flight.frames, FLAT, canvas, read=flight.read)
     plain, mine = whole(canvas).astype(float), labels(canvas)
-    render(flight.frames, FLAT, canvas, read=flight.read, gains={name: np.array([0.5, 1.0, 1.2])})
+    render(flight.frames, FLAT, canvas, read=flight.read, gains={name: uniform([0.5, 1.0, 1.2])})
     bright = whole(canvas).astype(float)
     assert np.abs(bright - plain * (0.5, 1.0, 1.2, 1.0))[(mine == 1) & (plain[..., 2] < 200)].max() <= 1.0
     assert (bright == plain)[mine == 2].all()
@@ -217,7 +218,7 @@ def test_bounds_renew_only_the_tiles_they_touch(canvas):
     render(flight.frames, FLAT, canvas, read=flight.read)
     before, old = canvas.version, whole(canvas)
     west, _, _, north = canvas.grid.bounds
-    dark = {f.frame.image: np.full(3, 0.5) for f in flight.frames}
+    dark = {f.frame.image: uniform(np.full(3, 0.5)) for f in flight.frames}
     corner = BoundingBox(west, north - 50, west + 50, north)
     stats = render(flight.frames, FLAT, canvas, read=flight.read, gains=dark, bounds=corner)
     assert canvas.changed_since(before) == [(0, 0)]

@@ -16,7 +16,7 @@ from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rot
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
-from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
@@ -45,7 +45,7 @@ def refine_something() -> None:
         grid = GroundGrid(_EPSG, _EAST - 200.0, _NORTH + 200.0, 0.5, 800, 800)
         with Canvas.create(place / "canvas", grid, plane="frame") as canvas:
             stats = render(second.placed, terrain, canvas)
-            estimate_gains(second.placed, stats.thumbnails, terrain)
+            estimate_fields(second.placed, stats.thumbnails, terrain)
 
 
 def made_up_ground() -> NDArray[np.float32]:

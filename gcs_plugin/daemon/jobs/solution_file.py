@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
-from orthoswarm.mosaic.color_balance import estimate_gains
 from orthoswarm.mosaic.footprint import footprint_boxes
+from orthoswarm.mosaic.radiometry import estimate_fields
 
 Bytes = NDArray[np.uint8]
 Gain = NDArray[np.float32]
@@ -120,5 +120,5 @@ def gains_of(
         for placed in other.solution.placed:
             if placed.frame.image in other.gains and touches(placed, bounds):
                 put(placed, False, other.thumbnails, other.gains)
-    found = estimate_gains(frames, small, terrain, fixed)
+    found = estimate_fields(frames, small, terrain, fixed)
     return {names[name]: gain for name, gain in found.items() if name in names}

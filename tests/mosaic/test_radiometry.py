@@ -1,11 +1,11 @@
-"""Gains: known factors put on pictures are found again, and seams get less visible."""
+"""Radiometry: known factors and fields put on pictures are found again, and seams get less visible."""
 
 import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.color_balance import estimate_gains
+from orthoswarm.mosaic.radiometry import estimate_fields, uniform
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.mosaic.renderer import render
 from tests.kit import mosaic_scene as scene
@@ -26,6 +26,12 @@ def uneven_flight(seed=0):
     return flight, np.array(truth)
 
 
+def middle(fields, flight=None):
+    """Factors (N, 3) in the pictures' centres."""
+    names = fields if flight is None else [f.frame.image for f in flight.frames]
+    return np.array([fields[name][:, 0] for name in names])
+
+
 def thumbnails_of(flight):
     return {name: thumbnail(picture) for name, picture in flight.pictures.items()}
 
@@ -43,7 +49,7 @@ def seam_steps(canvas):
 def test_seams_get_less_visible(tmp_path):
     flight, _ = uneven_flight()
     steps, means = [], []
-    for name, gains in (("raw", None), ("even", estimate_gains(flight.frames, thumbnails_of(flight), FLAT))):
+    for name, gains in (("raw", None), ("even", estimate_fields(flight.frames, thumbnails_of(flight), FLAT))):
         with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame") as canvas:
             render(flight.frames, FLAT, canvas, read=flight.read, gains=gains)
             steps.append(seam_steps(canvas))
@@ -56,8 +62,8 @@ def test_seams_get_less_visible(tmp_path):
 
 def test_known_gains_are_found_up_to_a_common_one():
     flight, truth = uneven_flight(1)
-    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT)
-    found = np.log(np.array([gains[f.frame.image] for f in flight.frames]))
+    gains = estimate_fields(flight.frames, thumbnails_of(flight), FLAT)
+    found = np.log(middle(gains, flight))
     left = found + truth - (found + truth).mean(0)
     assert np.abs(left).mean() < 0.35 * np.abs(truth - truth.mean(0)).mean()
     assert np.abs(left).max() < 0.1
@@ -65,29 +71,45 @@ def test_known_gains_are_found_up_to_a_common_one():
 
 def test_a_vehicle_follows_those_that_are_drawn_already():
     flight, truth = uneven_flight(2)
-    drawn = {
-        f.frame.image: np.exp(-t).astype(np.float32) for f, t in zip(flight.frames, truth) if f.frame.vehicle != "uav2"
-    }
-    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT, held=drawn)
+    drawn = {f.frame.image: uniform(np.exp(-t)) for f, t in zip(flight.frames, truth) if f.frame.vehicle != "uav2"}
+    gains = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, held=drawn)
     assert all(gains[image] is gain for image, gain in drawn.items())
-    found = np.log([gains[f.frame.image] for f in flight.frames])
+    found = np.log(middle(gains, flight))
     late = np.array([f.frame.vehicle == "uav2" for f in flight.frames])
     assert np.abs((found + truth)[late]).mean() < 0.35 * np.abs(truth[late]).mean()  # no common factor is free now
 
 
 def test_even_pictures_are_left_alone():
     flight = scene.survey(2)
-    gains = estimate_gains(flight.frames, thumbnails_of(flight), FLAT)
-    assert np.abs(np.array(list(gains.values())) - 1.0).max() < 0.05
+    gains = estimate_fields(flight.frames, thumbnails_of(flight), FLAT)
+    assert np.abs(middle(gains) - 1.0).max() < 0.05
 
 
-def test_vignetting_is_left_alone():
+def at_corner(field, x=0.7, y=0.5):
+    return field @ np.array([1.0, x, y, x * x, x * y, y * y])
+
+
+def test_vignetting_is_taken_out():
     flight = scene.survey(2, tilt_deg=1.0)
-    y, x = np.indices((120, 160)) - np.array([59.5, 79.5])[:, None, None]
-    fall = 1.0 - 0.35 * (x**2 + y**2) / 100.0**2
+    y, x = (np.indices((120, 160)) - np.array([59.5, 79.5])[:, None, None]) / 80.0
+    fall = 1.0 - 0.3 * (x**2 + y**2)
     small = {name: thumbnail((p * fall[..., None]).astype(np.uint8)) for name, p in flight.pictures.items()}
-    gains = estimate_gains(flight.frames, small, FLAT)
-    assert np.abs(np.array(list(gains.values())) - 1.0).max() < 0.06
+    gains = estimate_fields(flight.frames, small, FLAT)
+    brighter = np.array([at_corner(g) / g[:, 0] for g in gains.values()])
+    wanted = 1.0 / (1.0 - 0.3 * (0.7**2 + 0.5**2))
+    assert brighter.mean() == pytest.approx(wanted, abs=0.5 * (wanted - 1.0))
+
+
+def test_a_picture_that_is_darker_on_one_side_is_evened_out():
+    flight = scene.survey(3, tilt_deg=1.0)
+    x = (np.arange(160) - 79.5) / 80.0
+    small = thumbnails_of(flight)
+    odd = flight.frames[len(flight.frames) // 2].frame.image
+    small[odd] = thumbnail((flight.pictures[odd] * np.exp(0.15 * x)[None, :, None]).astype(np.uint8))
+    gains = estimate_fields(flight.frames, small, FLAT)
+    slopes = {name: float(np.mean(g[:, 1] / g[:, 0])) for name, g in gains.items()}
+    others = np.median([slope for name, slope in slopes.items() if name != odd])
+    assert -0.15 < slopes[odd] - others < -0.03
 
 
 def test_frame_without_thumbnail_gets_its_vehicles_gain():
@@ -95,9 +117,9 @@ def test_frame_without_thumbnail_gets_its_vehicles_gain():
     small = thumbnails_of(flight)
     missing = flight.frames[3].frame.image
     del small[missing]
-    gains = estimate_gains(flight.frames, small, FLAT)
-    own = np.array([gains[f.frame.image] for f in flight.frames if f.frame.vehicle == "uav0"])
-    assert gains[missing] == pytest.approx(own.mean(0), abs=0.06)
+    gains = estimate_fields(flight.frames, small, FLAT)
+    own = np.array([gains[f.frame.image][:, 0] for f in flight.frames if f.frame.vehicle == "uav0"])
+    assert gains[missing][:, 0] == pytest.approx(own.mean(0), abs=0.06)
 
 
 def test_dark_and_burnt_out_pictures_say_nothing():
@@ -105,11 +127,11 @@ def test_dark_and_burnt_out_pictures_say_nothing():
     small = thumbnails_of(flight)
     for k, name in enumerate(small):
         small[name] = np.full((12, 16, 3), 255 if k % 2 else 2, np.uint8)
-    gains = estimate_gains(flight.frames, small, FLAT)
-    assert np.array(list(gains.values())) == pytest.approx(1.0)
+    gains = estimate_fields(flight.frames, small, FLAT)
+    assert middle(gains) == pytest.approx(1.0)
 
 
 def test_nothing_to_compare_gives_no_gains():
     flight = scene.survey(0, count=1)
-    assert estimate_gains(flight.frames, thumbnails_of(flight), FLAT) == {}
-    assert estimate_gains([], {}, FLAT) == {}
+    assert estimate_fields(flight.frames, thumbnails_of(flight), FLAT) == {}
+    assert estimate_fields([], {}, FLAT) == {}

@@ -1,0 +1,199 @@
+"""Where two frames show the same ground, and the ratio of their colours there.
+
+Places are taken at the seams of the orthoimage, a little to either side of them (there one frame sees steeply, the
+other obliquely), and on a grid over consecutive frames of a vehicle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.camera import Camera, Lens
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, footprint_boxes
+from orthoswarm.mosaic.render_arrays import Shots, heights, project
+from orthoswarm.mosaic.seam_labels import label_tile
+from orthoswarm.mosaic.visible_ground import by_tile
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
+
+_TILE = 512
+_CELLS_ACROSS = 64
+_MAX_CELLS = 2_000_000
+_AT_ONCE = 65_536
+_DARK, _BRIGHT = 8.0, 247.0
+"""Means beyond these levels are (partly) clipped and say nothing about a gain."""
+_ASIDE = 0.35
+"""How far beside a seam, towards each frame's nadir, colours are compared as well; a share of the way there."""
+_PER_FRAME = 48
+"""Samples a frame at most, beside those of consecutive frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class OverlapColors:
+    """Colours of the same ground in two frames, M samples.
+
+    Attributes:
+        frame: int32 (M, 2), indices of the frames.
+        ratio: float32 (M, 3), log of the first one's colour over the other's.
+        place: float32 (M, 2, 4), for either frame: where in the picture (x, y from its centre, half its width being 1),
+            and how it is seen (tangents of the view direction, east and north).
+    """
+
+    frame: Ints
+    ratio: NDArray[np.float32]
+    place: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class _Meetings:
+    """Places where two frames show the same ground: frames a and b (M,), ground points (M, 2)."""
+
+    a: Ints
+    b: Ints
+    ground: Array
+
+
+def overlap_colors(
+    cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.intp], small: Bytes, terrain: Terrain
+) -> tuple[OverlapColors, Array]:
+    """Compare the frames' colours where they overlap.
+
+    Args:
+        cameras: N cameras; shots: the same as arrays. vehicle: int (N,). small: uint8 (N, rows, columns, 3) thumbnails.
+        terrain: the ground.
+
+    Returns:
+        The samples, and each frame's share (N,) of the orthoimage in cells.
+    """
+    labels, grid = _coarse_labels(cameras, shots, terrain)
+    seams = _seams(labels, grid)
+    towards = [_towards(seams, side, shots) for side in (seams.a, seams.b)]
+    meetings = [*(_thinned(m, len(cameras)) for m in (seams, *towards)), _consecutive(cameras, shots, vehicle, terrain)]
+    some = _Meetings(*(np.concatenate([getattr(m, name) for m in meetings]) for name in ("a", "b", "ground")))
+    area = np.bincount(labels[labels > 0] - 1, minlength=len(cameras)).astype(float)
+    return _compared(some, shots, small, terrain), area
+
+
+def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> tuple[Ints, GroundGrid]:
+    """The mosaic's labels (index + 1) on cells of a 64th of a picture."""
+    boxes = footprint_boxes(cameras, float(terrain.z.min()), float(terrain.z.max()))
+    boxes = boxes[boxes[:, 0] <= boxes[:, 2]]
+    if len(boxes) == 0:
+        return np.zeros((1, 1), np.int32), GroundGrid(0, 0.0, 0.0, 1.0, 1, 1)
+    side = float(np.median(boxes[:, 2:] - boxes[:, :2]))
+    box = BoundingBox.around(boxes)
+    cell = max(side / _CELLS_ACROSS, float(np.sqrt(box.width * box.height / _MAX_CELLS)), 1e-3)
+    grid = GroundGrid.around(0, box, cell)
+    labels = np.zeros((grid.height, grid.width), np.int32)
+    for (r, c), ids in by_tile(cameras, grid, _TILE, terrain).items():
+        part = np.zeros((min(_TILE, grid.height - r), min(_TILE, grid.width - c)), np.int32)
+        left, top = grid.west + c * cell, grid.north - r * cell
+        lattice = heights(terrain, left, top, cell, _TILE)
+        label_tile(part, shots.take(ids), (ids + 1).astype(np.int32), lattice, left, top, cell)
+        labels[r : r + part.shape[0], c : c + part.shape[1]] = part
+    return labels, grid
+
+
+def _seams(labels: Ints, grid: GroundGrid) -> _Meetings:
+    """Between neighbouring cells of different frames."""
+    parts = []
+    for one, other, shift in (
+        (labels[:, :-1], labels[:, 1:], (0.5, 0.0)),
+        (labels[:-1], labels[1:], (0.0, 0.5)),
+    ):
+        rows, cols = np.nonzero((one != other) & (one > 0) & (other > 0))
+        place = grid.to_ground(np.stack([cols, rows], 1) + np.array(shift))
+        parts.append((one[rows, cols] - 1, other[rows, cols] - 1, place))
+    return _Meetings(*(np.concatenate([p[k] for p in parts]) for k in range(3)))
+
+
+def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.intp], terrain: Terrain) -> _Meetings:
+    """A 3 x 2 grid of points of each frame with the next one of its vehicle and with the one before: alike in both."""
+    u, v = np.meshgrid([0.2, 0.5, 0.8], [0.3, 0.7])
+    share = np.stack([u.ravel(), v.ravel()], 1)
+    by_lens: dict[Lens, Array] = {}
+    for lens in {camera.lens for camera in cameras}:
+        pixels = share * (lens.width - 1.0, lens.height - 1.0)
+        xy = lens.undistort((pixels - lens.principal_point) / lens.focal_px)
+        by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
+    rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
+    height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
+    descent = np.where(rays[..., 2:] < -LEAST_DESCENT, -rays[..., 2:], np.nan)
+    ground = shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
+
+    same = np.nonzero(vehicle[1:] == vehicle[:-1])[0]
+    a, b = np.concatenate([same, same + 1]), np.concatenate([same + 1, same])
+    points = len(share)
+    return _Meetings(
+        np.repeat(a, points).astype(np.int32), np.repeat(b, points).astype(np.int32), ground[a].reshape(-1, 2)
+    )
+
+
+def _towards(seams: _Meetings, frame: Ints, shots: Shots) -> _Meetings:
+    """The same places, moved towards the nadirs of one of the two frames."""
+    nadir = shots.position[frame, :2]
+    return _Meetings(seams.a, seams.b, seams.ground + _ASIDE * (nadir - seams.ground))
+
+
+def _thinned(meetings: _Meetings, frames: int) -> _Meetings:
+    """Every k-th place, so that there are not more than some a frame."""
+    step = max(1, -(-len(meetings.a) // (_PER_FRAME // 3 * frames)))
+    return _Meetings(meetings.a[::step], meetings.b[::step], meetings.ground[::step])
+
+
+def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain) -> OverlapColors:
+    """The samples at places of which both frames tell a colour."""
+    count = len(meetings.a)
+    ratio, usable = np.zeros((count, 3), np.float32), np.zeros(count, bool)
+    seen = np.zeros((count, 2, 4), np.float32)
+    west, north = (float(v) for v in shots.position[:, :2].mean(0))
+    position, rotation = shots.about(west, north)
+    for first in range(0, count, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        ground = np.nan_to_num(meetings.ground[some])
+        place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
+        _compare(
+            meetings.a[some], meetings.b[some], place, position, rotation, shots.lens, shots.size, small,
+            ratio[some], usable[some], seen[some],
+        )  # fmt: skip
+    usable &= np.asarray(np.isfinite(meetings.ground).all(axis=1))
+    return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable])
+
+
+@kernel
+def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable, seen):  # type: ignore[no-untyped-def]
+    rows, columns = small.shape[1], small.shape[2]
+    for m in range(len(a)):
+        clear = 0
+        for side in range(2):
+            k = a[m] if side == 0 else b[m]
+            u, v = project(position[k], rotation[k], lens[k], place[m, 0], place[m, 1], place[m, 2])
+            if u < 0.0 or v < 0.0 or u > size[k, 0] - 1.0 or v > size[k, 1] - 1.0:
+                break
+            x = min(max((u + 0.5) / size[k, 0] * columns - 0.5, 0.0), columns - 1.000001)
+            y = min(max((v + 0.5) / size[k, 1] * rows - 0.5, 0.0), rows - 1.000001)
+            j, i = int(x), int(y)
+            fx, fy = x - j, y - i
+            good = True
+            for channel in range(3):
+                top = small[k, i, j, channel] * (1.0 - fx) + small[k, i, j + 1, channel] * fx
+                low = small[k, i + 1, j, channel] * (1.0 - fx) + small[k, i + 1, j + 1, channel] * fx
+                value = top * (1.0 - fy) + low * fy
+                good = good and value > _DARK and value < _BRIGHT
+                ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
+            half = 0.5 * size[k, 0]
+            seen[m, side, 0] = (u + 0.5) / half - 1.0
+            seen[m, side, 1] = (v + 0.5 - 0.5 * size[k, 1]) / half
+            rise = max(position[k, 2] - place[m, 2], 1e-3)
+            seen[m, side, 2] = (place[m, 0] - position[k, 0]) / rise
+            seen[m, side, 3] = (position[k, 1] - place[m, 1]) / rise
+            clear += good
+        usable[m] = clear == 2

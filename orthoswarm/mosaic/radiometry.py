@@ -1,0 +1,267 @@
+"""Colours of frames evened out, so that neither seams nor facets show: a smooth field of factors for each frame.
+
+Where two frames show the same ground, the logarithm of the ratio of their colours is a measured difference of
+
+    log factor = gain of the vehicle + gain of the frame                       (exposure, white balance)
+               + polynomial of the place in the picture, one a vehicle          (vignetting)
+               + polynomial of the view direction, one a vehicle                (hot spot, haze)
+               + slopes across the picture, one a frame                         (clouds, what is left)
+
+All differences are solved together by robust least squares (Geman-McClure), every unknown held near 0 by a prior, which
+also keeps tones from drifting over a large area. Brightness and hue are solved side by side; hue is held tighter, since
+meadows and shadows differ in it by themselves. The solution of a frame is a quadratic polynomial of the place in the
+picture, which the renderer evaluates at each pixel that it takes.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.lens_arrays import F, U, V
+from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
+from orthoswarm.mosaic.render_arrays import Shots
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+"""Factors of a frame: float32 (3, 6), for red, green and blue the coefficients of 1, x, y, x^2, xy, y^2; x and y are
+the place in the picture from its centre, half the picture's width being 1."""
+
+_SAMPLE_SIGMA = 0.15
+"""Log ratio of two thumbnails at one place: parallax, shadows, moving things (two suburbs, once solved: half within
+0.05, 90 % within 0.19)."""
+_VEHICLE_SIGMA, _FRAME_SIGMA = 0.30, 0.06
+"""Priors of the log gains of vehicles (other exposure) and of frames (automatic exposure within a flight)."""
+_LENS_SIGMAS = (0.05, 0.05, 0.15, 0.05, 0.15)
+"""Priors of x, y, x^2, xy, y^2 of a vehicle's lens; chosen: corners may be darker by a fifth or so."""
+_VIEW_SIGMAS = (0.15, 0.15, 0.10, 0.10, 0.10)
+"""Priors of e, n, e^2, en, n^2 of the view direction's tangents; chosen (two suburbs: 0.14 to 0.22 a tangent found)."""
+_SLOPE_SIGMA = 0.04
+"""Prior of a frame's own slopes; chosen (two suburbs: 0.02 to 0.03 found)."""
+_HUE_SHARE = 0.35
+"""How much less than brightness hue may vary, but for a vehicle's white balance; chosen by looking at four sets."""
+_BRIGHTNESS_HUE = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
+"""Red, green, blue to brightness and two differences of hue, an orthonormal change of axes."""
+_CLIP = float(np.log(1.8))
+"""Greatest log factor: what would need more is another cause (burnt out, cloud shadow)."""
+_ROUNDS, _STEPS, _ENOUGH = 4, 25, 1e-3
+_NODES = 7
+_LENS, _VIEW, _OWN = 6, 11, 3
+"""Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain and two slopes."""
+
+
+def uniform(gain: Sequence[float] | NDArray[np.floating]) -> Field:
+    """The field of a constant factor (3,)."""
+    field = np.zeros((3, 6), np.float32)
+    field[:, 0] = gain
+    return field
+
+
+def estimate_fields(
+    frames: Sequence[PlacedFrame],
+    thumbnails: Mapping[str, Bytes],
+    terrain: Terrain,
+    held: Mapping[str, Field] | None = None,
+) -> dict[str, Field]:
+    """Factors that make neighbouring frames alike.
+
+    The mean logarithm of the mosaic's brightness stays as it was, channel by channel; where some fields are held, the
+    others follow those instead.
+
+    Args:
+        frames: placed frames in order of vehicle and time.
+        thumbnails: image -> uint8 (rows, columns, 3), means of a picture's parts (RenderStats.thumbnails of an earlier
+            rendering); a frame without one gets what its vehicle has in common.
+        terrain: the ground's height.
+        held: image -> field of frames that are drawn already and stay as they are.
+
+    Returns:
+        image -> field for every frame; factors lie within 1/1.8 to 1.8.
+    """
+    held = held or {}
+    known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
+    if len(known) < 2:
+        return {}
+    names = sorted({f.frame.vehicle for f in frames})
+    vehicle = np.array([names.index(f.frame.vehicle) for f in frames], np.int32)
+    shots = Shots.of([f.camera for f in frames], [False] * len(frames))
+    some = np.array(known)
+    small = np.stack([thumbnails[frames[i].frame.image] for i in known])
+    cameras = [frames[i].camera for i in known]
+    colors, area = overlap_colors(cameras, shots.take(some), vehicle[some], small, terrain)
+    fixed = np.array([frames[i].frame.image in held for i in known], bool)
+    if fixed.any():
+        colors = _with_held(colors, [held.get(frames[i].frame.image) for i in known])
+    of_vehicle, of_known = _solve(colors, vehicle[some], len(names), fixed)
+    of_frame = np.zeros((len(frames), _OWN, 3))
+    of_frame[some] = of_known
+    x, y = _nodes(shots.size)
+    log = _log_factors(of_vehicle[vehicle], of_frame, x, y, shots, terrain)
+    if not fixed.any() and area.sum() > 0:
+        middle = log[some].mean(1)
+        log -= (area[:, None] * middle).sum(0) / area.sum()
+    fields = _as_polynomials(np.exp(np.clip(log, -_CLIP, _CLIP)), x, y)
+    return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
+
+
+def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapColors:
+    """The samples with the factors of held frames in their ratios."""
+    ratio = colors.ratio.copy()
+    coefficients = np.stack([uniform(np.ones(3)) if field is None else field for field in held])
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        x, y = colors.place[:, side, 0], colors.place[:, side, 1]
+        basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+        factor = np.einsum("mk,mck->mc", basis, coefficients[colors.frame[:, side]])
+        ratio += sign * np.log(np.maximum(factor, 0.1))
+    return OverlapColors(colors.frame, ratio.astype(np.float32), colors.place)
+
+
+def _solve(
+    colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Unknowns of vehicles (V, 11, 3) and of frames (N, 3, 3), by conjugate gradients within reweighting rounds."""
+    prior_v = np.array([_VEHICLE_SIGMA, *_LENS_SIGMAS, *_VIEW_SIGMAS]) ** -2.0
+    prior_f = np.array([_FRAME_SIGMA, _SLOPE_SIGMA, _SLOPE_SIGMA]) ** -2.0
+    prior = np.concatenate([np.tile(prior_v, vehicles), np.tile(prior_f, len(vehicle))])[:, None] * np.ones(3)
+    of_hue = np.ones(len(prior), bool)
+    of_hue[: vehicles * _VIEW : _VIEW] = False
+    prior[of_hue, 1:] /= _HUE_SHARE**2
+    measured = colors.ratio @ _BRIGHTNESS_HUE.T
+    x = np.zeros((len(prior), 3))
+    free = (~fixed).astype(np.float64)
+    sample = (colors.frame, colors.place, vehicle, free, vehicles)
+
+    def differences(values: Array) -> Array:
+        out = np.empty((len(colors.frame), 3))
+        _forward(*sample, values, out)
+        return out
+
+    def gathered(weighted: Array) -> Array:
+        out = np.zeros_like(x)
+        _backward(*sample, weighted, out)
+        return out
+
+    for _ in range(_ROUNDS):
+        residual = differences(x) + measured
+        error2 = np.square(residual).mean(1) / _SAMPLE_SIGMA**2
+        weight = ((1.0 + error2 / 9.0) ** -2 / _SAMPLE_SIGMA**2)[:, None]
+        diagonal = np.zeros(len(prior))
+        _diagonal(*sample, weight[:, 0], diagonal)
+        scale = 1.0 / (diagonal[:, None] + prior)
+        # the step from x: (A' W A + P) d = -(A' W r + P x)
+        left = -(gathered(weight * residual) + prior * x)
+        step, z = np.zeros_like(x), scale * left
+        towards, product = z.copy(), (left * z).sum(0)
+        enough = _ENOUGH**2 * product
+        for _ in range(_STEPS):
+            image = gathered(weight * differences(towards)) + prior * towards
+            curve = (towards * image).sum(0)
+            alpha = product / np.where(curve > 0.0, curve, 1.0)
+            step += alpha * towards
+            left -= alpha * image
+            z = scale * left
+            last, product = product, (left * z).sum(0)
+            if (product <= enough).all():
+                break
+            towards = z + product / np.where(last > 0.0, last, 1.0) * towards
+        x += step
+    x = x @ _BRIGHTNESS_HUE
+    return x[: vehicles * _VIEW].reshape(vehicles, _VIEW, 3), x[vehicles * _VIEW :].reshape(-1, _OWN, 3)
+
+
+@kernel
+def _bases(place, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
+    """Factors of a side's unknowns: (11,) of the vehicle, (3,) of the frame."""
+    x, y, e, n = place[0], place[1], place[2], place[3]
+    of_vehicle[0], of_vehicle[1], of_vehicle[2] = 1.0, x, y
+    of_vehicle[3], of_vehicle[4], of_vehicle[5] = x * x, x * y, y * y
+    of_vehicle[6], of_vehicle[7], of_vehicle[8], of_vehicle[9], of_vehicle[10] = e, n, e * e, e * n, n * n
+    of_frame[0], of_frame[1], of_frame[2] = 1.0, x, y
+
+
+@kernel
+def _forward(frame, place, vehicle, free, vehicles, values, out):  # type: ignore[no-untyped-def]
+    """Difference of the log factors of the two sides of each sample (M, 3)."""
+    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    out[:] = 0.0
+    for m in range(len(frame)):
+        for side in range(2):
+            k = frame[m, side]
+            sign = (1.0 - 2.0 * side) * free[k]
+            if sign == 0.0:
+                continue
+            _bases(place[m, side], of_vehicle, of_frame)
+            for channel in range(3):
+                total = 0.0
+                for q in range(11):
+                    total += of_vehicle[q] * values[11 * vehicle[k] + q, channel]
+                for q in range(3):
+                    total += of_frame[q] * values[11 * vehicles + 3 * k + q, channel]
+                out[m, channel] += sign * total
+
+
+@kernel
+def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ignore[no-untyped-def]
+    """The transpose of `_forward`: samples' values gathered in the unknowns (added to out)."""
+    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    for m in range(len(frame)):
+        for side in range(2):
+            k = frame[m, side]
+            sign = (1.0 - 2.0 * side) * free[k]
+            if sign == 0.0:
+                continue
+            _bases(place[m, side], of_vehicle, of_frame)
+            for channel in range(3):
+                value = sign * weighted[m, channel]
+                for q in range(11):
+                    out[11 * vehicle[k] + q, channel] += of_vehicle[q] * value
+                for q in range(3):
+                    out[11 * vehicles + 3 * k + q, channel] += of_frame[q] * value
+
+
+@kernel
+def _diagonal(frame, place, vehicle, free, vehicles, weight, out):  # type: ignore[no-untyped-def]
+    """The diagonal of the normal matrix, each side of a sample by itself (added to out)."""
+    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    for m in range(len(frame)):
+        for side in range(2):
+            k = frame[m, side]
+            if free[k] == 0.0:
+                continue
+            _bases(place[m, side], of_vehicle, of_frame)
+            for q in range(11):
+                out[11 * vehicle[k] + q] += weight[m] * of_vehicle[q] * of_vehicle[q]
+            for q in range(3):
+                out[11 * vehicles + 3 * k + q] += weight[m] * of_frame[q] * of_frame[q]
+
+
+def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
+    """Places in the pictures (N, 49) at which fields are fitted."""
+    across = np.linspace(-1.0, 1.0, _NODES)
+    x = np.tile(across, _NODES)
+    y = np.repeat(across, _NODES)[None, :] * (size[:, 1] / size[:, 0])[:, None]
+    return np.broadcast_to(x, y.shape), y
+
+
+def _log_factors(of_vehicle: Array, of_frame: Array, x: Array, y: Array, shots: Shots, terrain: Terrain) -> Array:
+    """Log factors (N, nodes, 3) of frames with their vehicles' unknowns (N, 11, 3) and their own (N, 3, 3)."""
+    half = 0.5 * shots.size[:, :1]
+    u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5
+    rays = np.stack([(u - shots.lens[:, [U]]) / shots.lens[:, [F]], (v - shots.lens[:, [V]]) / shots.lens[:, [F]]], -1)
+    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) @ shots.rotation.transpose(0, 2, 1)
+    down = np.maximum(-rays[..., 2:], 0.2 * np.linalg.norm(rays, axis=-1, keepdims=True))
+    e, n = np.moveaxis(rays[..., :2] / down, -1, 0)
+    one = np.ones_like(y)
+    common = np.stack([one, x, y, x * x, x * y, y * y, e, n, e * e, e * n, n * n], -1)
+    own = np.stack([one, x, y], -1)
+    return np.asarray(common @ of_vehicle + own @ of_frame)
+
+
+def _as_polynomials(factor: Array, x: Array, y: Array) -> Field:
+    """Coefficients (N, 3, 6) of the polynomials nearest to factors (N, nodes, 3) at places (N, nodes)."""
+    basis = np.stack([np.ones_like(y), x, y, x * x, x * y, y * y], -1)
+    normal = np.swapaxes(basis, 1, 2) @ basis
+    right = np.swapaxes(basis, 1, 2) @ factor
+    return np.ascontiguousarray(np.swapaxes(np.linalg.solve(normal, right), 1, 2), np.float32)
