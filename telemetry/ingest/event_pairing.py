@@ -1,8 +1,7 @@
-"""Photos and camera events brought together, although their clocks differ and some of either are missing.
+"""Photos paired with camera events, although their clocks differ and some of either are missing.
 
-By time: the offset of the clocks is the one under which most photos fall on events (their uneven rhythm at turns and
-pauses fits one offset only); then each photo takes its event in order. Without times: by the numbers in file names and
-events, else by order alone. Missing first, dropped and extra pictures are found that way and reported.
+By time: both are matched as sequences (`sequence_match`). Without times: by the numbers in file names and events, else
+by order alone. Missing first, dropped and extra pictures are found that way and reported.
 """
 
 from collections.abc import Sequence
@@ -11,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from telemetry.ingest.sequence_match import match_sequences
+
 Array = NDArray[np.float64]
 
-_BIN_S = 0.5
-_TOLERANCE_S = 1.25
-_CANDIDATES = 24
-_MOST_DIFFERENCES = 4_000_000
+CERTAIN = 0.999
+"""Probability from which on a pairing counts as decided."""
 
 
 @dataclass(slots=True)
@@ -25,12 +24,14 @@ class Pairing:
 
     Attributes:
         pairs: (photo, event) indices, both increasing.
+        doubtful: photos whose pairing the times do not decide, with the events that each may belong to.
         offset_s: photo clock minus event clock, None where times were not used.
-        residual_s: median distance of paired times after the offset.
-        ambiguous: True where another offset fits as well. how: "time", "number" or "order".
+        residual_s: median distance of paired times after offset and drift.
+        ambiguous: True where less than half of the pairs are decided. how: "time", "number" or "order".
     """
 
     pairs: list[tuple[int, int]] = field(default_factory=list)
+    doubtful: dict[int, list[int]] = field(default_factory=dict)
     offset_s: float | None = None
     residual_s: float = 0.0
     ambiguous: bool = False
@@ -43,7 +44,7 @@ def pair(
     photo_numbers: Sequence[int | None] = (),
     event_numbers: Sequence[int | None] = (),
 ) -> Pairing:
-    """Bring photos and events together; both are in order of time (or of name).
+    """Pair photos with events; both are in order of time (or of name).
 
     Args:
         photo_times: by the camera's clock, None where unknown.
@@ -62,6 +63,7 @@ def pair(
             found = by_time(photos, events)
             if len(found.pairs) >= 0.5 * min(len(photos), len(events)):
                 found.pairs = [(timed[i], dated[j]) for i, j in found.pairs]
+                found.doubtful = {timed[i]: [dated[j] for j in at] for i, at in found.doubtful.items()}
                 return found
     numbered = _by_number(photo_numbers, event_numbers)
     if numbered is not None:
@@ -70,67 +72,27 @@ def pair(
     return Pairing([(i, i) for i in range(count)], how="order", ambiguous=len(photo_times) != len(event_times))
 
 
-def by_time(photos: Array, events: Array, tolerance_s: float = _TOLERANCE_S) -> Pairing:
-    """Pair two rows of times whose clocks differ by an unknown offset."""
+def by_time(photos: Array, events: Array) -> Pairing:
+    """Pair two rows of times whose clocks differ by an unknown offset and drift."""
     order_p, order_e = np.argsort(photos, kind="stable"), np.argsort(events, kind="stable")
-    p, e = photos[order_p], events[order_e]
-    tried: list[tuple[int, float, float, list[tuple[int, int]]]] = []
-    for offset in _offsets(p, e):
-        for _ in range(3):
-            pairs = _in_order(p - offset, e, tolerance_s)
-            if not pairs:
-                break
-            better = float(np.median([p[i] - e[j] for i, j in pairs]))
-            if abs(better - offset) < 1e-6:
-                break
-            offset = better
-        if pairs:
-            residual = float(np.median([abs(p[i] - offset - e[j]) for i, j in pairs]))
-            tried.append((len(pairs), residual, offset, pairs))
-    if not tried:
+    found = match_sequences(photos[order_p], events[order_e])
+    if found is None:
         return Pairing()
-    tried.sort(key=lambda row: (-row[0], round(row[1], 2), abs(row[2])))
-    count, residual, offset, pairs = tried[0]
-    rivals = [row for row in tried[1:] if abs(row[2] - offset) > 2.0 * tolerance_s]
-    ambiguous = bool(rivals) and rivals[0][0] == count and rivals[0][1] < residual + 0.1
-    matched = [(int(order_p[i]), int(order_e[j])) for i, j in pairs]
-    return Pairing(sorted(matched), offset, residual, ambiguous)
-
-
-def _offsets(p: Array, e: Array) -> list[float]:
-    """Likely offsets: where differences of all pairs gather."""
-    step = max(1, int(np.sqrt(len(p) * len(e) / _MOST_DIFFERENCES)))
-    difference = np.sort((p[:, None] - e[None, ::step]).ravel())
-    # Count differences within one bin after each, without a histogram over what may be years.
-    count = np.searchsorted(difference, difference + 2.0 * _BIN_S, side="right") - np.arange(len(difference))
-    found: list[float] = []
-    for at in np.argsort(-count, kind="stable"):
-        middle = float(np.median(difference[at : at + count[at]]))
-        if all(abs(middle - other) > _BIN_S for other in found):
-            found.append(middle)
-            if len(found) == _CANDIDATES:
-                break
-    return found
-
-
-def _in_order(p: Array, e: Array, tolerance_s: float) -> list[tuple[int, int]]:
-    """Pairs within the tolerance, each used once, in order; the nearer of two neighbours wins."""
-    pairs: list[tuple[int, int]] = []
-    i = j = 0
-    while i < len(p) and j < len(e):
-        apart = abs(p[i] - e[j])
-        if i + 1 < len(p) and abs(p[i + 1] - e[j]) < apart and p[i] < e[j]:
-            i += 1
-        elif j + 1 < len(e) and abs(p[i] - e[j + 1]) < apart and e[j] < p[i]:
-            j += 1
-        elif apart <= tolerance_s:
-            pairs.append((i, j))
-            i, j = i + 1, j + 1
-        elif p[i] < e[j]:
-            i += 1
-        else:
-            j += 1
-    return pairs
+    pairs = found.pairs()
+    certain = sum(probability >= CERTAIN for _, _, probability in pairs)
+    result = Pairing(offset_s=found.offset_s, ambiguous=certain < 0.5 * len(pairs))
+    for i, j, probability in pairs:
+        photo, event = int(order_p[i]), int(order_e[j])
+        result.pairs.append((photo, event))
+        if probability < CERTAIN or result.ambiguous:
+            result.doubtful[photo] = [int(order_e[k]) for k in found.alternatives(i)]
+    if pairs:
+        own, theirs = photos[order_p][[i for i, _, _ in pairs]], events[order_e][[j for _, j, _ in pairs]]
+        middle = 0.5 * (float(events.min()) + float(events.max()))
+        apart = own + 0.5 * found.resolution_s - theirs - found.offset_s - found.drift * (theirs - middle)
+        result.residual_s = float(np.median(np.abs(apart)))
+    result.pairs.sort()
+    return result
 
 
 def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pairing | None:

@@ -168,7 +168,12 @@ def _use_events(
         photo = photos[i]
         if photo.lat_deg is not None and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > _FAR_M:
             far += 1
-        fill(photo, replace(pose, time_s=event.time_s), f"{event.kind} ({log.path.name})", gimbal=log.has_gimbal)
+        origin = f"{event.kind} ({log.path.name})"
+        if i in pairing.doubtful:
+            spread = max((_apart_m(pose, log.events[k].sample) for k in pairing.doubtful[i]), default=0.0)
+            pose = replace(pose, sigma_m=max(spread, pose.sigma_m or 0.0) or None)
+            origin += ", one of several that its time allows"
+        fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
     if far > 0.2 * len(pairing.pairs):
         text = f"{plural(far, 'photo')} lie more than {_FAR_M:.0f} m from their camera events; the log may be another's"
@@ -195,6 +200,12 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     if pairing.ambiguous:
         text = f"photos fit the camera events of {log.path.name} in more than one way; check the map for a shift"
         found.append(Finding("pairing-ambiguous", text))
+    elif pairing.doubtful:
+        text = (
+            f"{plural(len(pairing.doubtful), 'photo')} may belong to neighbouring camera events of {log.path.name} "
+            "(their times do not tell); their positions count as that uncertain"
+        )
+        found.append(Finding("pairing-doubtful", text))
     if not log.has_gimbal:
         text = f"{log.path.name} reports no gimbal: the camera is taken as fixed under the airframe"
         found.append(Finding("fixed-camera", text, note=True))

@@ -1,0 +1,417 @@
+"""Two recordings of one sequence of exposures, matched by their times.
+
+A camera and an autopilot record the same exposures, each by its own clock and each losing some. Both are matched as
+sequences (a pair hidden Markov model with the states match, photo without event, event without photo; Durbin et al.,
+"Biological Sequence Analysis", chapter 4) under the clock offsets and drifts that their correlation proposes. The
+forward-backward algorithm, summed over all clocks, gives the probability of every pairing: what the times do not decide
+comes out as undecided, not as the nearest event.
+
+Exposures are taken as a Poisson process of the usual interval, so a match of residual u weighs f(u) times the interval,
+where f is a uniform density as wide as the camera's clock resolution (one second for EXIF without sub-seconds)
+convolved with a Gaussian of the trigger's jitter. Exposures that are missing at an end weigh less than those missing in
+between: logs begin before the first photo.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MOST_DRIFT = 1.2e-3
+"""Seconds a second: quartz clocks of cameras stay below 1e-4, a tenfold margin for poor ones."""
+_SAME_EXPOSURE_S = 0.12
+_MISSING_AT_END = 0.5
+_NEGLIGIBLE = 16.0
+"""Natural logarithm of the odds beyond which a hypothesis is left out."""
+_LEAST_PROBABILITY = 0.02
+_CLOCK_DOUBT = 1e-3
+"""Probability of other clocks (by more than half an interval) above which each photo's is not believed."""
+_CANDIDATES = 24
+_FIRST_JITTER_S = 0.08
+_JITTERS_S = (0.02, 0.04, 0.08, 0.16)
+_MOST_BINS = 1 << 19
+_MOST_DRIFTS = 81
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceMatch:
+    """Probabilities of pairings.
+
+    Attributes:
+        events: (K,) index of each single event; repetitions are left out.
+        first: (N,) position in `events` that column 0 of a photo's row stands for.
+        probability: (N, B) of each photo and event.
+        offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
+        resolution_s: of the photo's clock. jitter_s: of the trigger, one sigma.
+    """
+
+    events: Indices
+    first: Indices
+    probability: Array
+    offset_s: float
+    drift: float
+    resolution_s: float
+    jitter_s: float
+
+    def pairs(self) -> list[tuple[int, int, float]]:
+        """The alignment with the most expected matches: photo, event (both increasing) and probability.
+
+        A heaviest increasing subsequence, with a Fenwick tree of prefix maxima over the events.
+        """
+        tree: list[tuple[float, int]] = [(0.0, -1)] * (len(self.events) + 2)
+        nodes: list[tuple[int, int, float, int]] = []  # photo, event, probability, node before
+        for i, row in enumerate(self.probability):
+            reached = []
+            for column in np.flatnonzero(row > _LEAST_PROBABILITY).tolist():
+                event = int(self.first[i]) + column
+                value, before = _prefix_maximum(tree, event)
+                nodes.append((i, event, float(row[column]), before))
+                reached.append((event, value + float(row[column]), len(nodes) - 1))
+            for event, value, node in reached:
+                _raise_to(tree, event + 1, (value, node))
+        pairs = []
+        node = _prefix_maximum(tree, len(self.events))[1]
+        while node >= 0:
+            i, event, probability, node = nodes[node]
+            pairs.append((i, int(self.events[event]), probability))
+        return pairs[::-1]
+
+    def alternatives(self, photo: int) -> list[int]:
+        """Events that a photo may belong to."""
+        columns = np.flatnonzero(self.probability[photo] > _LEAST_PROBABILITY)
+        return [int(self.events[self.first[photo] + column]) for column in columns]
+
+
+def _prefix_maximum(tree: list[tuple[float, int]], end: int) -> tuple[float, int]:
+    best = (0.0, -1)
+    while end > 0:
+        best = max(best, tree[end])
+        end -= end & -end
+    return best
+
+
+def _raise_to(tree: list[tuple[float, int]], at: int, entry: tuple[float, int]) -> None:
+    while at < len(tree):
+        tree[at] = max(tree[at], entry)
+        at += at & -at
+
+
+def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
+    """Match two increasing rows of times; None where nothing can be said.
+
+    Args:
+        photos: (N,) by the camera's clock, whole seconds or finer, equal ones in order of exposure.
+        events: (M,) by the vehicle's clock; one exposure recorded twice within 0.12 s counts once.
+    """
+    if len(photos) < 2 or len(events) < 2:
+        return None
+    single = _single_events(events)
+    if len(single) < 2:
+        return None
+    middle = 0.5 * float(events[single[0]] + events[single[-1]])
+    e = events[single] - middle
+    resolution = _resolution(photos)
+    p = photos - photos[0] + 0.5 * resolution
+    problem = _Problem(p, e, resolution, float(np.median(np.diff(e))))
+    problem, candidates = _plausible(problem)
+    if not candidates:
+        return None
+    first, probability, offset, drift, clock_doubt = _probabilities(problem, candidates)
+    inside = np.clip(first, 0, len(single))
+    shifted = np.zeros_like(probability)
+    for i, (lo, at) in enumerate(zip(first.tolist(), inside.tolist(), strict=True)):
+        keep = max(0, min(probability.shape[1] - (at - lo), len(single) - at))
+        shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
+    if clock_doubt < _CLOCK_DOUBT:
+        shifted = _without_coincidences(problem, inside, shifted, offset, drift)
+    offset += float(photos[0]) - middle
+    return SequenceMatch(single, inside, shifted, offset, drift, resolution, problem.jitter_s)
+
+
+def _without_coincidences(
+    problem: "_Problem", first: Indices, probability: Array, offset: float, drift: float
+) -> Array:
+    """Probabilities given that exposures do not come closer to each other than the camera can take them.
+
+    The Poisson process allows a photo without event and an event without photo at one moment. Where every exposure that
+    the photo's time allows lies closer to its likeliest event than the least interval, the two are the same exposure,
+    and only events compete.
+    """
+    least = float(np.quantile(np.diff(problem.e), 0.02))
+    rows = np.arange(len(problem.p))
+    best = np.argmax(probability, axis=1)
+    expected = offset + (1.0 + drift) * problem.e[np.clip(first + best, 0, len(problem.e) - 1)]
+    farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s
+    total = probability.sum(axis=1)
+    alone = (farthest < least) & (probability[rows, best] > 0.5)
+    return np.where(alone[:, None], probability / np.maximum(total, 1e-300)[:, None], probability)
+
+
+def _single_events(events: Array) -> Indices:
+    """Indices of events without repetitions."""
+    steps = np.diff(events)
+    usual = float(np.median(steps[steps > 0.01])) if (steps > 0.01).any() else 1.0
+    return np.flatnonzero(np.concatenate([[True], steps > min(_SAME_EXPOSURE_S, 0.35 * usual)]))
+
+
+def _resolution(times: Array) -> float:
+    """Of a clock, in seconds: the coarsest step that all times are multiples of; 0 for finer than 0.05 s."""
+    for step in (1.0, 0.5, 0.1, 0.05):
+        if np.abs(times / step - np.round(times / step)).max() < 1e-3:
+            return step
+    return 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Times of photos and events, each from an origin of its own, and the model's parameters.
+
+    Attributes:
+        p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
+        resolution_s: width of a photo's interval. interval_s: usual time between exposures.
+        jitter_s: one sigma. missing: odds of one exposure missing from one of the recordings.
+    """
+
+    p: Array
+    e: Array
+    resolution_s: float
+    interval_s: float
+    jitter_s: float = _FIRST_JITTER_S
+    missing: float = 0.1
+
+    def weights(self, i: int, first: int, width: int, offset: Array, drift: Array) -> Array:
+        """(H, width) weight of photo i being the event `first` and those after it."""
+        at = np.arange(first, first + width)
+        inside = (at >= 0) & (at < len(self.e))
+        e = self.e[np.clip(at, 0, len(self.e) - 1)]
+        u = self.p[i] - offset[:, None] - (1.0 + drift[:, None]) * e
+        q, sigma = self.resolution_s, self.jitter_s
+        if q >= 0.05:
+            density = (ndtr((u + 0.5 * q) / sigma) - ndtr((u - 0.5 * q) / sigma)) / q
+        else:
+            density = np.exp(-0.5 * (u / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
+        return np.asarray(np.where(inside, self.interval_s * density, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Clocks about one of them: offsets (H,) in seconds and drifts (H,); half widths bound the band of events."""
+
+    offset: Array
+    drift: Array
+    centre: tuple[float, float]
+    reach_s: float
+
+    def band(self, problem: _Problem) -> tuple[Indices, int]:
+        """First event of each photo's band, and the width of all bands."""
+        expected = self.centre[0] + (1.0 + self.centre[1]) * problem.e
+        reach = self.reach_s + 0.5 * problem.resolution_s + 4.5 * problem.jitter_s
+        first = np.searchsorted(expected, problem.p - reach)
+        last = np.searchsorted(expected, problem.p + reach)
+        return first, max(1, int((last - first).max()))
+
+
+def _grid(problem: _Problem, offset: float, drift: float, reach_s: float, drift_reach_s: float) -> _Grid:
+    """A grid as fine as the jitter: offsets within reach_s, drifts that move the ends by up to drift_reach_s."""
+    step = 0.8 * max(problem.jitter_s, 0.04 * problem.resolution_s)
+    half = max(0.5 * float(np.ptp(problem.e)), 1e-3)
+    offsets = offset + step * np.arange(-np.ceil(reach_s / step), np.ceil(reach_s / step) + 1)
+    count = np.ceil(drift_reach_s / (2.0 * step))
+    drifts = drift + 2.0 * step / half * np.arange(-count, count + 1)
+    drifts = np.unique(np.clip(drifts, -MOST_DRIFT, MOST_DRIFT))
+    both = np.meshgrid(offsets, drifts, indexing="ij")
+    return _Grid(both[0].ravel(), both[1].ravel(), (offset, drift), reach_s + drift_reach_s + 2.0 * step)
+
+
+def _correlation_peaks(problem: _Problem) -> Iterator[tuple[float, float]]:
+    """Offsets and drifts under which most photos fall on events, the best first."""
+    p, e = problem.p, problem.e
+    span = float(np.ptp(p) + np.ptp(e)) * (1.0 + MOST_DRIFT) + 4.0
+    bin_s = max(0.25 if problem.resolution_s >= 0.5 else 0.1, span / _MOST_BINS)
+    size = 1 << int(np.ceil(np.log2(span / bin_s + 16)))
+    half = max(0.5 * float(np.ptp(e)), 1e-3)
+    count = min(int(np.ceil(MOST_DRIFT * half / bin_s)), _MOST_DRIFTS // 2)
+    drifts = np.linspace(-MOST_DRIFT, MOST_DRIFT, 2 * count + 1) if count else np.zeros(1)
+    photos = np.fft.rfft(_train(p - p[0], bin_s, size, problem.resolution_s))
+    best, drift_at = np.full(size, -np.inf), np.zeros(size)
+    for drift in drifts:
+        own = (1.0 + drift) * (e - e[0])
+        together = np.fft.irfft(np.conj(np.fft.rfft(_train(own, bin_s, size, 0.0))) * photos, size)
+        # The lag is between the first event and the first photo; offsets count from the middle of the events.
+        better = together > best
+        best[better], drift_at[better] = together[better], drift
+    apart = max(1, round(_reach_s(problem) / bin_s))
+    for _ in range(_CANDIDATES):
+        lag = int(np.argmax(best))
+        if not np.isfinite(best[lag]) or best[lag] < 0.25:
+            return
+        signed = lag if lag < size // 2 else lag - size
+        drift = float(drift_at[lag])
+        yield float(p[0]) + signed * bin_s - (1.0 + drift) * float(e[0]), drift
+        best[np.arange(lag - apart, lag + apart + 1) % size] = -np.inf
+
+
+def _reach_s(problem: _Problem) -> float:
+    """How far around a peak of the correlation clocks are tried."""
+    return 0.8 if problem.resolution_s >= 0.5 else 0.25
+
+
+def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
+    """(size,) a unit for each time, spread over its clock's resolution and between the two bins next to it."""
+    spread = np.arange(-0.5 * width_s, 0.5 * width_s + 1e-9, bin_s) if width_s > bin_s else np.zeros(1)
+    places = ((times[:, None] + spread[None, :]) / bin_s).ravel()
+    low = np.floor(places).astype(np.int64)
+    share = places - low
+    train = np.zeros(size)
+    np.add.at(train, low % size, (1.0 - share) / len(spread))
+    np.add.at(train, (low + 1) % size, share / len(spread))
+    return train
+
+
+def _plausible(problem: _Problem) -> tuple[_Problem, list[tuple[float, float]]]:
+    """The model's parameters by the best clock, and the clocks that are not out of the question."""
+    tried: list[tuple[float, float, float]] = []
+    bin_s = 0.25 if problem.resolution_s >= 0.5 else 0.1
+    for offset, drift in _correlation_peaks(problem):
+        grid = _grid(problem, offset, drift, _reach_s(problem), bin_s)
+        evidence = _forward(problem, grid).evidence
+        at = int(np.argmax(evidence))
+        tried.append((float(evidence[at]), float(grid.offset[at]), float(grid.drift[at])))
+    tried.sort(reverse=True)
+    if not tried or not np.isfinite(tried[0][0]):
+        return problem, []
+    problem = _fitted(problem, tried[0][1], tried[0][2])
+    # The first parameters were guesses: leave out only what they make impossible.
+    return problem, [(o, d) for value, o, d in tried if value > tried[0][0] - 3.0 * _NEGLIGIBLE]
+
+
+def _fitted(problem: _Problem, offset: float, drift: float) -> _Problem:
+    """Jitter and share of missing exposures with the most evidence."""
+    best: tuple[float, _Problem] | None = None
+    for jitter in _JITTERS_S:
+        trial = replace(problem, jitter_s=jitter)
+        for missing in (0.01, 0.03, 0.1, 0.35):
+            trial = replace(trial, missing=missing)
+            grid = _grid(trial, offset, drift, 2.0 * _FIRST_JITTER_S, 2.0 * _FIRST_JITTER_S)
+            evidence = float(_forward(trial, grid).evidence.max())
+            evidence -= _normalisation(trial)
+            if best is None or evidence > best[0]:
+                best = evidence, trial
+    assert best is not None
+    return best[1]
+
+
+def _normalisation(problem: _Problem) -> float:
+    """Of the model's weights, so that evidence under different shares of missing exposures can be compared."""
+    return (len(problem.p) + len(problem.e)) * float(np.log1p(problem.missing))
+
+
+@dataclass(slots=True)
+class _Forward:
+    """Sums over all alignments that end with a match.
+
+    Attributes:
+        evidence: (H,) logarithm of the sum over all alignments.
+        rows: (N, H, B) each divided by the exponential of scales (N, H); empty unless asked for.
+    """
+
+    evidence: Array
+    rows: Array
+    scales: Array
+
+
+def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bool = False) -> _Forward:
+    """The forward algorithm over the photos, or from the last one back.
+
+    With m the weight of a match, s that of a missing exposure and t that of one missing at an end,
+
+        F[i, j] = m[i, j] (t^(i + j) + G[i - 1, j - 1]),    G[i, j] = sum over i' <= i, j' <= j of F s^(i - i' + j - j')
+    """
+    first, width = grid.band(problem)
+    count, total, clocks = len(problem.p), len(problem.e), len(grid.offset)
+    s, log_t = problem.missing, float(np.log(_MISSING_AT_END))
+    columns = np.arange(width + 1)
+    decay = np.tril(s ** np.maximum(columns[1:, None] - columns[None, 1:], 0).astype(np.float64)).T
+    sums, scale = np.zeros((clocks, width + 1)), np.zeros(clocks)
+    evidence = np.full(clocks, -np.inf)
+    rows = np.zeros((count, clocks, width)) if keep else np.zeros((0, 0, 0))
+    scales = np.zeros((count, clocks)) if keep else np.zeros((0, 0))
+    before: int | None = None
+    for step in range(count):
+        i = count - 1 - step if backward else step
+        weight = problem.weights(i, int(first[i]), width, grid.offset, grid.drift)
+        lo = int(first[i])
+        if backward:
+            weight, lo = weight[:, ::-1], total - lo - width
+        if before is not None and lo != before:
+            at = columns + (lo - before)
+            sums = sums[:, np.minimum(at, width)] * s ** np.maximum(at - width, 0)
+        before = lo
+        leads = np.exp(np.clip(log_t * (step + np.maximum(lo + columns[:-1], 0)) - scale[:, None], -700.0, 700.0))
+        found = weight * (leads + sums[:, :-1])
+        sums = s * sums
+        sums[:, 1:] += found @ decay
+        after = log_t * (count - 1 - step + np.maximum(total - 1 - lo - columns[:-1], 0))
+        top = after.max()
+        with np.errstate(divide="ignore"):
+            evidence = np.logaddexp(evidence, np.log(found @ np.exp(after - top)) + top + scale)
+        if keep:
+            rows[i], scales[i] = (found[:, ::-1] if backward else found), scale
+        largest = np.maximum(sums.max(axis=1), leads[:, 0])
+        sums /= largest[:, None]
+        scale += np.log(largest)
+    return _Forward(evidence, rows, scales)
+
+
+def _probabilities(
+    problem: _Problem, candidates: list[tuple[float, float]]
+) -> tuple[Indices, Array, float, float, float]:
+    """First event and probabilities of each photo's band; the most likely offset and drift, and their doubt."""
+    scored = []
+    for offset, drift in candidates:
+        grid = _grid(problem, offset, drift, 2.0 * _FIRST_JITTER_S + 0.3 * _reach_s(problem), 0.16)
+        scored.append((grid, _forward(problem, grid).evidence))
+    most = max(float(evidence.max()) for _, evidence in scored)
+    total = np.logaddexp.reduce(np.concatenate([evidence for _, evidence in scored]))
+    parts: list[tuple[Indices, Array]] = []
+    for grid, evidence in scored:
+        chosen = np.flatnonzero(evidence > most - _NEGLIGIBLE)
+        if len(chosen):
+            some = replace(grid, offset=grid.offset[chosen], drift=grid.drift[chosen])
+            parts.append((some.band(problem)[0], _posterior(problem, some, float(total))))
+    best, values = max(scored, key=lambda row: float(row[1].max()))
+    at = int(np.argmax(values))
+    first = np.min([lo for lo, _ in parts], axis=0)
+    width = max(int((lo + part.shape[1] - first).max()) for lo, part in parts)
+    joined = np.zeros((len(problem.p), width))
+    for lo, part in parts:
+        for i, shift in enumerate((lo - first).tolist()):
+            joined[i, shift : shift + part.shape[1]] += part[i]
+    offset, drift, doubt = float(best.offset[at]), float(best.drift[at]), 0.0
+    half = 0.5 * float(np.ptp(problem.e))
+    for grid, evidence in scored:
+        moved = np.abs(grid.offset - offset) + half * np.abs(grid.drift - drift)
+        doubt += float(np.exp(evidence - total)[moved > 0.6 * problem.interval_s].sum())
+    return first, joined, offset, drift, doubt
+
+
+def _posterior(problem: _Problem, grid: _Grid, total: float) -> Array:
+    """(N, B) probability of each photo and event, summed over the clocks of a grid."""
+    first, width = grid.band(problem)
+    result = np.zeros((len(problem.p), width))
+    most = max(1, 4_000_000 // max(1, len(problem.p) * width))
+    for start in range(0, len(grid.offset), most):
+        part = replace(grid, offset=grid.offset[start : start + most], drift=grid.drift[start : start + most])
+        ahead, back = _forward(problem, part, keep=True), _forward(problem, part, backward=True, keep=True)
+        for i in range(len(problem.p)):
+            weight = problem.weights(i, int(first[i]), width, part.offset, part.drift)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                both = np.log(ahead.rows[i]) + np.log(back.rows[i]) - np.log(weight)
+                both += (ahead.scales[i] + back.scales[i] - total)[:, None]
+                result[i] += np.where(weight > 0.0, np.exp(np.minimum(both, 0.0)), 0.0).sum(axis=0)
+    return result
