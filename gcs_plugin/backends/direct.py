@@ -124,7 +124,7 @@ class DirectBackend(Backend):
         jobs: list[Exchange] = []
         for system in systems or list(fleet.vehicles):
             vehicle = fleet.vehicles.get(system)
-            idle = vehicle is not None and not vehicle.lost and not fleet.busy(system) and not vehicle.twins
+            idle = vehicle is not None and not vehicle.lost and not fleet.busy(system) and not vehicle.claimants
             if vehicle is not None and idle and vehicle.mission_total and not vehicle.detector.knows:
                 jobs.append(fleet.download(system))
         fleet.run_until(lambda: all(job.outcome is not None for job in jobs), 20.0)

@@ -30,7 +30,7 @@ from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_fra
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
-from gcs_plugin.daemon.vehicles import Flock, completion_rows, note_completion
+from gcs_plugin.daemon.vehicles import VehicleLinks, completion_rows, note_completion
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.model.errors import InputError
@@ -103,11 +103,11 @@ class Daemon:
         self.legwatch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
         self.plans = Plans(folder / "plans")
-        self.flock: Flock | None = None
+        self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
         if settings.links:
-            self.flock = Flock(settings, self.journal, self.events, self.jobs)
-            self.takeoffs = Takeoffs(self.flock, self.plans, self._say)
+            self.links = VehicleLinks(settings, self.journal, self.events, self.jobs)
+            self.takeoffs = Takeoffs(self.links, self.plans, self._say)
         self.sources = [
             Source(
                 v.id,
@@ -132,8 +132,8 @@ class Daemon:
         threading.Thread(target=self.crew.warm_up, daemon=True).start()
         self._watch_what_came_before()
         self.legwatch.start()
-        if self.flock is not None:
-            self.flock.start()
+        if self.links is not None:
+            self.links.start()
         for source in self.sources:
             source.start()
 
@@ -144,8 +144,8 @@ class Daemon:
         self.legwatch.close()
         if self.takeoffs is not None:
             self.takeoffs.close()
-        if self.flock is not None:
-            self.flock.close()
+        if self.links is not None:
+            self.links.close()
         self.crew.close()
         self.background.close()
         self.jobs.close()
@@ -222,7 +222,7 @@ class Daemon:
 
     def vehicles(self) -> list[dict[str, Any]]:
         """All vehicles that were heard or sent pictures, as JSON values."""
-        linked = {} if self.flock is None else {row["id"]: row for row in self.flock.rows()}
+        linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
         for vehicle, takeoff in ({} if self.takeoffs is None else self.takeoffs.rows()).items():
             linked.setdefault(vehicle, {"id": vehicle})["takeoff"] = takeoff
         return views.vehicle_rows(self.journal, self.settings.vehicles, self.sources, linked)
@@ -236,7 +236,7 @@ class Daemon:
         return completion_rows(self.journal)
 
     def _pose_at(self, vehicle: str, time_s: float) -> Sample | None:
-        return None if self.flock is None else self.flock.pose_at(vehicle, time_s)
+        return None if self.links is None else self.links.pose_at(vehicle, time_s)
 
     def _link_log(self, vehicle: str, out: Path) -> bool:
         """Write what a vehicle has said on the links, in this run or before, into a log of its own."""
@@ -344,8 +344,8 @@ class Daemon:
             "layer": job.detail["layer"], "version_before": job.detail["version_before"],
             "version": job.detail["version"], "frames": job.detail["frames"],
         }  # fmt: skip
-        if self.flock is not None:
-            facts["still_flying_after"] = [r["id"] for r in self.flock.rows() if r["mission"]["phase"] == "active"]
+        if self.links is not None:
+            facts["still_flying_after"] = [r["id"] for r in self.links.rows() if r["mission"]["phase"] == "active"]
         self.journal.write(note_completion(job.vehicle, job.sortie, facts))
         self.events.publish("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
 

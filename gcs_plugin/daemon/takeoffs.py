@@ -1,23 +1,23 @@
 """The takeoffs of a plan: one command starts all its vehicles, each at the plan's time, which keeps them apart.
 
 A plan's vehicles share airspace: they stay apart by heights and by the times of their takeoffs (`start_s`). Nobody is
-started unless all are heard and hold their missions of this plan; one that then refuses leaves the others where the
-plan has them. What waits is forgotten when the daemon ends: a start is a command, and is not repeated by itself.
+started unless all have passed their preflight check; one that then refuses holds those that still wait on the ground.
+What waits is forgotten when the daemon ends: a start is a command, and is not repeated by itself.
 """
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gcs_plugin.daemon.vehicles import Flock
+from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.fleet.commands import Order
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-_AT_ONCE: Final = 16
+_LOOK_S: Final = 0.05
 _log = logging.getLogger(__name__)
 
 
@@ -31,29 +31,66 @@ class Takeoffs:
     """Starts the vehicles of one plan at a time.
 
     Args:
-        flock: the vehicles. plans: of the workspace. say: told what went wrong. clock: monotonic seconds.
+        links: the vehicles. plans: of the workspace. say: told what went wrong. clock: monotonic seconds.
     """
 
     def __init__(
-        self, flock: Flock, plans: Plans, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+        self, links: VehicleLinks, plans: Plans, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._flock, self._plans, self._say, self._clock = flock, plans, say, clock
+        self._links, self._plans, self._say, self._clock = links, plans, say, clock
         self._condition = threading.Condition()
         self._waiting: dict[str, _Takeoff] = {}
         self._failed: dict[str, str] = {}
         self._checking = self._closed = False
+        links.cancel_takeoff = self.cancel
 
-    def begin(self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None) -> dict[str, float]:
+    def preflight(
+        self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None, **limits: float | None
+    ) -> list[dict[str, Any]]:
+        """Check a plan's vehicles before their start.
+
+        Args:
+            plan, sortie, names: as for `begin`.
+            limits: `endurance_s`, `legal_height_m`, as for `VehicleLinks.preflight`.
+
+        Returns:
+            A row a vehicle, as `VehicleLinks.preflight` gives them.
+
+        Raises:
+            InputError: there is no such plan or flight.
+            OrthoSwarmError: vehicles are not heard.
+        """
+        starts = self._plans.starts(plan, sortie)
+        whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
+        missions = {}
+        for vehicle, name in whose.items():
+            known = self._links.fleet.vehicles[self._links.system_of(name)]
+            mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
+            missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
+        times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
+        return self._links.preflight(list(whose.values()), missions, starts=times, **limits)
+
+    def begin(
+        self,
+        plan: str,
+        sortie: int = 1,
+        names: Mapping[str, str] | None = None,
+        override: Mapping[str, Collection[str]] | None = None,
+    ) -> dict[str, float]:
         """Start a plan's vehicles; gives vehicle -> seconds from now.
+
+        All are checked before the first takes off. One that cannot start at its time holds those that still wait on
+        the ground, and that is said.
 
         Args:
             plan: its id. sortie: which flight of each vehicle, from 1.
             names: the plan's vehicle -> the daemon's, where they differ.
+            override: names of red preflight items that do not stop the start, by the daemon's vehicle.
 
         Raises:
             InputError: there is no such plan or flight.
-            OrthoSwarmError: vehicles are not heard, or do not hold their mission, or takeoffs are under way; nobody
-                was started.
+            OrthoSwarmError: vehicles are not heard, a preflight item is red, or takeoffs are under way; nobody was
+                started.
         """
         starts = self._plans.starts(plan, sortie)
         with self._condition:
@@ -62,7 +99,7 @@ class Takeoffs:
             self._checking = True
         try:
             whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
-            systems = self._ready(plan, sortie, whose)
+            systems = self._ready(plan, sortie, names, override or {})
             first, now = min(starts.values()), self._clock()
             with self._condition:
                 self._failed.clear()
@@ -94,31 +131,29 @@ class Takeoffs:
             self._waiting.clear()
             self._condition.notify_all()
 
-    def _ready(self, plan: str, sortie: int, whose: Mapping[str, str]) -> dict[str, int]:
-        """The plan's vehicles' system ids, once all hold their missions."""
+    def _ready(
+        self,
+        plan: str,
+        sortie: int,
+        names: Mapping[str, str] | None,
+        override: Mapping[str, Collection[str]],
+    ) -> dict[str, int]:
+        """The plan's vehicles' system ids, once all have passed their check."""
         try:
-            systems = {vehicle: self._flock.system_of(name) for vehicle, name in whose.items()}
+            rows = self.preflight(plan, sortie, names)
+        except InputError:
+            raise
         except OrthoSwarmError as error:
             raise OrthoSwarmError(f"{error}; nobody was started") from None
-
-        def check(vehicle: str) -> str | None:
-            system = systems[vehicle]
-            known = self._flock.fleet.vehicles[system]
-            if known.lost:
-                return f"{whose[vehicle]} is silent"
-            name = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
-            try:
-                mission = self._plans.mission({"plan": plan, "mission": name}, vehicle, known.autopilot)
-                found = self._flock.unlike(system, mission)
-            except OrthoSwarmError as error:
-                return str(error)
-            return None if found is None else f"{whose[vehicle]} does not hold its mission of this plan ({found})"
-
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            wrong = [text for text in pool.map(check, whose) if text is not None]
+        wrong = []
+        for row in rows:
+            allowed = override.get(row["vehicle"], ())
+            red = [i for i in row["items"] if i["state"] == "red" and i["name"] not in allowed]
+            wrong += [f"{row['vehicle']}: {item['name']}: {item['reason']}" for item in red]
         if wrong:
-            raise OrthoSwarmError(f"{'; '.join(wrong)}; nobody was started, upload the plan first")
-        return systems
+            raise OrthoSwarmError(f"{'; '.join(wrong)}; nobody was started")
+        back = {name: vehicle for vehicle, name in (names or {}).items()}
+        return {back.get(row["vehicle"], row["vehicle"]): self._links.system_of(row["vehicle"]) for row in rows}
 
     def _run(self) -> None:
         """Start each at its time; ends with the last."""
@@ -135,17 +170,28 @@ class Takeoffs:
             threading.Thread(target=self._start, args=(vehicle, takeoff.system), daemon=True).start()
 
     def _start(self, vehicle: str, system: int) -> None:
+        """Start one; where that fails, those that still wait stay on the ground."""
+        order = Order("start", system, self._clock())
         try:
-            self._flock.command(lambda fleet: fleet.start(system))
-        except OrthoSwarmError as error:
-            if self._closed:
-                return
-            with self._condition:
-                self._failed[vehicle] = str(error)
-            self._say(f"{vehicle} did not take off: {error}")
+            self._links.fleet.call(lambda: self._links.fleet.order(order))
+            while order.outcome is None and not self._closed:
+                time.sleep(_LOOK_S)
         except Exception as error:  # the links are being closed
             if not self._closed:
                 _log.error("starting %s", vehicle, exc_info=error)
+            return
+        outcome = order.outcome
+        if outcome is None or outcome.ok or self._closed:
+            return
+        with self._condition:
+            self._failed[vehicle] = outcome.text
+            held = sorted(self._waiting)
+            for name in held:
+                self._failed[name] = f"held on the ground, because {vehicle} did not take off"
+            self._waiting.clear()
+            self._condition.notify_all()
+        also = f"; {', '.join(held)} stay on the ground" if held else ""
+        self._say(f"{vehicle} did not take off: {outcome.text}{also}")
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

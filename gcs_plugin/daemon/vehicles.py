@@ -2,14 +2,29 @@
 
 A fleet is polled by one thread. What must not be forgotten (a new sortie, a completion with the refinement that it
 asks for, the completion detector's state) goes to the journal in one transaction before anything is done about it.
+
+What the HTTP API and the page build on, all in JSON values:
+
+- `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
+  `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
+  links at once.
+- `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (`link`, `gps`, `ekf`,
+  `home`, `pre-arm`, `battery`, `mission`, `height`, `separation`), `state` (`ok`, `warning`, `red`) and `reason`. A
+  red item stops `start` unless it is overridden by its name.
+- `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
+  `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
+  `items`.
+- `clock()` is the monotonic clock by which commands expire: a page that learns it from the event stream can say when
+  its command was given, so that one that was held up on the way is not executed late.
 """
 
+import contextlib
 import json
 import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +32,9 @@ from gcs_plugin.daemon.jobs.job_queue import Jobs, new_job
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
-from orthoswarm.model.errors import OrthoSwarmError
+from gcs_plugin.fleet.commands import CommandResult
+from gcs_plugin.mission.exchange import Verdict
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
@@ -30,6 +47,9 @@ if TYPE_CHECKING:
     from telemetry.live.live_poses import LivePoses
 
 _WATCH_S: Final = 0.5
+_SOON_S: Final = 5.0
+_READ_S: Final = 20.0
+_OUTCOME_S: Final = 60.0
 _TRAIL: Final = 600
 _REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
@@ -45,11 +65,12 @@ class _Kept:
     lost_since: float | None = None
 
 
-class Flock:
+class VehicleLinks:
     """The daemon's fleet.
 
     Attributes:
         fleet: its vehicles and links.
+        cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
     """
 
     def __init__(self, settings: Settings, journal: Journal, events: Events, jobs: Jobs) -> None:
@@ -59,12 +80,14 @@ class Flock:
             InputError: a link cannot be opened.
         """
         from gcs_plugin.fleet.fleet import Fleet
+        from gcs_plugin.links.signing import find_key
 
         self._settings, self._journal, self._events, self._jobs = settings, journal, events, jobs
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._kept: dict[int, _Kept] = {}
         self._stop = threading.Event()
-        self.fleet: Fleet = Fleet(settings.links, tlog=settings.workspace / "telemetry.tlog")
+        self.cancel_takeoff: Callable[[str], float | None] = lambda _: None
+        self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._threads = [
@@ -119,6 +142,163 @@ class Flock:
                 sample = kept.poses.at(time_s)
                 return sample if sample.has_position else None
         return None
+
+    @staticmethod
+    def clock() -> float:
+        """Monotonic seconds, by which commands expire."""
+        return time.monotonic()
+
+    def flight_state(self, vehicle: str) -> dict[str, Any]:
+        """What a vehicle is doing: `state`, `text`, `item`, `items`.
+
+        Raises:
+            OrthoSwarmError: it was not heard on any link.
+        """
+        from gcs_plugin.fleet.flight_state import flight_state
+
+        known = self.fleet.vehicles[self.system_of(vehicle)]
+        return self.fleet.call(lambda: flight_state(known).document()).result(_SOON_S)
+
+    def commands(
+        self,
+        verb: str,
+        vehicles: Collection[str] | None = None,
+        *,
+        given_s: float | None = None,
+        command_id: str | None = None,
+        override: Mapping[str, Collection[str]] | None = None,
+    ) -> list[dict[str, Any]]:
+        """Give a command to vehicles, to all at once, and wait for the outcome of each.
+
+        Args:
+            verb: `start`, `pause`, `resume`, `rtl` or `land`.
+            vehicles: their ids; None for all on the links.
+            given_s: when it was given (`clock`); now unless said. It is not sent later than 5 s after that.
+            command_id: id of the command; a new one unless said.
+            override: names of red preflight items that do not stop a start, by vehicle.
+
+        Returns:
+            A row a vehicle, see the top of this module.
+
+        Raises:
+            InputError: there is no such command.
+        """
+        from gcs_plugin.fleet.commands import VERBS, Order, new_id
+
+        if verb not in VERBS:
+            raise InputError(f"there is no command '{verb}'; choose {', '.join(VERBS)}")
+        given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
+        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        rows, systems = self._without_command(verb, names, number, override or {})
+        orders = {name: Order(verb, system, given, number) for name, system in systems.items()}
+        for order in orders.values():
+            self.fleet.call(lambda o=order: self.fleet.order(o))  # type: ignore[misc]
+        end = time.monotonic() + _OUTCOME_S
+        while any(order.outcome is None for order in orders.values()) and not self._stop.is_set():
+            if time.monotonic() > end:
+                break
+            time.sleep(0.02)
+        for name, order in orders.items():
+            result = order.result(name)
+            if result is None:
+                reason = f"{name} has not answered; watch whether it obeys"
+                result = CommandResult(number, name, verb, Verdict.UNKNOWN, reason)
+            rows[name] = result.document()
+        return [rows[name] for name in names]
+
+    def _without_command(
+        self, verb: str, names: Collection[str], number: str, override: Mapping[str, Collection[str]]
+    ) -> tuple[dict[str, dict[str, Any]], dict[str, int]]:
+        """The rows of vehicles to which nothing needs to be sent, and the system ids of the others."""
+        from gcs_plugin.fleet.commands import URGENT
+
+        rows: dict[str, dict[str, Any]] = {}
+        systems: dict[str, int] = {}
+
+        def end(name: str, outcome: Verdict, reason: str) -> None:
+            rows[name] = CommandResult(number, name, verb, outcome, reason).document()
+
+        for name in names:
+            try:
+                systems[name] = self.system_of(name)
+            except OrthoSwarmError as error:
+                end(name, Verdict.NOT_SENT, str(error))
+                continue
+            waited = self.cancel_takeoff(name) if verb in URGENT else None
+            if waited is not None and not self.fleet.vehicles[systems[name]].armed:
+                end(name, Verdict.DONE, f"{name} stays on the ground: its takeoff in {waited:.0f} s is cancelled")
+                del systems[name]
+        if verb == "start":
+            for row in self.preflight(list(systems)):
+                red = [
+                    i for i in row["items"] if i["state"] == "red" and i["name"] not in override.get(row["vehicle"], ())
+                ]
+                if red:
+                    reason = "; ".join(f"{item['name']}: {item['reason']}" for item in red)
+                    end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not started: {reason}")
+                    del systems[row["vehicle"]]
+        return rows, systems
+
+    def preflight(
+        self,
+        vehicles: Collection[str] | None = None,
+        missions: "Mapping[str, Mission] | None" = None,
+        *,
+        starts: Mapping[str, float] | None = None,
+        endurance_s: float | None = None,
+        legal_height_m: float | None = None,
+    ) -> list[dict[str, Any]]:
+        """Check vehicles before their start; their missions are read from them first.
+
+        Args:
+            vehicles: their ids; None for all on the links.
+            missions: the plan's mission of each, by vehicle; without it whatever a vehicle holds is flown.
+            starts: takeoff of each in seconds after the first; all at once unless said.
+            endurance_s: flight time of a full battery. legal_height_m: height that may be flown without asking.
+
+        Returns:
+            A row a vehicle, see the top of this module.
+
+        Raises:
+            OrthoSwarmError: a vehicle was not heard on any link.
+        """
+        from gcs_plugin.fleet.preflight import ENDURANCE_S, LEGAL_HEIGHT_M, preflight_all
+
+        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        systems = {self.system_of(name): name for name in names}
+        stored = self._read_missions(systems)
+        wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
+        times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
+        checks = self.fleet.call(
+            lambda: preflight_all(
+                {s: self.fleet.vehicles[s] for s in systems},
+                wanted,
+                stored,
+                times,
+                time.monotonic(),
+                endurance_s=endurance_s or ENDURANCE_S,
+                legal_height_m=legal_height_m or LEGAL_HEIGHT_M,
+            )
+        ).result(_READ_S)
+        return [check.document(systems[check.system]) for check in checks]
+
+    def _read_missions(self, systems: Collection[int]) -> "dict[int, Mission]":
+        """What vehicles hold now, of those that hand it out in time."""
+        from gcs_plugin.mission.items import Mission
+
+        reads: dict[int, MissionDownload] = {}
+
+        def begin(system: int) -> None:
+            with contextlib.suppress(OrthoSwarmError):  # lost, or busy: the check says so
+                reads[system] = self.fleet.download(system)
+
+        for begun in [self.fleet.call(lambda s=system: begin(s)) for system in systems]:  # type: ignore[misc]
+            begun.result(_SOON_S)
+        end = time.monotonic() + _READ_S
+        while any(read.outcome is None for read in reads.values()) and time.monotonic() < end:
+            time.sleep(0.02)
+        kinds = {s: self.fleet.vehicles[s].autopilot for s in reads}
+        return {s: Mission(kinds[s], tuple(read.items)) for s, read in reads.items() if read.items is not None}
 
     def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
         """Have a dialogue with a vehicle, to its end; gives what was said at the end.

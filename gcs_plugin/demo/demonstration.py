@@ -179,11 +179,11 @@ class Served:
 
 def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
-    flock = daemon.flock
-    assert flock is not None
-    _wait(lambda: sum(row["lat_deg"] is not None for row in flock.rows()) == setting.vehicles, 60.0, "the vehicles")
+    links = daemon.links
+    assert links is not None
+    _wait(lambda: sum(row["lat_deg"] is not None for row in links.rows()) == setting.vehicles, 60.0, "the vehicles")
     tell("planning", 0, 1)
-    starts = [[row["lat_deg"], row["lon_deg"]] for row in flock.rows()]
+    starts = [[row["lat_deg"], row["lon_deg"]] for row in links.rows()]
     body = {
         "area": setting.area(), "vehicles": setting.vehicles, "altitude_m": HEIGHT_M, "fov_min_deg": FOV_MIN_DEG,
         "speed_m_s": 12.0, "forward_overlap": 0.85, "side_overlap": 0.6, "method": "columns", "starts": starts,
@@ -194,13 +194,13 @@ def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
     began = time.monotonic()
     for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
-        system = flock.system_of(vehicle)
-        mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, flock.fleet.vehicles[system].autopilot)
-        flock.command(lambda fleet, s=system, m=mission: fleet.upload(s, m))  # type: ignore[misc]
+        system = links.system_of(vehicle)
+        mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, links.fleet.vehicles[system].autopilot)
+        links.command(lambda fleet, s=system, m=mission: fleet.upload(s, m))  # type: ignore[misc]
         # apart as planned, and never at the same moment, so that one completes while others fly
         due = began + max(delays[vehicle], 6.0 * (number - 1)) / setting.speed
         time.sleep(max(0.0, due - time.monotonic()))
-        flock.command(lambda fleet, s=system: fleet.start(s))  # type: ignore[misc]
+        links.command(lambda fleet, s=system: fleet.start(s))  # type: ignore[misc]
         tell("starting", number, setting.vehicles)
     photos = sum(vehicle["photos"] for vehicle in plan["vehicles"])
 

@@ -299,20 +299,41 @@ def _guarded(follower: Follower) -> bool:
         return True
 
 
-def wait_for_place(fleet: "Fleet", vehicles: int, seconds: float) -> tuple[float, float]:
+def wait_for_place(
+    fleet: "Fleet", vehicles: int, seconds: float, stop: threading.Event, say: Callable[[str], None]
+) -> tuple[float, float] | None:
     """Poll a fleet until so many vehicles know where they are; gives where the one with the lowest id stands.
 
     Stock ArduCopter says latitude 0, longitude 0 until its receiver and filter have a position, which takes up to half
     a minute after its start; PX4 says nothing.
 
+    Args:
+        fleet: the vehicles. vehicles: how many. seconds: longest wait.
+        stop: set by whoever wants to end it; then None is returned.
+        say: called with what is waited for, when that changes.
+
     Raises:
         InputError: they do not come in time.
     """
+    said = ""
 
     def placed() -> list["Vehicle"]:
         return [v for v in fleet.vehicles.values() if v.lat_deg and v.lon_deg and v.gps_fix >= 3]
 
-    if not fleet.run_until(lambda: len(placed()) >= vehicles, seconds):
+    def done() -> bool:
+        nonlocal said
+        if stop.is_set() or len(placed()) >= vehicles:
+            return True
+        text = _missing(fleet, vehicles, len(placed()))
+        if text != said:
+            said = text
+            say(f"waiting: {text}")
+        return False
+
+    found = fleet.run_until(done, seconds)
+    if stop.is_set():
+        return None
+    if not found:
         heard = len(fleet.vehicles)
         raise InputError(
             f"{len(placed())} of {vehicles} vehicles know their position after {seconds:.0f} s ({heard} heard); "
@@ -320,3 +341,12 @@ def wait_for_place(fleet: "Fleet", vehicles: int, seconds: float) -> tuple[float
         )
     first = min(placed(), key=lambda v: v.system)
     return float(first.lat_deg or 0.0), float(first.lon_deg or 0.0)
+
+
+def _missing(fleet: "Fleet", vehicles: int, placed: int) -> str:
+    """What the vehicles still lack, in words."""
+    heard = sorted(fleet.vehicles.items())
+    if len(heard) < vehicles:
+        return f"{len(heard)} of {vehicles} vehicles heard"
+    lacking = [f"v{s} has {'no position yet' if v.gps_fix >= 3 else 'no GPS fix'}" for s, v in heard if not v.lat_deg]
+    return "; ".join(lacking) or f"{placed} of {vehicles} vehicles have a position"

@@ -1,6 +1,6 @@
 """The vehicles on the links: finding, losing, routing by system id, streams, dialogues, the completion of missions.
 
-One thread polls it (`poll`, or `run` until it is told to stop); other threads hand in work with `call`. Nothing that a
+One thread polls it (`poll`, or `run` until `stop` is set); other threads hand in work with `call`. Nothing that a
 vehicle could act on is sent unless somebody asked for it: the fleet by itself sends its heartbeat, which announces a
 ground station, and asks for streams.
 """
@@ -12,17 +12,20 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams, default_rates
-from gcs_plugin.fleet.vehicle_state import Route, Vehicle
+from gcs_plugin.fleet.routes import Route
+from gcs_plugin.fleet.telemetry_check import has_place, possible
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link, Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
 from gcs_plugin.mission.control import CheckMission, InOrder
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import GROUND_STATION, NEVER, Address, Exchange
+from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, NEVER, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.upload import MissionUpload
@@ -35,13 +38,21 @@ Handler = Callable[[Vehicle, Message, float], None]
 _LOST_S: Final = 5.0
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
+_SURE_S: Final = 2.5  # older news of a vehicle are not believed against a command that ends its flight
 _IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 _HEARTBEAT, _ACK, _TEXT = _IDS["HEARTBEAT"], _IDS["COMMAND_ACK"], _IDS["STATUSTEXT"]
 _DETECTED: Final = frozenset(_IDS[name] for name in RELEVANT)
 _REQUESTS: Final = frozenset({_IDS["MISSION_REQUEST"], _IDS["MISSION_REQUEST_INT"]})
 _BOOT_CLOCKS: Final = frozenset({_IDS["GLOBAL_POSITION_INT"], _IDS["SYSTEM_TIME"]})
-# What a late packet of these says has been said better since.
+# What a late packet of these says is out of date.
 _STATES: Final = frozenset({_HEARTBEAT, _IDS["MISSION_CURRENT"], _IDS["EXTENDED_SYS_STATE"]})
+# State that comes again by itself: on a second link it may be late, so it is taken from the one in use.
+_REPEATED: Final = frozenset({
+    *_STATES, _IDS["GLOBAL_POSITION_INT"], _IDS["ATTITUDE"], _IDS["SYS_STATUS"], _IDS["GPS_RAW_INT"],
+    _IDS["EKF_STATUS_REPORT"], _IDS["ESTIMATOR_STATUS"],
+})  # fmt: skip
+_POSITION: Final = _IDS["GLOBAL_POSITION_INT"]
+_SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64
 _PHOTOS: Final = frozenset({_IDS["CAMERA_FEEDBACK"], _IDS["CAMERA_IMAGE_CAPTURED"]})
 
@@ -90,6 +101,7 @@ class Fleet:
         self._handlers: dict[int, list[Handler]] = {}
         self._taps: list[Callable[[Packet, float], None]] = []
         self._counters: dict[tuple[Peer, int, int], int] = {}
+        self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._jobs: list[Exchange] = []
         self._remembered = dict(remembered or {})
         self._tick_at = 0.0
@@ -128,9 +140,29 @@ class Fleet:
     def begin(self, dialogue: Dialogue) -> Dialogue:
         """Start a dialogue; its outcome is set some time later while the fleet is polled."""
         self._jobs.append(dialogue)
-        self._send(dialogue.vehicle.system, dialogue.start(self._clock()))
+        self._drive(dialogue, dialogue.start(self._clock()))
         self._reap()
         return dialogue
+
+    def order(self, order: Order) -> Order:
+        """Give a command to a vehicle; its outcome is set some time later while the fleet is polled.
+
+        A command is sent only while it is fresh (COMMAND_S after it was given). Pause, RTL and land are never held
+        back for doubts about identity or link: with several claimants of one system id they go to all of them, and
+        to a lost vehicle on every way on which it was heard.
+        """
+        now = self._clock()
+        if now > order.expires_s:
+            text = f"vehicle {order.system}: '{order.verb}' was given {now - order.given_s:.0f} s ago and was not sent"
+            return order.end(f"{text}; give it again", Verdict.NOT_SENT)
+        try:
+            exchange = self._dialogue(order.verb, order.system)
+        except OrthoSwarmError as error:
+            silent = order.system not in self.vehicles or self.vehicles[order.system].lost
+            return order.end(str(error), Verdict.NOT_SENT if silent else Verdict.REFUSED)
+        exchange.expires = order.expires_s
+        order.exchange = self.begin(exchange)
+        return order
 
     def vehicle(self, system: int) -> Vehicle:
         """A vehicle that can be commanded.
@@ -138,12 +170,10 @@ class Fleet:
         Raises:
             OrthoSwarmError: it was never heard, is lost, or shares its system id with another.
         """
-        vehicle = self.vehicles.get(system)
-        if vehicle is None:
-            known = ", ".join(str(number) for number in sorted(self.vehicles)) or "none"
-            raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
-        if vehicle.twins:
-            raise OrthoSwarmError(f"two vehicles use system id {system}; give one of them another id")
+        vehicle = self._known(system)
+        if vehicle.claimants:
+            who = ", ".join(vehicle.claimants)
+            raise OrthoSwarmError(f"several vehicles use system id {system} ({who}); give each an id of its own")
         if vehicle.lost:
             raise OrthoSwarmError(f"vehicle {system} is lost; wait until it is heard again")
         return vehicle
@@ -172,24 +202,23 @@ class Fleet:
 
     def start(self, system: int) -> Exchange:
         """Let a vehicle fly its mission from the beginning: check, mode, arm, MISSION_START."""
-        vehicle = self._free(system)
-        if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
-            raise OrthoSwarmError(f"vehicle {system} is flying its mission already")
-        check = vehicle.mission is None or not vehicle.detector.knows
-        return self.begin(vehicle.pilot.start(in_air=vehicle.in_air and vehicle.armed, check=check))
+        return self._now("start", system)
 
     def pause(self, system: int) -> Exchange:
         """Let a vehicle stay where it is."""
-        return self.begin(self._urgent(system).pilot.pause())
+        return self._now("pause", system)
 
     def resume(self, system: int) -> Exchange:
         """Let a vehicle go on with its mission."""
-        vehicle = self._urgent(system)
-        return self.begin(vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission))
+        return self._now("resume", system)
 
     def rtl(self, system: int) -> Exchange:
         """Let a vehicle fly home and land."""
-        return self.begin(self._urgent(system).pilot.rtl())
+        return self._now("rtl", system)
+
+    def land(self, system: int) -> Exchange:
+        """Let a vehicle land where it is."""
+        return self._now("land", system)
 
     def memory(self) -> dict[int, dict[str, Any]]:
         """Where each vehicle's mission stands, as JSON values by system id; for `remembered` after a restart."""
@@ -205,14 +234,50 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} is busy with another request; wait until that has ended")
         return vehicle
 
-    def _urgent(self, system: int) -> Vehicle:
-        """A vehicle for a command that goes before a start under way (an upload may go on)."""
-        vehicle = self.vehicle(system)
+    def _now(self, verb: Verb, system: int) -> Exchange:
+        """A command that is given at this moment.
+
+        Raises:
+            OrthoSwarmError: it cannot be given.
+        """
+        exchange = self._dialogue(verb, system)
+        exchange.expires = self._clock() + COMMAND_S
+        return self.begin(exchange)
+
+    def _dialogue(self, verb: Verb, system: int) -> Exchange:
+        """What a command comes to, not begun yet.
+
+        Raises:
+            OrthoSwarmError: it cannot be given.
+        """
+        if verb == "start":
+            vehicle = self._free(system)
+            if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
+                raise OrthoSwarmError(f"vehicle {system} is flying its mission already")
+            check = vehicle.mission is None or not vehicle.detector.knows
+            return vehicle.pilot.start(in_air=vehicle.flying, check=check)
+        vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
+        sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
+        if verb == "pause" and sure and not vehicle.armed:
+            raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
+        self._make_way(system)
+        if verb == "resume":
+            return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
+        return {"pause": vehicle.pilot.pause, "rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
+
+    def _known(self, system: int) -> Vehicle:
+        vehicle = self.vehicles.get(system)
+        if vehicle is None:
+            known = ", ".join(str(number) for number in sorted(self.vehicles)) or "none"
+            raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
+        return vehicle
+
+    def _make_way(self, system: int) -> None:
+        """End a command under way for one that comes after it (an upload may go on)."""
         for job in self._jobs:
             if job.vehicle.system == system and not isinstance(job, (MissionUpload, MissionDownload)):
                 job.cancel("another command came in between")
         self._reap()
-        return vehicle
 
     # --- the loop ---
 
@@ -223,14 +288,14 @@ class Fleet:
         now = self._clock()
         for job in list(self._jobs):
             if now >= job.deadline:
-                self._send(job.vehicle.system, job.tick(now))
+                self._drive(job, job.tick(now))
         self._reap()
         if now >= self._tick_at:
             self._tick_at = now + _TICK_S
             self._tick(now)
 
     def run(self, stop: threading.Event) -> None:
-        """Poll until told to stop. Input is taken in small batches, which saves most of the waking up."""
+        """Poll until `stop` is set. Input is taken in small batches, which saves most of the waking up."""
         self._thread = threading.get_ident()
         while not stop.is_set():
             self.poll(0.5)
@@ -274,60 +339,91 @@ class Fleet:
             vehicle = self._found(packet, now)
             if vehicle is None:
                 return
-        late = self._count(vehicle, peer, packet, now)
-        vehicle.heard = now
         kind = packet.kind
+        late, lost = self._count(vehicle, peer, packet, now)
+        if not possible(packet.message):
+            vehicle.impossible += 1
+            return
+        vehicle.heard, vehicle.signs = now, vehicle.signs or packet.signed
         if packet.component == vehicle.address.component:
-            self._autopilot_says(vehicle, side, peer, kind, packet.message, now, late and kind in _STATES)
+            route = self._route(vehicle, side, peer, now)
+            route.counted(lost)
+            beside = kind in _REPEATED and vehicle.routes.stale(route, now)
+            self._autopilot_says(vehicle, route, kind, packet.message, now, beside or (late and kind in _STATES))
+            if beside:
+                return
         elif kind in _PHOTOS:
             vehicle.update(packet.message)
+        if kind == _POSITION and not has_place(packet.message):
+            return
         for handler in self._handlers.get(kind, ()):
             handler(vehicle, packet.message, utc)
 
-    def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> bool:
-        """Keep the books of a sender's packet counter; True for a packet that others have overtaken, or a copy."""
+    def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> tuple[bool, int]:
+        """Follow a sender's packet counter: whether others have overtaken a packet (or it is a copy), and what is lost.
+
+        Gives True for an overtaken one, and how many packets were lost just before this one.
+        """
         counter = (peer, packet.system, packet.component)
-        last = self._counters.get(counter)
+        last, lost = self._counters.get(counter), 0
         vehicle.received += 1
         if last is not None:
             gap = (packet.seq - last - 1) & 0xFF
             if gap >= 256 - _OVERTAKEN and now - vehicle.heard < 1.0:
-                return True
-            vehicle.missed += gap if gap < 128 else 0
+                return True, 0
+            lost = gap if gap < 128 else 0
+            vehicle.missed += lost
         self._counters[counter] = packet.seq
-        return False
+        return False, lost
+
+    def _route(self, vehicle: Vehicle, side: Side, peer: Peer, now: float) -> Route:
+        """The way on which a packet has come; streams run on the way in use."""
+        route, taken_over = vehicle.routes.heard(side, peer, now)
+        if taken_over:
+            self._taken_over(vehicle, now)
+        return route
+
+    def _taken_over(self, vehicle: Vehicle, now: float) -> None:
+        if vehicle.route is not None:
+            self._event("link", vehicle, f"is commanded over {vehicle.route.address} from now on")
+        self._send(vehicle.system, vehicle.streams.start(now))
 
     def _autopilot_says(
-        self, vehicle: Vehicle, side: Side, peer: Peer, kind: int, message: Message, now: float, stale: bool
+        self, vehicle: Vehicle, route: Route, kind: int, message: Message, now: float, stale: bool
     ) -> None:
-        route = vehicle.routes.get((side, peer))
-        if route is None:
-            route = vehicle.routes[side, peer] = Route(side, peer, now)
-        route.heard = now
-        if vehicle.route is None or now - vehicle.route.heard > 2.0:
-            vehicle.route = route
         if vehicle.lost or not vehicle.streams.started:
             if vehicle.lost:
                 vehicle.lost = False
                 self._event("regained", vehicle, "is heard again")
             self._send(vehicle.system, vehicle.streams.start(now))
-        vehicle.streams.seen(kind, now)
-        if stale:
-            return
-        vehicle.update(message)
         if kind in _BOOT_CLOCKS:
             self._watch_clock(vehicle, route, message.time_boot_ms / 1e3, now)
-        elif kind == _ACK:
+        if stale:
+            return
+        vehicle.streams.seen(kind, now)
+        vehicle.update(message)
+        if kind == _ACK:
             self._send(vehicle.system, vehicle.streams.acknowledged(message, now))
         elif kind == _TEXT:
-            self._event("text", vehicle, f"says: {vehicle.texts[-1]}")
+            self._text(vehicle, route, str(message.text).strip("\x00\t "), now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self.own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
         if self._jobs:
             for job in list(self._jobs):
                 if job.vehicle == vehicle.address and job.outcome is None:
-                    self._send(vehicle.system, job.feed(message, now))
+                    self._drive(job, job.feed(message, now))
             self._reap()
+
+    def _text(self, vehicle: Vehicle, route: Route, text: str, now: float) -> None:
+        """Pass a text on once, though it comes on two links."""
+        last = self._said.get((vehicle.system, text))
+        self._said[vehicle.system, text] = now, route
+        if last is not None and last[1] is not route and now - last[0] < _SAME_TEXT_S:
+            return
+        if len(self._said) > 1000:
+            self._said.clear()
+        vehicle.says(text, now)
+        self._event("text", vehicle, f"says: {text}")
 
     def _found(self, packet: Packet, now: float) -> Vehicle | None:
         if packet.kind != _HEARTBEAT or not is_autopilot(packet.message):
@@ -349,7 +445,8 @@ class Fleet:
         verdict = route.clock.feed(time_boot_s, now)
         route.boot, route.boot_at = now - time_boot_s, now
         if verdict == "mixed":
-            self._twins(vehicle)
+            vehicle.routes.mixed(now)
+            self._compare_routes(vehicle, now)
         elif verdict == "rebooted" and route is vehicle.route:
             self._event("rebooted", vehicle, "has restarted")
             vehicle.mission = None
@@ -357,12 +454,7 @@ class Fleet:
             self._send(vehicle.system, vehicle.streams.start(now))
             for job in list(self._jobs):
                 if job.vehicle == vehicle.address and job.outcome is None:
-                    self._send(vehicle.system, job.rebooted(now))
-
-    def _twins(self, vehicle: Vehicle) -> None:
-        if not vehicle.twins:
-            vehicle.twins = True
-            self._event("conflict", vehicle, "is two vehicles with one system id; give one of them another id")
+                    self._drive(job, job.rebooted(now))
 
     def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
         for event in events:
@@ -384,19 +476,21 @@ class Fleet:
             if now - vehicle.heard > _LOST_S:
                 vehicle.lost = True
                 self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
-            if len(vehicle.routes) > 1:
+            if len(vehicle.routes.known) > 1 or vehicle.claimants:
                 self._compare_routes(vehicle, now)
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
-        """Is it one vehicle on two links, or two vehicles with one system id? Their clocks tell."""
-        fresh = [route for route in vehicle.routes.values() if now - route.heard < 2.0]
-        boots = [route.boot for route in fresh if route.boot is not None and now - route.boot_at < 1.5]
-        if boots and max(boots) - min(boots) > 3.0:
-            self._twins(vehicle)
-        for route in fresh:
-            if route is not vehicle.route and now - route.boot_at > 1.5 and now - route.asked_at > 3.0:
-                route.asked_at = now
-                self.hub.send(route.side, route.peer, vehicle.streams.ask_clock())
+        """Is it one vehicle on two links, or several vehicles with one system id? Their clocks tell."""
+        before = vehicle.claimants
+        if vehicle.routes.compare(now):
+            self._taken_over(vehicle, now)
+        if vehicle.claimants and not before:
+            who = ", ".join(vehicle.claimants)
+            self._event("conflict", vehicle, f"is several vehicles with one system id ({who}); give each its own")
+        elif before and not vehicle.claimants:
+            self._event("single", vehicle, "is one vehicle again")
+        for route in vehicle.routes.unasked(now):
+            self.hub.send(route.side, route.peer, vehicle.streams.ask_clock())
 
     def _reap(self) -> None:
         """Take out the dialogues that have ended, and remember what they have shown."""
@@ -422,11 +516,27 @@ class Fleet:
             vehicle.mission = mission
             vehicle.detector.knows_mission(mission)
 
-    def _send(self, system: int, messages: Sequence[Message]) -> None:
-        if not messages:
-            return
-        vehicle = self.vehicles.get(system)
-        if vehicle is None or vehicle.route is None:
-            return
+    def _drive(self, job: Exchange, messages: Sequence[Message]) -> None:
+        """Send what a dialogue wants sent, and let it know what a link took.
+
+        A command that is repeated, and any to a vehicle that is lost or has several claimants, goes on every way.
+        """
         for message in messages:
-            self.hub.send(vehicle.route.side, vehicle.route.peer, message)
+            vehicle = self.vehicles[job.vehicle.system]
+            again = bool(getattr(message, "confirmation", 0))
+            everywhere = again or vehicle.lost or bool(vehicle.claimants)
+            if self._send(vehicle.system, [message], everywhere=everywhere, expires=job.expires):
+                job.took()
+
+    def _send(
+        self, system: int, messages: Sequence[Message], *, everywhere: bool = False, expires: float = NEVER
+    ) -> bool:
+        """Send to a vehicle; whether a link took it."""
+        vehicle = self.vehicles.get(system)
+        if vehicle is None or not messages:
+            return False
+        taken = False
+        for route in vehicle.routes.towards(self._clock(), everywhere=everywhere):
+            for message in messages:
+                taken |= self.hub.send(route.side, route.peer, message, expires)
+        return taken

@@ -18,7 +18,7 @@ from gcs_plugin.links.packets import Framer, Packet
 from gcs_plugin.links.signing import Signing
 from gcs_plugin.links.tlog_writer import TlogWriter
 from gcs_plugin.links.transports import Link, Peer, parse_link
-from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.exchange import NEVER, Address
 from orthoswarm.model.errors import InputError
 
 _PEER_S: Final = 30.0
@@ -76,6 +76,7 @@ class Hub:
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._selector = selectors.DefaultSelector()
         self._bell, self._ear = socket.socketpair()
+        self._bell.setblocking(False)
         self._ear.setblocking(False)
         self._selector.register(self._ear, selectors.EVENT_READ, None)
         self.sides: list[Side] = []
@@ -132,18 +133,24 @@ class Hub:
     def post(self, work: Callable[[], None]) -> None:
         """Have the polling thread do something soon; from any thread."""
         self._work.put(work)
-        self._bell.send(b"!")
+        with contextlib.suppress(BlockingIOError):  # full: the polling thread has been woken often enough
+            self._bell.send(b"!")
 
-    def send(self, side: Side, peer: Peer, message: Message) -> None:
-        """Send a message to a peer."""
+    def send(self, side: Side, peer: Peer, message: Message, expires: float = NEVER) -> bool:
+        """Send a message to a peer; one that still waits when it expires (monotonic seconds) is thrown away.
+
+        Returns:
+            Whether the link took it.
+        """
         packer, utc = side.packer, self._wall()
         if side.signing is not None:
             packer.signing.timestamp = side.signing.next_timestamp(utc)
         raw = message.pack(packer)
         packer.seq = (packer.seq + 1) & 0xFF
-        side.link.send(peer, raw)
+        taken = side.link.send(peer, raw, expires)
         if self._tlog is not None:
             self._tlog.write(utc, raw)
+        return taken
 
     def _receive(self, side: Side, source: Any, events: int) -> None:
         now, utc = self._clock(), self._wall()

@@ -51,6 +51,9 @@ def default_rates(pose_hz: float = 10.0) -> Rates:
             # A rangefinder that states its limits; a height from a coarse terrain map is worse than none.
             int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
             int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
+            # Each autopilot has one of the two.
+            int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): 1.0,
+            int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): 1.0,
         },
     )
 

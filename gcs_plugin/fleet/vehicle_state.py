@@ -1,11 +1,14 @@
-"""What is known about one vehicle: its state as its messages tell it."""
+"""What is known about one vehicle: its state from its messages."""
 
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.message_rates import Streams
+from gcs_plugin.fleet.routes import Route, Routes
+from gcs_plugin.fleet.telemetry_check import has_place
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.control import Pilot
@@ -13,58 +16,13 @@ from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import Modes, modes_of
 from gcs_plugin.mission.items import Mission
 
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.link_hub import Side
-    from gcs_plugin.links.transports import Peer
-
 _LANDED: Final = {0: "", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
-
-
-@dataclass(slots=True)
-class BootClock:
-    """Watches a vehicle's own clock, which only a restart (or a second vehicle with the same id) sets back."""
-
-    last_s: float = -1.0
-    _low: int = 0
-    _returns: float = 0.0
-    _restarted: float = -1e9
-
-    def feed(self, time_boot_s: float, now: float) -> str:
-        """Take a time since boot; returns "", "rebooted", or "mixed" where two clocks take turns.
-
-        Single packets from the past are late copies: a restart shows in three in a row.
-        """
-        if time_boot_s >= self.last_s - 1.5:
-            self._returns = 0.98 * self._returns + (1.0 if self._low else 0.0)
-            self._low, self.last_s = 0, max(self.last_s, time_boot_s)
-            return "mixed" if self._returns > 5.0 else ""
-        self._low += 1
-        if self._low < 3:
-            return ""
-        again, self._restarted = now - self._restarted < 10.0, now
-        self._low, self.last_s = 0, time_boot_s
-        return "mixed" if again else "rebooted"
-
-
-@dataclass(slots=True)
-class Route:
-    """A way on which a vehicle is heard.
-
-    Attributes:
-        side: the link; peer: the sender on it.
-        heard: when something came last (the fleet's clock).
-        boot: the vehicle's start on that clock, from its own counter; None before the first position.
-        boot_at: when that was computed; asked_at: when its clock was asked for.
-        clock: watches the counter.
-    """
-
-    side: "Side"
-    peer: "Peer"
-    heard: float
-    boot: float | None = None
-    boot_at: float = 0.0
-    asked_at: float = 0.0
-    clock: BootClock = field(default_factory=BootClock)
+_PREARM: Final = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
+_PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
+# EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these. PX4 sets CONST_POS_MODE whenever it stands still.
+_EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
+_EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
+_STILL_M_S: Final = 0.6
 
 
 @dataclass(slots=True)
@@ -76,9 +34,9 @@ class Vehicle:
         autopilot: its dialect; modes: its modes.
         detector: follows its mission.
         streams: keeps its messages coming.
-        routes: the ways on which it is heard, by link and peer.
+        routes: the ways on which it is heard, and whether several vehicles use its system id.
         lost: True while it is silent.
-        twins: True while two vehicles use this system id; commands are refused then.
+        signs: True once it was heard to sign its messages.
         heard: when it was heard last (the fleet's clock).
         lat_deg: latitude, None before the first position; lon_deg: longitude.
         alt_m: above sea level; height_m: above takeoff.
@@ -89,6 +47,10 @@ class Vehicle:
         mission: what it holds, where that was read or written in this session.
         photos: pictures that it has reported.
         received: packets; missed: packets that its counters say were lost on the way.
+        impossible: messages with values out of their range, which were thrown away.
+        ekf_ok: whether its filter has an absolute position; None where it does not say.
+        prearm_ok: whether its own checks before arming have passed; None where it does not say.
+        home: latitude and longitude of its home in degrees, None before it is set.
     """
 
     address: Address
@@ -96,10 +58,9 @@ class Vehicle:
     modes: Modes
     detector: CompletionDetector
     streams: Streams
-    routes: dict[Any, Route] = field(default_factory=dict)
-    route: Route | None = None
+    routes: Routes = field(default_factory=Routes)
     lost: bool = False
-    twins: bool = False
+    signs: bool = False
     heard: float = 0.0
     armed: bool = False
     custom_mode: int = 0
@@ -126,7 +87,13 @@ class Vehicle:
     photos: int = 0
     received: int = 0
     missed: int = 0
+    impossible: int = 0
+    ekf_ok: bool | None = None
+    prearm_ok: bool | None = None
+    home: tuple[float, float] | None = None
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
+    _prearm: dict[str, float] = field(default_factory=dict)
+    _still_since: float | None = None
     _pictures: set[tuple[int, int]] = field(default_factory=set)
 
     @property
@@ -150,9 +117,40 @@ class Vehicle:
         return self.landed not in ("", "on ground")
 
     @property
+    def flying(self) -> bool:
+        """True if it is armed and, as far as is known, off the ground."""
+        return self.armed and (self.in_air or (not self.landed and self.height_m > 1.5))
+
+    @property
+    def route(self) -> Route | None:
+        """The way that carries commands, None before it was heard."""
+        return self.routes.best
+
+    @property
+    def claimants(self) -> tuple[str, ...]:
+        """Addresses of those who use its system id, where they are several; empty otherwise."""
+        return self.routes.claimants
+
+    @property
+    def still_s(self) -> float:
+        """For how many seconds of its own clock it has stood still."""
+        return 0.0 if self._still_since is None else max(0.0, self.time_boot_s - self._still_since)
+
+    def prearm_texts(self, now: float) -> list[str]:
+        """What it said lately about why it would not arm."""
+        return [text for text, said in self._prearm.items() if now - said < _PREARM_S]
+
+    @property
     def pilot(self) -> Pilot:
         """Makes the commands for it."""
         return Pilot(self.address, self.streams.own, self.autopilot, self.modes)
+
+    def says(self, text: str, now: float) -> None:
+        """Take a text of its autopilot."""
+        self.texts.append(text)
+        if text.startswith(("PreArm", "Arm:", "Preflight")):
+            self._prearm.pop(text, None)
+            self._prearm[text] = now
 
     def update(self, message: Message) -> None:
         """Take a message of its autopilot or camera."""
@@ -167,7 +165,10 @@ class Vehicle:
             "system": self.system,
             "autopilot": self.autopilot.value,
             "link": self.route.side.link.name if self.route else "",
-            "state": "lost" if self.lost else "conflict" if self.twins else "found",
+            "state": "lost" if self.lost else "conflict" if self.claimants else "found",
+            "links": [route.address for route in self.routes.fresh(now)],
+            "claimants": list(self.claimants),
+            "flight": flight_state(self).document(),
             "silent_s": round(now - self.heard, 1),
             "armed": self.armed,
             "mode": self.mode,
@@ -200,11 +201,15 @@ class Vehicle:
             self.modes = modes_of(self.autopilot, self.kind)
 
     def _position(self, m: Message) -> None:
-        self.lat_deg, self.lon_deg = m.lat / 1e7, m.lon / 1e7
+        self.lat_deg, self.lon_deg = (m.lat / 1e7, m.lon / 1e7) if has_place(m) else (None, None)
         self.alt_m, self.height_m = m.alt / 1e3, m.relative_alt / 1e3
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
+        if math.hypot(*self.velocity_m_s) > _STILL_M_S:
+            self._still_since = None
+        elif self._still_since is None or self._still_since > self.time_boot_s:
+            self._still_since = self.time_boot_s
 
     def _attitude(self, m: Message) -> None:
         self.roll_rad, self.pitch_rad, self.yaw_rad = m.roll, m.pitch, m.yaw
@@ -225,10 +230,16 @@ class Vehicle:
         self.gps_fix, self.satellites = int(m.fix_type), int(m.satellites_visible)
 
     def _power(self, m: Message) -> None:
-        self.battery = m.battery_remaining / 100.0 if m.battery_remaining >= 0 else None
+        self.battery = m.battery_remaining / 100.0 if 0 <= m.battery_remaining <= 100 else None
+        known = self.autopilot is Autopilot.PX4 or m.onboard_control_sensors_enabled & _PREARM
+        self.prearm_ok = bool(m.onboard_control_sensors_health & _PREARM) if known else None
 
-    def _text(self, m: Message) -> None:
-        self.texts.append(str(m.text).strip("\x00 "))
+    def _filter(self, m: Message) -> None:
+        wrong = _EKF_WRONG if m.get_type() == "EKF_STATUS_REPORT" else 0
+        self.ekf_ok = m.flags & _EKF_NEEDED == _EKF_NEEDED and not m.flags & wrong
+
+    def _home(self, m: Message) -> None:
+        self.home = (m.latitude / 1e7, m.longitude / 1e7)
 
     def _photo(self, m: Message) -> None:
         index = m.img_idx if m.get_type() == "CAMERA_FEEDBACK" else m.image_index
@@ -246,7 +257,9 @@ _HANDLERS: Final = {
     int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Vehicle._system_time,
     int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Vehicle._gps,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Vehicle._power,
-    int(dialect.MAVLINK_MSG_ID_STATUSTEXT): Vehicle._text,
+    int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Vehicle._filter,
+    int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Vehicle._filter,
+    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Vehicle._home,
     int(dialect.MAVLINK_MSG_ID_CAMERA_FEEDBACK): Vehicle._photo,
     int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED): Vehicle._photo,
 }

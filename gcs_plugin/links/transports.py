@@ -11,6 +11,8 @@ import re
 import selectors
 import socket
 import sys
+import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -20,6 +22,8 @@ from orthoswarm.model.errors import InputError
 # Who sent something: an address, a connection, the other end of a line. Hashable, and of no meaning to anybody else.
 Peer = Any
 
+NEVER: Final = float("inf")
+
 _DATAGRAM: Final = 65536
 _AT_ONCE: Final = 2000
 _BUFFER: Final = 4 << 20
@@ -27,6 +31,45 @@ _BACKLOG: Final = 1 << 16
 _RETRY_S: Final = 2.0
 _AGAIN: Final = (errno.EAGAIN, errno.EWOULDBLOCK)
 EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:192.168.1.7:14550, tcp:127.0.0.1:5760 or serial:/dev/ttyUSB0:57600"
+
+
+@dataclass(slots=True)
+class _Pending:
+    """Packets that wait for a line. One that has expired is left out, unless its first bytes are gone already."""
+
+    _packets: deque[tuple[bytes, float]] = field(default_factory=deque)
+    _begun: int = 0
+    _size: int = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, data: bytes, expires: float) -> None:
+        """Add a packet."""
+        self._packets.append((data, expires))
+        self._size += len(data)
+
+    def bytes(self) -> bytes:
+        """What is to go out now."""
+        now, begun = time.monotonic(), self._begun
+        first = [self._packets[0]] if begun else []
+        rest = self._packets if not begun else list(self._packets)[1:]
+        self._packets = deque([*first, *(p for p in rest if p[1] >= now)])
+        self._size = sum(len(data) for data, _ in self._packets) - begun
+        return b"".join(data for data, _ in self._packets)[begun:]
+
+    def sent(self, count: int) -> None:
+        """So many bytes have gone out."""
+        self._size -= count
+        count += self._begun
+        while self._packets and count >= len(self._packets[0][0]):
+            count -= len(self._packets.popleft()[0])
+        self._begun = count
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._packets.clear()
+        self._begun = self._size = 0
 
 
 class Link(abc.ABC):
@@ -52,8 +95,16 @@ class Link(abc.ABC):
         """Everything that has arrived on a file object of the link: peer and bytes."""
 
     @abc.abstractmethod
-    def send(self, peer: Peer, data: bytes) -> None:
-        """Send to a peer, or drop it where that would mean waiting."""
+    def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
+        """Send to a peer, or drop it where that would mean waiting.
+
+        Args:
+            peer: to whom. data: one packet.
+            expires: monotonic seconds after which it is thrown away if it still waits for the line.
+
+        Returns:
+            False where it was dropped at once.
+        """
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -115,12 +166,14 @@ class UdpLink(Link):
                 continue  # the answer to something sent to a port where nobody listens
             yield peer, data
 
-    def send(self, peer: Peer, data: bytes) -> None:
+    def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Send one datagram."""
         try:
             self._socket.sendto(data, peer)
         except OSError:
             self.dropped += 1
+            return False
+        return True
 
     def greet(self) -> list[Peer]:
         """The address that it is aimed at."""
@@ -139,7 +192,7 @@ class _Stream:
 
     socket: socket.socket
     connected: bool
-    pending: bytearray = field(default_factory=bytearray)
+    pending: "_Pending" = field(default_factory=lambda: _Pending())
 
 
 class TcpLink(Link):
@@ -200,14 +253,15 @@ class TcpLink(Link):
             else:
                 self._drop(stream, "the other side closed the connection", now)
 
-    def send(self, peer: Peer, data: bytes) -> None:
+    def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Queue for a connection."""
         if not isinstance(peer, _Stream) or peer.socket not in self._streams or len(peer.pending) > _BACKLOG:
             self.dropped += 1
-            return
-        peer.pending += data
+            return False
+        peer.pending.put(data, expires)
         if peer.connected:
-            self._flush(peer, self._retry_at)
+            return self._flush(peer, self._retry_at)
+        return True
 
     def greet(self) -> list[Peer]:
         """All connections."""
@@ -254,8 +308,8 @@ class TcpLink(Link):
                 return False
             stream.connected, self.problem = True, ""
         try:
-            if stream.pending:
-                del stream.pending[: stream.socket.send(stream.pending)]
+            if stream.pending and (data := stream.pending.bytes()):
+                stream.pending.sent(stream.socket.send(data))
         except OSError as error:
             if error.errno not in _AGAIN:
                 self._drop(stream, error.strerror or str(error), now)
@@ -283,7 +337,7 @@ class SerialLink(Link):
         super().__init__(name)
         self._device, self._baud = device, baud
         self._port: Any = None
-        self._pending = bytearray()
+        self._pending = _Pending()
         self._retry_at = 0.0
 
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
@@ -310,13 +364,14 @@ class SerialLink(Link):
         if data:
             yield self._PEER, data
 
-    def send(self, peer: Peer, data: bytes) -> None:
+    def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Queue for the line."""
         if self._port is None or len(self._pending) > _BACKLOG:
             self.dropped += 1
-            return
-        self._pending += data
+            return False
+        self._pending.put(data, expires)
         self._flush(self._retry_at)
+        return self._port is not None
 
     def greet(self) -> list[Peer]:
         """The line itself."""
@@ -348,7 +403,8 @@ class SerialLink(Link):
 
     def _flush(self, now: float) -> None:
         try:
-            del self._pending[: self._port.write(self._pending) or 0]
+            if data := self._pending.bytes():
+                self._pending.sent(self._port.write(data) or 0)
         except OSError as error:
             if error.errno not in _AGAIN and "timeout" not in str(error).lower():
                 self._lose(str(error), now)

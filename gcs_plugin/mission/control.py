@@ -1,4 +1,4 @@
-"""Commands to a vehicle: start, pause, resume, return. Each is sent because a person asked for it, never on its own.
+"""Commands to a vehicle: start, pause, resume, return, land. Each is sent because a person asked for it.
 
 Start is what was measured to work with both autopilots: a mode that can be armed (ArduPilot stays in AUTO after a
 mission and refuses to arm there), arm, MAV_CMD_MISSION_START. Before that the mission is read from the vehicle, because
@@ -12,28 +12,29 @@ from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.exchange import COMMAND_S, NEVER, Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import Modes, mode_params
 from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)
 _UNSUPPORTED: Final = int(dialect.MAV_RESULT_UNSUPPORTED)
+_REPEAT_S: Final = 0.5
 _AGAIN_S: Final = 1.0
-_ARM_S: Final = 60.0
+_ANSWER_S: Final = 1.0
 _AIRBORNE_COMMANDS: Final = frozenset({TAKEOFF, int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)})
 
 
 @dataclass(slots=True)
 class Command(Exchange):
-    """One COMMAND_LONG, repeated until it is acknowledged.
+    """One COMMAND_LONG, repeated until it is acknowledged or expires.
 
     Attributes:
         command: MAV_CMD.
         params: parameters 1 to 7, missing ones 0.
         verb: what it does, for messages: "arm".
-        insist_s: how long a refusal is answered by asking again (arming: until the position is good).
-        patience_s: silence after which it gives up.
+        insist_s: how long a refusal is answered by asking again.
+        patience_s: silence after which it gives up, where it does not expire before.
         reasons: what the vehicle said meanwhile, in its own words.
     """
 
@@ -50,6 +51,9 @@ class Command(Exchange):
     def start(self, now: float) -> list[Message]:
         """Send it."""
         self._began = self._heard = now
+        if now > self.expires:
+            self._expired(now)
+            return []
         return self._send(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
@@ -69,7 +73,7 @@ class Command(Exchange):
             self._end(True, f"vehicle {self.vehicle.system}: {self.verb} accepted")
         elif result == _IN_PROGRESS:
             self.deadline = now + self.patience_s
-        elif now - self._began < self.insist_s and result != _UNSUPPORTED:
+        elif now - self._began < self.insist_s and now + _AGAIN_S < self.expires and result != _UNSUPPORTED:
             self.deadline = now + _AGAIN_S
         else:
             self._refuse(result)
@@ -79,8 +83,11 @@ class Command(Exchange):
         """Send it again, or give up."""
         if self.outcome is not None or now < self.deadline:
             return []
-        if now - self._heard >= self.patience_s:
-            self._end(False, f"vehicle {self.vehicle.system} did not answer to '{self.verb}'; check the link")
+        if now - self._heard >= self.patience_s or now >= self.expires + _ANSWER_S:
+            self._expired(now)
+            return []
+        if now > self.expires:
+            self.deadline = self.expires + _ANSWER_S  # the last one may still be answered
             return []
         return self._send(now)
 
@@ -88,8 +95,21 @@ class Command(Exchange):
         # Autopilots that do not fill the target leave 0.
         return message.target_system in (0, self.own.system) and message.target_component in (0, self.own.component)
 
+    def _expired(self, now: float) -> None:
+        name = f"vehicle {self.vehicle.system}"
+        if self.delivered:
+            advice = "watch whether it obeys, then give it again or use the radio control"
+            self._end(False, f"{name} did not answer to '{self.verb}'; {advice}", Verdict.UNKNOWN)
+        elif not self._sent:
+            late = now - self.expires + COMMAND_S
+            text = f"{name}: '{self.verb}' was given {late:.0f} s ago and was not sent; give it again"
+            self._end(False, text, Verdict.NOT_SENT)
+        else:
+            text = f"{name}: no link takes '{self.verb}'; use the radio control, or give it again when the link is back"
+            self._end(False, text, Verdict.NOT_SENT)
+
     def _send(self, now: float) -> list[Message]:
-        self.deadline = now + _AGAIN_S
+        self.deadline = now + _REPEAT_S
         values = (*self.params, *(0.0,) * 7)[:7]
         confirmation, self._sent = min(self._sent, 255), self._sent + 1
         to = self.vehicle
@@ -124,9 +144,8 @@ class Confirm(Exchange):
     def tick(self, now: float) -> list[Message]:
         """Give up in the end."""
         if self.outcome is None and now >= self.deadline:
-            self._end(
-                False, f"vehicle {self.vehicle.system} accepted, but nothing shows that it {self.what}; look at it"
-            )
+            text = f"vehicle {self.vehicle.system} accepted, but nothing shows that it {self.what}; look at it"
+            self._end(False, text, Verdict.UNKNOWN)
         return []
 
 
@@ -149,6 +168,7 @@ class CheckMission(Exchange):
 
     def start(self, now: float) -> list[Message]:
         """Ask for the mission."""
+        self._reading.patience_s = min(15.0, self.expires - now)
         return self._follow(self._reading.start(now))
 
     def feed(self, message: Message, now: float) -> list[Message]:
@@ -165,7 +185,7 @@ class CheckMission(Exchange):
         if reading.outcome is None:
             return messages
         if reading.items is None:
-            self._end(False, reading.outcome.text)
+            self._end(False, reading.outcome.text, Verdict.NOT_SENT)
             return messages
         self.mission = Mission(self.autopilot, tuple(reading.items))
         wrong = unflyable(reading.items, self.autopilot, in_air=self.in_air)
@@ -197,7 +217,7 @@ class _Several(Exchange):
 
     def start(self, now: float) -> list[Message]:
         """Begin with the first."""
-        return self._follow(self.steps[0].start(now), now)
+        return self._follow(self._begin(now), now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Hand a message to the present one."""
@@ -222,9 +242,22 @@ class _Several(Exchange):
             if self._ended(outcome, last):
                 return messages
             self._at += 1
-            messages = messages + self.steps[self._at].start(now)
+            messages = messages + self._begin(now)
         self.deadline = self.steps[self._at].deadline
         return messages
+
+    def took(self) -> None:
+        """A link has taken a message of the present one."""
+        self.delivered += 1
+        self.steps[self._at].took()
+
+    def _begin(self, now: float) -> list[Message]:
+        step = self.steps[self._at]
+        step.expires = self._step_expires(now)
+        return step.start(now)
+
+    def _step_expires(self, now: float) -> float:
+        return self.expires
 
     @abc.abstractmethod
     def _ended(self, outcome: Outcome, last: bool) -> bool:
@@ -237,13 +270,18 @@ class InOrder(_Several):
 
     Attributes:
         done: what to say at the end.
+        carried: from this step on the vehicle is at it already, so that the steps get time of their own.
     """
 
     done: str = field(kw_only=True)
+    carried: int = field(default=1000, kw_only=True)
+
+    def _step_expires(self, now: float) -> float:
+        return now + COMMAND_S if self._at >= self.carried and self.expires < NEVER else self.expires
 
     def _ended(self, outcome: Outcome, last: bool) -> bool:
         if not outcome.ok:
-            self._end(False, outcome.text)
+            self._end(False, outcome.text, outcome.verdict)
         elif last:
             self._end(True, f"vehicle {self.vehicle.system} {self.done}")
         return self.outcome is not None
@@ -254,8 +292,8 @@ class Either(_Several):
     """A way of doing something, and another one where the vehicle refuses the first."""
 
     def _ended(self, outcome: Outcome, last: bool) -> bool:
-        if outcome.ok or last:
-            self._end(outcome.ok, outcome.text)
+        if outcome.ok or last or outcome.verdict is not Verdict.REFUSED:
+            self._end(outcome.ok, outcome.text, outcome.verdict)
         return self.outcome is not None
 
 
@@ -288,16 +326,14 @@ class Pilot:
             steps.append(CheckMission(self.vehicle, self.own, autopilot=self.autopilot, in_air=in_air))
         arm = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(1.0,), verb="arm",
-            insist_s=_ARM_S,
+            insist_s=COMMAND_S,
         )  # fmt: skip
         go = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_MISSION_START, verb="start the mission", insist_s=3.0
         )
         flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
-        return InOrder(
-            self.vehicle, self.own, steps=[*steps, self.set_mode(self.modes.ready, _ARM_S), arm, go, flies],
-            done="flies its mission",
-        )  # fmt: skip
+        steps += [self.set_mode(self.modes.ready), arm, go, flies]
+        return InOrder(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)
 
     def pause(self) -> Exchange:
         """Stay where it is. ArduPilot's own pause works on the way between waypoints only, BRAKE everywhere."""
@@ -318,6 +354,11 @@ class Pilot:
             self.vehicle, self.own, command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, verb="return to launch", insist_s=2.0
         )
         return Either(self.vehicle, self.own, steps=[home, self.set_mode(self.modes.rtl)])
+
+    def land(self) -> Exchange:
+        """Land where it is."""
+        down = Command(self.vehicle, self.own, command=dialect.MAV_CMD_NAV_LAND, verb="land", insist_s=2.0)
+        return Either(self.vehicle, self.own, steps=[down, self.set_mode(self.modes.land)])
 
     def _pause_continue(self, go_on: float, verb: str) -> Command:
         return Command(

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.links.mavlink import Message, dialect
-from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip
+from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip, Verdict
 from gcs_plugin.mission.items import MissionItem
 from gcs_plugin.mission.refusal import ACCEPTED, DENIED
 
@@ -54,7 +54,11 @@ class MissionDownload(Exchange):
             return []
         if now - self._heard_at > self.patience_s:
             why = ", another ground station is using it" if self._refused == DENIED else ""
-            self._end(False, f"vehicle {self.vehicle.system} did not hand out its mission{why}; check the link")
+            self._end(
+                False,
+                f"vehicle {self.vehicle.system} did not hand out its mission{why}; check the link",
+                Verdict.UNKNOWN,
+            )
             return []
         self._trip.missed()
         return self._ask(now, again=True)

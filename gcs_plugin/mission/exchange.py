@@ -6,12 +6,15 @@ Times are seconds of any clock that does not go backwards. Nothing here waits, s
 """
 
 import abc
+import enum
 from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, dialect
 
 NEVER: Final = float("inf")
+COMMAND_S: Final = 5.0
+"""How long after it was given a command may still be sent; a later one could surprise whoever gave it."""
 MISSION: Final = int(dialect.MAV_MISSION_TYPE_MISSION)
 
 
@@ -27,6 +30,19 @@ class Address:
 GROUND_STATION: Final = Address(255, 190)
 
 
+class Verdict(enum.Enum):
+    """What became of a command.
+
+    DONE: the vehicle acknowledged it. REFUSED: the vehicle or the station said no, and why. NOT_SENT: nothing left the
+    station. UNKNOWN: it was sent and not answered, so that the vehicle may or may not obey.
+    """
+
+    DONE = "done"
+    REFUSED = "refused"
+    NOT_SENT = "not_sent"
+    UNKNOWN = "unknown"
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """How an exchange ended.
@@ -37,6 +53,7 @@ class Outcome:
         item: sequence number of the mission item that a vehicle refused, None if it is about something else.
         field: the field of that item, empty if none.
         code: the vehicle's MAV_MISSION_RESULT, None without a refusal.
+        failure: what kind of failure it is, where it is one.
     """
 
     ok: bool
@@ -44,6 +61,12 @@ class Outcome:
     item: int | None = None
     field: str = ""
     code: int | None = None
+    failure: Verdict = Verdict.REFUSED
+
+    @property
+    def verdict(self) -> Verdict:
+        """DONE, or the kind of failure."""
+        return Verdict.DONE if self.ok else self.failure
 
 
 @dataclass(slots=True)
@@ -55,12 +78,16 @@ class Exchange(abc.ABC):
         own: who we are; replies to others are not ours.
         outcome: None until it has ended.
         deadline: when `tick` wants to be called next.
+        expires: after this time nothing that begins the command may be sent.
+        delivered: messages that a link took; counted by whoever drives the exchange.
     """
 
     vehicle: Address
     own: Address = GROUND_STATION
     outcome: Outcome | None = field(default=None, init=False)
     deadline: float = field(default=NEVER, init=False)
+    expires: float = field(default=NEVER, init=False)
+    delivered: int = field(default=0, init=False)
 
     @abc.abstractmethod
     def start(self, now: float) -> list[Message]:
@@ -81,7 +108,12 @@ class Exchange(abc.ABC):
     def cancel(self, why: str) -> None:
         """End it without success; nothing more is sent."""
         if self.outcome is None:
-            self._end(False, f"vehicle {self.vehicle.system}: {why}")
+            sent = Verdict.UNKNOWN if self.delivered else Verdict.NOT_SENT
+            self._end(False, f"vehicle {self.vehicle.system}: {why}", sent)
+
+    def took(self) -> None:
+        """A link has taken a message of this exchange."""
+        self.delivered += 1
 
     @property
     def progress(self) -> float:
@@ -103,8 +135,8 @@ class Exchange(abc.ABC):
             return ""
         return kind if self._for_us(message) else ""
 
-    def _end(self, ok: bool, text: str) -> None:
-        self.outcome, self.deadline = Outcome(ok, text), NEVER
+    def _end(self, ok: bool, text: str, failure: Verdict = Verdict.REFUSED) -> None:
+        self.outcome, self.deadline = Outcome(ok, text, failure=failure), NEVER
 
 
 @dataclass(slots=True)

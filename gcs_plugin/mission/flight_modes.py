@@ -19,6 +19,7 @@ class Modes:
         ready: stays put and lets itself be armed, before a mission is started.
         hold: stays where it is in the air, whatever the sticks say.
         rtl: flies home and lands.
+        land: lands where it is; where there is no such mode, rtl.
         names: all that have a name here.
     """
 
@@ -26,6 +27,7 @@ class Modes:
     ready: int
     hold: int
     rtl: int
+    land: int
     names: dict[int, str]
 
     def name(self, custom_mode: int) -> str:
@@ -33,19 +35,19 @@ class Modes:
         return self.names.get(custom_mode, f"mode {custom_mode}")
 
 
-_COPTER: Final = Modes(3, 4, 17, 6, {
+_COPTER: Final = Modes(3, 4, 17, 6, 9, {
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
     11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 20: "GUIDED_NOGPS",
     21: "SMART_RTL", 22: "FLOWHOLD", 23: "FOLLOW", 27: "AUTO_RTL",
 })  # fmt: skip
-_PLANE: Final = Modes(10, 15, 12, 11, {
+_PLANE: Final = Modes(10, 15, 12, 11, 11, {
     0: "MANUAL", 5: "FBWA", 6: "FBWB", 7: "CRUISE", 10: "AUTO", 11: "RTL", 12: "LOITER", 13: "TAKEOFF", 15: "GUIDED",
     17: "QSTABILIZE", 18: "QHOVER", 19: "QLOITER", 20: "QLAND", 21: "QRTL",
 })  # fmt: skip
-_ROVER: Final = Modes(10, 15, 4, 11, {
+_ROVER: Final = Modes(10, 15, 4, 11, 4, {
     0: "MANUAL", 1: "ACRO", 3: "STEERING", 4: "HOLD", 5: "LOITER", 10: "AUTO", 11: "RTL", 12: "SMART_RTL", 15: "GUIDED",
 })  # fmt: skip
-_PX4: Final = Modes(_px4(4, 4), _px4(4, 3), _px4(4, 3), _px4(4, 5), {
+_PX4: Final = Modes(_px4(4, 4), _px4(4, 3), _px4(4, 3), _px4(4, 5), _px4(4, 6), {
     _px4(1): "MANUAL", _px4(2): "ALTCTL", _px4(3): "POSCTL", _px4(4, 2): "TAKEOFF", _px4(4, 3): "HOLD",
     _px4(4, 4): "MISSION", _px4(4, 5): "RTL", _px4(4, 6): "LAND", _px4(4, 8): "FOLLOW", _px4(5): "ACRO",
     _px4(6): "OFFBOARD", _px4(7): "STABILIZED",

@@ -9,7 +9,7 @@ from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.links.mavlink import Message, dialect
 from gcs_plugin.links.packets import Framer
-from gcs_plugin.links.transports import Link, Peer
+from gcs_plugin.links.transports import NEVER, Link, Peer
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
@@ -70,9 +70,10 @@ class SimLink(Link):
         """All vehicles."""
         return list(range(len(self.vehicles)))
 
-    def send(self, peer: Peer, data: bytes) -> None:
+    def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Hand bytes to the radio."""
         self.up.put((peer, data), self._clock.now)
+        return True
 
     def receive(self, source: Any, events: int, now: float) -> Iterator[tuple[Peer, bytes]]:
         """Let the vehicles take what has arrived, live up to now, and speak."""

@@ -159,6 +159,9 @@ class Flight:
         if mode == modes.rtl:
             self._ends_mission = False
             self._go_home()
+        elif mode == modes.land:
+            self._ends_mission = False
+            self._descend(*self.motion.seen)
         else:
             self._hold()
 

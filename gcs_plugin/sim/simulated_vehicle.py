@@ -27,6 +27,10 @@ _POSITION: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 _ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
 _CURRENT: Final = int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT)
 _PX4_DEFAULTS: Final = {_POSITION: 50.0, _ATTITUDE: 50.0, _CURRENT: 1.0, 245: 5.0, 1: 1.0, 24: 1.0, 2: 1.0}
+_FIX_SHARE: Final = 0.25
+_WHY_S: Final = 30.0
+_EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+_ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 _HOME: Final = (47.397742, 8.545594, 488.0)
 
 
@@ -40,7 +44,7 @@ class SimVehicle:
         home: latitude, longitude (degrees), altitude (metres).
         airframe: what it can do.
         boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
-        ready_s: when its position is good enough to arm.
+        ready_s: when its filter has a position, so that it lets itself be armed; its receiver has a fix before that.
         seed: of its receiver's errors.
         on_exposure: called at each picture.
     """
@@ -65,6 +69,7 @@ class SimVehicle:
     _greeted: bool = field(default=False, init=False)
     _photos_sent: int = field(default=0, init=False)
     _told: tuple[bool, int] = field(default=(False, 0), init=False)
+    _why_at: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         """Stand at home with an empty store."""
@@ -142,7 +147,8 @@ class SimVehicle:
         flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3
         match message.command:
             case dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-                if int(p1) not in _MAKERS:
+                foreign = _EKF if self.autopilot is Autopilot.PX4 else _ESTIMATOR
+                if int(p1) not in _MAKERS or int(p1) == foreign:
                     return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED
                 self._stream(int(p1), 1e6 / p2 if p2 > 0 else 0.0)
                 return _OK
@@ -159,6 +165,12 @@ class SimVehicle:
             case dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
                 flight.set_mode(flight.modes.rtl)
                 return _OK
+            case dialect.MAV_CMD_NAV_LAND:
+                flight.set_mode(flight.modes.land)
+                return _OK
+            case dialect.MAV_CMD_RUN_PREARM_CHECKS:
+                flight.texts += [] if self._ready else [self._why_not]
+                return _OK
             case dialect.MAV_CMD_DO_PAUSE_CONTINUE:
                 if self.autopilot is Autopilot.PX4:
                     return _UNSUPPORTED
@@ -171,12 +183,27 @@ class SimVehicle:
         if not wanted:
             self.flight.disarm()
             return _OK
-        if self._now - self._booted < self.ready_s:
-            self.flight.texts.append("Arm: Need Position Estimate")
+        if not self._ready:
+            self.flight.texts.append(self._why_not.replace("PreArm", "Arm"))
             return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _REJECTED
         why = self.flight.arm()
         self.flight.texts += [why] if why else []
         return _FAILED if why else _OK
+
+    @property
+    def _ready(self) -> bool:
+        return self._now - self._booted >= self.ready_s
+
+    @property
+    def _has_fix(self) -> bool:
+        """Its receiver knows where it is; ArduCopter's filter takes half a minute longer to believe it."""
+        return self._now - self._booted >= _FIX_SHARE * self.ready_s
+
+    @property
+    def _why_not(self) -> str:
+        if self.autopilot is Autopilot.PX4:
+            return "Preflight Fail: Waiting for estimator to initialize"
+        return "PreArm: Need Position Estimate" if self._has_fix else "PreArm: GPS 1: Bad fix"
 
     # --- messages out ---
 
@@ -192,12 +219,17 @@ class SimVehicle:
             self.flight.step(self._stepped - self._booted)
             messages += self._happened()
         messages += self.store.tick(now)
+        if not self._ready and now >= self._why_at:
+            self._why_at = now + _WHY_S
+            self.flight.texts.append(self._why_not)
+            messages += self._texts()
         while self._due and self._due[0][0] <= now:
             at, kind = heapq.heappop(self._due)
             hz = self._rates.get(kind, 0.0)
             if hz > 0.0:
                 heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
-                messages.append(_MAKERS[kind](self))
+                message = _MAKERS[kind](self)
+                messages += [] if message is None else [message]
         return messages
 
     @property
@@ -283,14 +315,19 @@ class SimVehicle:
         status = dialect.MAV_STATE_STANDBY if flight.landed is Landed.ON_GROUND else dialect.MAV_STATE_ACTIVE
         return dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_QUADROTOR, kind, base, flight.mode, status, 3)
 
-    def _position(self) -> Message:
+    def _position(self) -> Message | None:
         motion = self.flight.motion
         lat, lon = motion.chart.to_degrees(*motion.seen)
+        if not self._has_fix:  # PX4 says nothing, ArduCopter 0, 0
+            return None if self.autopilot is Autopilot.PX4 else self._nowhere()
         heading = round(math.degrees(motion.yaw) % 360.0 * 100.0) % 36000
         return dialect.MAVLink_global_position_int_message(
             self._boot_ms, round(lat * 1e7), round(lon * 1e7), round((motion.chart.alt_m + motion.up) * 1e3),
             round(motion.up * 1e3), round(motion.vn * 100), round(motion.ve * 100), round(-motion.vu * 100), heading,
         )  # fmt: skip
+
+    def _nowhere(self) -> Message:
+        return dialect.MAVLink_global_position_int_message(self._boot_ms, 0, 0, 0, 0, 0, 0, 0, 65535)
 
     def _attitude(self) -> Message:
         motion = self.flight.motion
@@ -310,6 +347,8 @@ class SimVehicle:
 
     def _gps(self) -> Message:
         motion = self.flight.motion
+        if not self._has_fix:
+            return dialect.MAVLink_gps_raw_int_message(0, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0)
         lat, lon = motion.chart.to_degrees(*motion.seen)
         return dialect.MAVLink_gps_raw_int_message(
             int((self._now - self._booted) * 1e6), 3, round(lat * 1e7), round(lon * 1e7),
@@ -319,16 +358,31 @@ class SimVehicle:
 
     def _power(self) -> Message:
         left = max(0, 100 - int((self._now - self._booted) / 18.0))
-        return dialect.MAVLink_sys_status_message(0, 0, 0, 250, 15800, 1200, left, 0, 0, 0, 0, 0, 0)
+        has = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
+        said = 0 if self.autopilot is Autopilot.PX4 else has  # PX4 sets the bit of health only
+        health = has if self._ready else 0
+        return dialect.MAVLink_sys_status_message(said, said, health, 250, 15800, 1200, left, 0, 0, 0, 0, 0, 0)
 
-    def _home(self) -> Message:
+    def _filter(self) -> Message:
+        """What it says of its filter; flags as ArduCopter 4.7 and PX4 were seen to send them."""
+        if self.autopilot is Autopilot.PX4:
+            flags = 0x3FF if self._ready else 0xA5
+            return dialect.MAVLink_estimator_status_message(self._boot_ms * 1000, flags, *(0.0,) * 8)
+        flags = 0x33F if self._ready else 0xA7
+        return dialect.MAVLink_ekf_status_report_message(flags, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def _home(self) -> Message | None:
+        if not self._has_fix:
+            return None
         lat, lon, alt = self.home
         return dialect.MAVLink_home_position_message(
             round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
         )
 
 
-_MAKERS: Final = {
+_MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
+    _EKF: SimVehicle._filter,
+    _ESTIMATOR: SimVehicle._filter,
     _HEARTBEAT: SimVehicle._heartbeat,
     _POSITION: SimVehicle._position,
     _ATTITUDE: SimVehicle._attitude,
@@ -342,7 +396,7 @@ _MAKERS: Final = {
 
 
 def _severity(text: str) -> int:
-    bad = text.startswith(("Arm:", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
+    bad = text.startswith(("Arm:", "PreArm:", "Preflight", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
     return int(dialect.MAV_SEVERITY_CRITICAL if bad else dialect.MAV_SEVERITY_INFO)
 
 

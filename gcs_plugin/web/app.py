@@ -19,7 +19,7 @@ from gcs_plugin.daemon.intake.posted_pose import PostedPose, parse_pose, parse_t
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.daemon.takeoffs import names_of
-from gcs_plugin.daemon.vehicles import Flock
+from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.web.guard import Guard, TooLarge, bounded
 from orthoswarm import __version__
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -267,22 +267,22 @@ class Routes:
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
         """Upload ({"plan": id, "mission": "v1"}), start, pause, resume or rtl. Answers when the vehicle has."""
         body = await self.body(request)
-        flock = self.daemon.flock
+        links = self.daemon.links
         if verb not in ("upload", "start", "pause", "resume", "rtl"):
             raise HTTPException(404, "there is no such command; choose upload, start, pause, resume or rtl")
-        text = await self.work(self._command, self._linked(flock), vehicle, verb, body)
+        text = await self.work(self._command, self._linked(links), vehicle, verb, body)
         return Ascii({"vehicle": vehicle, "command": verb, "ok": True, "text": text})
 
-    def _command(self, flock: Flock, vehicle: str, verb: str, body: dict[str, Any]) -> str:
-        system = flock.system_of(vehicle)
+    def _command(self, links: VehicleLinks, vehicle: str, verb: str, body: dict[str, Any]) -> str:
+        system = links.system_of(vehicle)
         if verb == "upload":
-            autopilot = flock.fleet.vehicles[system].autopilot
+            autopilot = links.fleet.vehicles[system].autopilot
             mission = self.daemon.plans.mission(body, vehicle, autopilot)
-            return flock.command(lambda fleet: fleet.upload(system, mission))
+            return links.command(lambda fleet: fleet.upload(system, mission))
         waited = self._linked(self.daemon.takeoffs).cancel(vehicle)
         if waited is not None and verb in ("pause", "rtl"):
             return f"{vehicle} stays on the ground: its takeoff in {waited:.0f} s is cancelled"
-        return flock.command(lambda fleet: getattr(fleet, verb)(system))
+        return links.command(lambda fleet: getattr(fleet, verb)(system))
 
     async def body(self, request: Request) -> dict[str, Any]:
         """The JSON object of a request; an empty one for an empty body."""

@@ -1,6 +1,7 @@
 """The fleet over simulated vehicles: found and lost, streams, routing, faults, commands, nothing sent unasked."""
 
 import json
+import math
 import threading
 import time
 from random import Random
@@ -8,7 +9,7 @@ from random import Random
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.vehicle_state import BootClock
+from gcs_plugin.fleet.routes import BootClock
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.tlog_writer import read_tlog
@@ -44,9 +45,9 @@ def sent_by(world):
     """Everything that the fleet has put on the link from now on, decoded."""
     messages, put = [], world.link.send
 
-    def send(peer, data):
+    def send(peer, data, expires=math.inf):
         messages.extend(packet.message for packet in Framer().feed(data))
-        put(peer, data)
+        return put(peer, data, expires)
 
     world.link.send = send
     return messages
@@ -68,7 +69,7 @@ def test_streams_run_at_the_rates_asked_for_on_both_autopilots(make_world):
         assert counts[system, "GLOBAL_POSITION_INT"] == pytest.approx(100, abs=2)
         assert counts[system, "ATTITUDE"] == pytest.approx(100, abs=2)
         assert counts[system, "MISSION_CURRENT"] == pytest.approx(20, abs=1)
-    assert world.fleet.vehicles[1].streams.refused == {132, 285}  # neither rangefinder nor gimbal
+    assert world.fleet.vehicles[1].streams.refused == {132, 230, 285}  # PX4's filter, rangefinder, gimbal
     assert sum(vehicle.missed for vehicle in world.fleet.vehicles.values()) == 0
 
 
@@ -101,7 +102,7 @@ def test_a_silent_vehicle_is_lost_and_found_again(make_world):
     assert kinds(world.events) == ["found", "lost"]
     assert world.fleet.vehicles[1].summary(world.clock.now)["state"] == "lost"
     with pytest.raises(OrthoSwarmError, match="lost"):
-        world.fleet.rtl(1)
+        world.fleet.start(1)
     world.wait(6.0)
     assert kinds(world.events) == ["found", "lost", "regained"]
 
@@ -202,7 +203,7 @@ def test_rtl_goes_before_a_start_under_way(make_world):
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, END)))
     start = world.fleet.start(1)
-    world.wait(5.0)
+    world.wait(2.0)
     rtl = world.fleet.rtl(1)
     assert not start.outcome.ok and "another command" in start.outcome.text
     assert world.finish(rtl)[0].ok
@@ -224,15 +225,17 @@ def test_the_swarm_flies_and_each_vehicle_completes_once(make_world):
     assert all(vehicle.photos == 6 for vehicle in fleet.vehicles.values())
 
 
-def test_two_vehicles_with_one_system_id_are_named_and_not_commanded(make_world):
+def test_two_vehicles_with_one_system_id_are_named_and_not_started(make_world):
     late = SimVehicle(1, AP)
     world = make_world(SimVehicle(1, AP), late)
     world.wait(20.0)
     late.reboot(world.clock.now, 1.0)  # now their clocks differ, as those of two vehicles do
     world.wait(10.0)
     assert "conflict" in kinds(world.events)
-    with pytest.raises(OrthoSwarmError, match="two vehicles use system id 1"):
-        world.fleet.rtl(1)
+    with pytest.raises(
+        OrthoSwarmError, match="several vehicles use system id 1 \\(simulation number 0, simulation number 1"
+    ):
+        world.fleet.start(1)
 
 
 def test_a_boot_clock_tells_restarts_from_late_copies():

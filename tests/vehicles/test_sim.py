@@ -184,17 +184,19 @@ def test_a_home_first_list_is_refused_by_px4_at_the_start():
     assert not outcome.ok and "Takeoff waypoint required" in outcome.text
 
 
-def test_arming_waits_for_the_position_and_says_why_it_cannot():
+def test_a_vehicle_that_is_not_ready_refuses_to_arm_and_says_why():
     world = make_world([SimVehicle(1, AP, ready_s=20.0)])
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, *ENDINGS["rtl"])))
     (outcome,) = world.finish(world.fleet.start(1))
-    assert outcome.ok and world.clock.now > 20.0
+    assert not outcome.ok and "Arm: Need Position Estimate" in outcome.text
+    world.wait(20.0)
+    assert world.finish(world.fleet.start(1))[0].ok
     never = make_world([SimVehicle(1, PX4, ready_s=1e9)])
     never.meet()
     never.finish(never.fleet.upload(1, mission(PX4, *ENDINGS["rtl"])))
     (outcome,) = never.finish(never.fleet.start(1))
-    assert not outcome.ok and "refuses to arm" in outcome.text and "Need Position Estimate" in outcome.text
+    assert not outcome.ok and "refuses to arm" in outcome.text and "Waiting for estimator" in outcome.text
 
 
 def test_a_jump_is_flown_as_often_as_it_says():

@@ -77,10 +77,12 @@ def run(args: argparse.Namespace) -> int:
         signal.signal(number, lambda *_: stop.set())
     with Fleet(args.link, own=own, key=find_key()) as fleet:
         relay = Relay(fleet, args.relay, own) if args.relay else None
+        if relay is not None:
+            relay.start()  # before anything waits: it takes every packet that the fleet hears
         try:
-            place = wait_for_place(fleet, args.vehicles, _WAIT_S)
-            if relay is not None:
-                relay.start()
+            place = wait_for_place(fleet, args.vehicles, _WAIT_S, stop, _say)
+            if place is None:
+                return 1
             poller = threading.Thread(target=fleet.run, args=(stop,), name="links", daemon=True)
             poller.start()
             folder, world = _world(args, place)
@@ -105,6 +107,10 @@ def run(args: argparse.Namespace) -> int:
         for row in rows:
             print(f"{row['id']}: {row['pictures']} pictures, {row['skipped']} skipped {row['problem']}".rstrip())
     return 0 if any(row["pictures"] for row in rows) else 1
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _world(args: argparse.Namespace, place: tuple[float, float]) -> tuple[Path, Any]:

@@ -1,0 +1,91 @@
+"""What a person tells vehicles to do, as a value: one id, one expiry, one outcome, the same for every console."""
+
+import itertools
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from gcs_plugin.mission.exchange import COMMAND_S, Outcome, Verdict
+
+if TYPE_CHECKING:
+    from gcs_plugin.mission.exchange import Exchange
+
+Verb = Literal["start", "pause", "resume", "rtl", "land"]
+VERBS: Final[tuple[Verb, ...]] = ("start", "pause", "resume", "rtl", "land")
+URGENT: Final[frozenset[str]] = frozenset({"pause", "rtl", "land"})
+"""Commands that bring a flight to its end: no doubt about identity or link ever blocks them."""
+
+_numbers = itertools.count(1)
+
+
+def new_id() -> str:
+    """An id that no other command of this or another station has."""
+    return f"{os.getpid():x}-{os.urandom(3).hex()}-{next(_numbers)}"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandResult:
+    """How a command to one vehicle ended.
+
+    Attributes:
+        id: of the command; a command to several vehicles has one id.
+        vehicle: its name: v1, or as the operator calls it.
+        command: `start`, `pause`, `resume`, `rtl`, `land`, or `upload`.
+        outcome: DONE: the vehicle acknowledged it. REFUSED: it or the station said no. NOT_SENT: nothing left the
+            station. UNKNOWN: it was sent and not answered.
+        reason: one sentence; where it was not done it says why, and what to do.
+    """
+
+    id: str
+    vehicle: str
+    command: str
+    outcome: Verdict
+    reason: str
+
+    def document(self) -> dict[str, Any]:
+        """As JSON values: `id`, `vehicle`, `command`, `outcome` (done, refused, not_sent, unknown), `reason`."""
+        return {
+            "id": self.id, "vehicle": self.vehicle, "command": self.command, "outcome": self.outcome.value,
+            "reason": self.reason,
+        }  # fmt: skip
+
+
+@dataclass(slots=True, eq=False)
+class Order:
+    """One command to one vehicle, under way or ended.
+
+    Attributes:
+        verb: what to do. system: the vehicle.
+        given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND_S after that.
+        id: of the command.
+        exchange: the dialogue with the vehicle, None where it did not come to one.
+    """
+
+    verb: Verb
+    system: int
+    given_s: float
+    id: str = field(default_factory=new_id)
+    exchange: "Exchange | None" = None
+    _ended: Outcome | None = None
+
+    @property
+    def expires_s(self) -> float:
+        """When it may no longer be sent."""
+        return self.given_s + COMMAND_S
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """How it ended, None while it is under way."""
+        return self.exchange.outcome if self.exchange is not None else self._ended
+
+    def end(self, text: str, failure: Verdict) -> "Order":
+        """End it without a dialogue."""
+        self._ended = Outcome(False, text, failure=failure)
+        return self
+
+    def result(self, name: str = "") -> CommandResult | None:
+        """How it ended, None while it is under way."""
+        outcome = self.outcome
+        if outcome is None:
+            return None
+        return CommandResult(self.id, name or f"v{self.system}", self.verb, outcome.verdict, outcome.text)

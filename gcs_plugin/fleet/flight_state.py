@@ -1,0 +1,121 @@
+"""What a vehicle is doing, in one word, from its mode, speed, height and mission together, for both autopilots."""
+
+import enum
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.completion import Phase
+from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+
+STILL_S: Final = 2.5
+"""How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
+_SINKS_M_S: Final = 0.3
+_SLOW_M_S: Final = 1.0
+_LOW_M: Final = 1.5
+_MISSION_PAUSED: Final = 4
+_RETURNS: Final = frozenset({"RTL", "SMART_RTL", "AUTO_RTL", "QRTL"})
+_LANDS: Final = frozenset({"LAND", "QLAND"})
+_HOLDS: Final = frozenset({"HOLD", "BRAKE", "LOITER", "POSHOLD", "GUIDED", "QHOVER", "QLOITER"})
+_TIMED: Final = frozenset({DELAY, LOITER_UNLIM, int(dialect.MAV_CMD_NAV_LOITER_TIME)})
+
+
+class Word(enum.Enum):
+    """What a vehicle is doing. FLYING: in the air without a mission; HOLDING: in the air after its mission's end."""
+
+    ON_GROUND = "on ground"
+    TAKING_OFF = "taking off"
+    ON_MISSION = "on mission"
+    PAUSED = "paused"
+    RETURNING = "returning"
+    LANDING = "landing"
+    HOLDING = "holding"
+    FLYING = "flying"
+    LOST = "lost"
+    COMPLETE = "complete"
+
+
+@dataclass(frozen=True, slots=True)
+class FlightState:
+    """What a vehicle is doing.
+
+    Attributes:
+        word: in a word.
+        item: the mission item that it is at, counted from 1. items: of so many; 0 where neither is known.
+    """
+
+    word: Word
+    item: int = 0
+    items: int = 0
+
+    @property
+    def text(self) -> str:
+        """For people: `on mission 7/13`."""
+        counted = self.word in (Word.ON_MISSION, Word.PAUSED) and self.items
+        return f"{self.word.value} {self.item}/{self.items}" if counted else self.word.value
+
+    def document(self) -> dict[str, Any]:
+        """As JSON values: `state` (the word), `text`, `item`, `items`."""
+        return {"state": self.word.value, "text": self.text, "item": self.item, "items": self.items}
+
+
+def flight_state(vehicle: "Vehicle") -> FlightState:
+    """What a vehicle is doing, as far as its messages tell."""
+    items = vehicle.mission_total
+    first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
+    return FlightState(_word(vehicle), min(vehicle.mission_seq + first, items), items)
+
+
+def _word(vehicle: "Vehicle") -> Word:
+    if vehicle.lost:
+        return Word.LOST
+    if not vehicle.flying:
+        done = vehicle.detector.phase is Phase.COMPLETE and not vehicle.armed
+        return Word.COMPLETE if done else Word.ON_GROUND
+    mode = vehicle.mode
+    if mode in _LANDS:
+        return Word.LANDING
+    if mode in _RETURNS:
+        return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
+    if mode == "TAKEOFF":
+        return Word.TAKING_OFF
+    if vehicle.custom_mode == vehicle.modes.mission:
+        return _on_mission(vehicle)
+    if vehicle.detector.phase is Phase.COMPLETE:
+        return Word.HOLDING
+    if mode in _HOLDS and vehicle.detector.phase is Phase.SUSPENDED:
+        return Word.PAUSED
+    return Word.FLYING
+
+
+def _on_mission(vehicle: "Vehicle") -> Word:
+    command, waits = _item(vehicle)
+    if command == RTL:
+        return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
+    if command in (LAND, VTOL_LAND) and _comes_down(vehicle):
+        return Word.LANDING
+    if vehicle.detector.phase is Phase.COMPLETE:
+        return Word.LANDING if _comes_down(vehicle) else Word.HOLDING
+    if command == TAKEOFF or vehicle.landed == "taking off":
+        return Word.TAKING_OFF
+    if vehicle.mission_state == _MISSION_PAUSED or (vehicle.still_s >= STILL_S and not waits):
+        return Word.PAUSED
+    return Word.ON_MISSION
+
+
+def _item(vehicle: "Vehicle") -> tuple[int | None, bool]:
+    """The present item's command, and whether it lets the vehicle wait; None where the mission is not known."""
+    mission = vehicle.mission
+    if mission is None or not 0 <= vehicle.mission_seq < len(mission.items):
+        return None, False
+    item = mission.items[vehicle.mission_seq]
+    return item.command, item.command in _TIMED or (item.command == WAYPOINT and item.params[0] > 0.0)
+
+
+def _comes_down(vehicle: "Vehicle") -> bool:
+    sinks = vehicle.velocity_m_s[2] > _SINKS_M_S and math.hypot(*vehicle.velocity_m_s[:2]) < _SLOW_M_S
+    return vehicle.landed == "landing" or sinks

@@ -1,0 +1,267 @@
+"""The check before a start, as data: for each vehicle a list of items, each ok, warning or red, with a reason.
+
+Red items stop a start unless each is overridden by its name. What an autopilot itself checks before it arms (its
+pre-arm checks, its filter) is asked for here, so that nobody takes off while another one cannot.
+"""
+
+import enum
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from gcs_plugin.mission.comparison import difference
+from gcs_plugin.mission.control import unflyable
+from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.mission.items import Mission
+
+ITEMS: Final = (
+    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "height", "separation",
+)  # fmt: skip
+LEGAL_HEIGHT_M: Final = 120.0
+"""Height up to which drones fly without a permit in the EU (2019/947, UAS.OPEN.010); 400 ft in the US."""
+ENDURANCE_S: Final = 1200.0
+"""Flight time of a full battery where the plan does not say it."""
+RESERVE: Final = 0.2
+"""Share of the battery that is to be left after landing."""
+_LINK_S: Final = (2.0, 5.0)
+_SATELLITES: Final = (6, 10)
+_HOME_M: Final = 50.0
+_UNKNOWN_SATELLITES: Final = 255
+
+
+class Level(enum.Enum):
+    """How an item stands."""
+
+    OK = "ok"
+    WARNING = "warning"
+    RED = "red"
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One item of a check.
+
+    Attributes:
+        name: one of ITEMS.
+        level: how it stands.
+        reason: in words, what was found.
+    """
+
+    name: str
+    level: Level
+    reason: str
+
+    def document(self) -> dict[str, str]:
+        """As JSON values: `name`, `state` (`ok`, `warning`, `red`), `reason`."""
+        return {"name": self.name, "state": self.level.value, "reason": self.reason}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The check of one vehicle.
+
+    Attributes:
+        system: the vehicle.
+        items: in the order of ITEMS.
+    """
+
+    system: int
+    items: tuple[Item, ...]
+
+    def red(self, overridden: Iterable[str] = ()) -> list[Item]:
+        """The items that stop a start, without those that are overridden by name."""
+        allowed = set(overridden)
+        return [item for item in self.items if item.level is Level.RED and item.name not in allowed]
+
+    @property
+    def level(self) -> Level:
+        """The worst of its items."""
+        levels = {item.level for item in self.items}
+        return Level.RED if Level.RED in levels else Level.WARNING if Level.WARNING in levels else Level.OK
+
+    def document(self, name: str) -> dict[str, Any]:
+        """As JSON values: `vehicle`, `state` (the worst), `items`."""
+        rows = [item.document() for item in self.items]
+        return {"vehicle": name, "state": self.level.value, "items": rows}
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a start is to be checked against.
+
+    Attributes:
+        mission: the plan's mission of this vehicle, None to fly what it holds.
+        stored: what was read from the vehicle just now, None to believe what is known.
+        endurance_s: flight time of a full battery.
+        legal_height_m: height above takeoff that may be flown without asking.
+        near: what the separation check found about this vehicle, empty if all is well.
+    """
+
+    mission: "Mission | None" = None
+    stored: "Mission | None" = None
+    endurance_s: float = ENDURANCE_S
+    legal_height_m: float = LEGAL_HEIGHT_M
+    near: str = ""
+
+
+def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
+    """Check one vehicle before its start.
+
+    Args:
+        vehicle: as the fleet knows it. wanted: what it is to fly. now: the fleet's clock.
+    """
+    mission = wanted.mission or wanted.stored or vehicle.mission
+    items = (
+        _link(vehicle, now), _gps(vehicle), _ekf(vehicle), _home(vehicle), _prearm(vehicle, now),
+        _battery(vehicle, mission, wanted.endurance_s), _mission(vehicle, wanted), _height(mission, wanted),
+        Item("separation", Level.RED, wanted.near) if wanted.near else Item("separation", Level.OK, "keeps apart"),
+    )  # fmt: skip
+    return Check(vehicle.system, items)
+
+
+def preflight_all(
+    vehicles: "Mapping[int, Vehicle]",
+    missions: "Mapping[int, Mission]",
+    stored: "Mapping[int, Mission]",
+    starts: Mapping[int, float],
+    now: float,
+    *,
+    endurance_s: float = ENDURANCE_S,
+    legal_height_m: float = LEGAL_HEIGHT_M,
+) -> list[Check]:
+    """Check vehicles that are to start together.
+
+    Args:
+        vehicles: by system id, as the fleet knows them.
+        missions: the plan's; whatever a vehicle holds is flown where there is none.
+        stored: what was read from the vehicles just now.
+        starts: takeoffs in seconds after the first; 0 where none is said.
+        now: the fleet's clock.
+        endurance_s, legal_height_m: see Wanted.
+    """
+    flown = {s: m for s, v in vehicles.items() if (m := missions.get(s) or stored.get(s) or v.mission) is not None}
+    near = near_text(flown, starts) if set(flown) - set(missions) else {}
+    return [
+        preflight(
+            vehicle,
+            Wanted(missions.get(s), stored.get(s), endurance_s, legal_height_m, near.get(s, "")),
+            now,
+        )
+        for s, vehicle in sorted(vehicles.items())
+    ]
+
+
+def near_text(missions: "Mapping[int, Mission]", starts: Mapping[int, float]) -> dict[int, str]:
+    """For vehicles whose missions come too near each other with these starts: whom they meet, when, how near.
+
+    Missions of one plan with the plan's own starts keep apart by construction and need no check.
+    """
+    found: dict[int, list[str]] = {}
+    for one, other, at, metres in Airspace.of(missions).conflicts({s: starts.get(s, 0.0) for s in missions}):
+        for mine, theirs in ((one, other), (other, one)):
+            found.setdefault(mine, []).append(f"{metres:.0f} m from v{theirs} after {at:.0f} s")
+    return {
+        s: f"comes within {', '.join(texts[:3])}; start them later, or plan them together" for s, texts in found.items()
+    }
+
+
+def red_text(checks: Sequence[Check], overridden: Mapping[int, Iterable[str]]) -> dict[int, str]:
+    """For each vehicle that may not start: why, in words."""
+    found = {check.system: check.red(overridden.get(check.system, ())) for check in checks}
+    return {system: "; ".join(f"{i.name}: {i.reason}" for i in items) for system, items in found.items() if items}
+
+
+def _link(vehicle: "Vehicle", now: float) -> Item:
+    age = now - vehicle.heard
+    if vehicle.claimants:
+        return Item("link", Level.RED, f"several vehicles use its system id: {', '.join(vehicle.claimants)}")
+    if vehicle.lost or age > _LINK_S[1]:
+        return Item("link", Level.RED, f"silent for {age:.0f} s")
+    level = Level.OK if age <= _LINK_S[0] else Level.WARNING
+    return Item("link", level, f"heard {age:.1f} s ago")
+
+
+def _gps(vehicle: "Vehicle") -> Item:
+    count = vehicle.satellites
+    if vehicle.gps_fix < 3:
+        return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
+    if vehicle.lat_deg is None:
+        return Item("gps", Level.RED, "it has not said where it is")
+    if count < _SATELLITES[0]:
+        return Item("gps", Level.RED, f"{count} satellites, {_SATELLITES[0]} are needed")
+    level = Level.OK if count >= _SATELLITES[1] else Level.WARNING
+    return Item("gps", level, "3D fix" if count == _UNKNOWN_SATELLITES else f"3D fix, {count} satellites")
+
+
+def _ekf(vehicle: "Vehicle") -> Item:
+    if vehicle.ekf_ok is None:
+        return Item("ekf", Level.WARNING, "it does not report its position filter")
+    if not vehicle.ekf_ok:
+        return Item("ekf", Level.RED, "its position filter has no absolute position yet; wait")
+    return Item("ekf", Level.OK, "position filter is running")
+
+
+def _home(vehicle: "Vehicle") -> Item:
+    if vehicle.home is None:
+        return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
+    if vehicle.lat_deg is None or vehicle.lon_deg is None:
+        return Item("home", Level.WARNING, "set, but the vehicle does not say where it is")
+    north = math.radians(vehicle.lat_deg - vehicle.home[0]) * 6_371_000.0
+    east = math.radians(vehicle.lon_deg - vehicle.home[1]) * 6_371_000.0 * math.cos(math.radians(vehicle.lat_deg))
+    away = math.hypot(north, east)
+    if away > _HOME_M and not vehicle.flying:
+        return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
+    return Item("home", Level.OK, "set")
+
+
+def _prearm(vehicle: "Vehicle", now: float) -> Item:
+    if vehicle.armed:
+        return Item("pre-arm", Level.OK, "armed")
+    if vehicle.prearm_ok is None:
+        return Item("pre-arm", Level.WARNING, "it does not report its pre-arm checks")
+    if not vehicle.prearm_ok:
+        said = "; ".join(vehicle.prearm_texts(now)) or "it does not say why yet"
+        return Item("pre-arm", Level.RED, f"would refuse to arm: {said}")
+    return Item("pre-arm", Level.OK, "its own checks passed")
+
+
+def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float) -> Item:
+    left = vehicle.battery
+    if left is None:
+        return Item("battery", Level.WARNING, "it does not report its battery")
+    needed = flight_seconds(mission) / endurance_s if mission is not None else 0.0
+    text = f"{100 * left:.0f} % left, the mission needs about {100 * needed:.0f} %"
+    if left < needed or left < 0.5 * RESERVE:
+        return Item("battery", Level.RED, f"{text}; change the battery")
+    if left < needed + RESERVE:
+        return Item("battery", Level.WARNING, f"{text}; less than {100 * RESERVE:.0f} % would be left")
+    return Item("battery", Level.OK, text)
+
+
+def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
+    held = wanted.stored or vehicle.mission
+    if held is None:
+        return Item("mission", Level.RED, "what it holds is not known; upload its mission, or let it be read")
+    wrong = unflyable(held.items, vehicle.autopilot, in_air=vehicle.flying)
+    if wrong:
+        return Item("mission", Level.RED, wrong)
+    if wanted.mission is not None:
+        found = difference(wanted.mission, held.items)
+        if found is not None:
+            return Item("mission", Level.RED, f"it does not hold this plan's mission ({found.text}); upload the plan")
+        return Item("mission", Level.OK, "holds this plan's mission")
+    return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
+
+
+def _height(mission: "Mission | None", wanted: Wanted) -> Item:
+    top = highest_m(mission) if mission is not None else None
+    if top is None:
+        return Item("height", Level.OK, "no height above takeoff in its mission")
+    if top > wanted.legal_height_m:
+        text = f"goes up to {top:.0f} m, above {wanted.legal_height_m:.0f} m; allow it if you may fly there"
+        return Item("height", Level.RED, text)
+    return Item("height", Level.OK, f"goes up to {top:.0f} m")

@@ -1,0 +1,160 @@
+"""The ways on which one vehicle is heard: the better one carries commands, another takes over when it falls silent.
+
+One vehicle on two links (radio and LTE) is normal. Two vehicles with one system id are not: their own clocks, which
+start at their boots, tell them apart.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.link_hub import Side
+    from gcs_plugin.links.transports import Peer
+
+FRESH_S: Final = 2.0
+_KNOWN_S: Final = 30.0
+_VERDICT_S: Final = 10.0
+_BOOT_GAP_S: Final = 3.0
+_BETTER: Final = 0.2
+_SMOOTHING: Final = 0.02
+_CLOCK_S: Final = 1.5
+_ASK_CLOCK_S: Final = 3.0
+
+
+@dataclass(slots=True)
+class BootClock:
+    """Watches a vehicle's own clock, which only a restart (or a second vehicle with the same id) sets back."""
+
+    last_s: float = -1.0
+    _low: int = 0
+    _returns: float = 0.0
+    _restarted: float = -1e9
+
+    def feed(self, time_boot_s: float, now: float) -> str:
+        """Take a time since boot; returns "", "rebooted", or "mixed" where two clocks take turns.
+
+        Single packets from the past are late copies: a restart shows in three in a row.
+        """
+        if time_boot_s >= self.last_s - 1.5:
+            self._returns = 0.98 * self._returns + (1.0 if self._low else 0.0)
+            self._low, self.last_s = 0, max(self.last_s, time_boot_s)
+            return "mixed" if self._returns > 5.0 else ""
+        self._low += 1
+        if self._low < 3:
+            return ""
+        again, self._restarted = now - self._restarted < 10.0, now
+        self._low, self.last_s = 0, time_boot_s
+        return "mixed" if again else "rebooted"
+
+
+@dataclass(slots=True)
+class Route:
+    """A way on which a vehicle is heard.
+
+    Attributes:
+        side: the link; peer: the sender on it.
+        heard: when something came last (the fleet's clock).
+        loss: share of packets that were lost lately, from the sender's counter.
+        boot: the vehicle's start on that clock, from its own counter; None before the first position.
+        boot_at: when that was computed; asked_at: when its clock was asked for.
+        clock: watches the counter.
+    """
+
+    side: "Side"
+    peer: "Peer"
+    heard: float
+    loss: float = 0.0
+    boot: float | None = None
+    boot_at: float = 0.0
+    asked_at: float = 0.0
+    clock: BootClock = field(default_factory=BootClock)
+
+    @property
+    def address(self) -> str:
+        """The link and, where several speak on it, who."""
+        name = self.side.link.name
+        if isinstance(self.peer, tuple) and len(self.peer) >= 2:
+            return f"{name} from {self.peer[0]}:{self.peer[1]}"
+        return f"{name} number {self.peer}" if isinstance(self.peer, int) else name
+
+    def counted(self, lost: int) -> None:
+        """A packet has come, after so many that were lost."""
+        for _ in range(min(lost, 20)):
+            self.loss += _SMOOTHING * (1.0 - self.loss)
+        self.loss -= _SMOOTHING * self.loss
+
+
+@dataclass(slots=True)
+class Routes:
+    """All ways to one vehicle.
+
+    Attributes:
+        known: by link and peer.
+        best: the one that carries commands, None before the first packet.
+        claimants: addresses of those who use the vehicle's system id, where they are several; empty otherwise.
+    """
+
+    known: "dict[tuple[Side, Peer], Route]" = field(default_factory=dict)
+    best: Route | None = None
+    claimants: tuple[str, ...] = ()
+    _claimed_until: float = -1.0
+
+    def heard(self, side: "Side", peer: "Peer", now: float) -> tuple[Route, bool]:
+        """The way on which a packet has come, and whether another one has taken over with it."""
+        route = self.known.get((side, peer))
+        if route is None:
+            route = self.known[side, peer] = Route(side, peer, now)
+        route.heard = now
+        best = self.best
+        if best is None or (best is not route and now - best.heard > FRESH_S):
+            self.best = route
+            return route, best is not None
+        return route, False
+
+    def stale(self, route: Route, now: float) -> bool:
+        """True for a way beside the one in use: what it says of the vehicle's state may be late."""
+        return route is not self.best and self.best is not None and now - self.best.heard < 1.0
+
+    def fresh(self, now: float, within_s: float = FRESH_S) -> list[Route]:
+        """The ways on which something came lately."""
+        return [route for route in self.known.values() if now - route.heard < within_s]
+
+    def towards(self, now: float, *, everywhere: bool) -> list[Route]:
+        """Where to send: the best way, or every way on which the vehicle was heard lately."""
+        if self.best is None:
+            return []
+        if not everywhere:
+            return [self.best]
+        return self.fresh(now, _KNOWN_S) or [self.best]
+
+    def mixed(self, now: float) -> None:
+        """Two clocks take turns on one way: several vehicles behind one link."""
+        self._claimed_until = now + _VERDICT_S
+
+    def compare(self, now: float) -> bool:
+        """Look whether one or several vehicles speak, and which way is best; True if another way has taken over."""
+        fresh = self.fresh(now)
+        boots = [route.boot for route in fresh if route.boot is not None and now - route.boot_at < _CLOCK_S]
+        if boots and max(boots) - min(boots) > _BOOT_GAP_S:
+            self._claimed_until = now + _VERDICT_S
+        several = now < self._claimed_until
+        self.claimants = tuple(sorted({*self.claimants, *(r.address for r in fresh)})) if several else ()
+        best = self.best
+        if several or best is None or len(fresh) < 2:
+            return False
+        better = min(fresh, key=lambda route: route.loss)
+        if better is best or better.loss > best.loss - _BETTER:
+            return False
+        self.best = better
+        return True
+
+    def unasked(self, now: float) -> list[Route]:
+        """Ways beside the best whose clock should be asked for."""
+        routes = [
+            route
+            for route in self.fresh(now)
+            if route is not self.best and now - route.boot_at > _CLOCK_S and now - route.asked_at > _ASK_CLOCK_S
+        ]
+        for route in routes:
+            route.asked_at = now
+        return routes

@@ -1,0 +1,205 @@
+"""Where a vehicle is when it flies a mission, and whether two missions keep apart: the planner's own model and measure.
+
+A mission is a path: takeoff at home, waypoints, the way back. The planner's `Motion` says when each point of it is
+passed (orthoswarm.planning.sorties.flight_time), and vehicles keep apart if at any moment, and a few seconds earlier or
+later, they are far enough from each other or at another height (orthoswarm.planning.sorties.deconfliction).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
+
+if TYPE_CHECKING:
+    from gcs_plugin.mission.items import Mission
+
+Array = NDArray[np.float64]
+
+_STEP_S: Final = 0.5
+_GROUND_M: Final = 2.0
+_SPEED_M_S: Final = 5.0
+_EARTH_M: Final = 6_378_137.0
+_HAIR_M: Final = 0.01
+_PAD: Final = 1.5  # radius about a start that vehicles share, in separation distances: only time keeps them apart there
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A flight, sampled every half second from its start on.
+
+    Attributes:
+        places: float64 (n, 3), east and north of a common origin and height over takeoff, metres.
+    """
+
+    places: Array
+
+    def pad(self, radius_m: float) -> NDArray[np.bool_]:
+        """Samples near its start."""
+        return np.asarray(np.hypot(*(self.places[:, :2] - self.places[0, :2]).T) < radius_m)
+
+
+def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, float]:
+    """The points of a mission, float64 (n, 3): east, north, height in metres; and its speed in m/s.
+
+    Args:
+        mission: the mission. origin: latitude and longitude in degrees of east 0, north 0.
+    """
+    points: list[tuple[float, float, float]] = []
+    home, speed = _home_of(mission), _SPEED_M_S
+    base = _ground_m(mission)
+    if home is not None:
+        points.append((*_metres(*home, origin), 0.0))
+    for item in mission.items[mission.first_seq :]:
+        if item.command == CHANGE_SPEED and item.params[1] > 0.0:
+            speed = item.params[1]
+        elif item.command == RTL and home is not None and points:
+            top = points[-1][2]
+            points += [(*_metres(*home, origin), top), (*_metres(*home, origin), 0.0)]
+        elif item.is_nav and item.has_place:
+            height = item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
+            place = (item.lat_deg, item.lon_deg) if item.x or item.y else home
+            if place is None:
+                continue
+            if item.command in (LAND, VTOL_LAND) and points:
+                points.append((*_metres(*place, origin), points[-1][2]))
+                height = 0.0
+            points.append((*_metres(*place, origin), height))
+    return np.array(points, float).reshape(-1, 3), speed
+
+
+def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
+    """A mission as positions over time."""
+    from orthoswarm.planning.sorties.flight_time import Motion
+
+    points, speed = flight_path(mission, origin)
+    if len(points) < 2:
+        return Track(points)
+    times = Motion(speed_m_s=speed).times(points)
+    moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
+    return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
+
+
+def flight_seconds(mission: "Mission") -> float:
+    """How long a mission takes, by the planner's model."""
+    home = _home_of(mission)
+    return 0.0 if home is None else _STEP_S * max(0, len(track_of(mission, home).places) - 1)
+
+
+def highest_m(mission: "Mission") -> float | None:
+    """The greatest height above takeoff in a mission, None where it says none."""
+    base = _ground_m(mission)
+    heights = [
+        item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
+        for item in mission.items[mission.first_seq :]
+        if item.is_nav and item.has_place
+    ]
+    return max(heights, default=None)
+
+
+@dataclass(slots=True)
+class Airspace:
+    """Missions that are flown together, and the times at which that is safe.
+
+    Attributes:
+        tracks: by system id.
+        distance_m, height_m, slack_s: how far apart, or at what other height, and how many seconds off schedule.
+        launch_s: time between takeoffs at one start.
+    """
+
+    tracks: dict[int, Track]
+    distance_m: float = 10.0
+    height_m: float = 5.0
+    slack_s: float = 3.0
+    launch_s: float = 5.0
+
+    @classmethod
+    def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
+        """Of missions by system id."""
+        origin = next((home for mission in missions.values() if (home := _home_of(mission))), (0.0, 0.0))
+        return cls({s: track_of(mission, origin) for s, mission in missions.items()}, distance_m, height_m)
+
+    def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
+        """When (seconds after the first one's start) and how near two come if the other starts so much later.
+
+        None if they keep apart by the plan's measure: at any moment, and `slack_s` earlier or later.
+        """
+        a, b = self.tracks[one].places, self.tracks[other].places
+        if not len(a) or not len(b):
+            return None
+        shared = self._share_a_start(one, other)
+        pads = [self.tracks[system].pad(_PAD * self.distance_m) for system in (one, other)]
+        worst: tuple[float, float] | None = None
+        slack = math.ceil(self.slack_s / _STEP_S)
+        for offset in range(-slack, slack + 1):
+            shift = round(later_s / _STEP_S) + offset
+            first, last = max(0, shift), min(len(a), len(b) + shift)
+            if last <= first:
+                continue
+            p, q = a[first:last], b[first - shift : last - shift]
+            apart = np.hypot(*(p[:, :2] - q[:, :2]).T)
+            flying = (p[:, 2] > _GROUND_M) & (q[:, 2] > _GROUND_M)
+            if shared:
+                flying &= ~(pads[0][first:last] & pads[1][first - shift : last - shift])
+            near = flying & (apart < self.distance_m) & (np.abs(p[:, 2] - q[:, 2]) < self.height_m - _HAIR_M)
+            if near.any():
+                at = int(np.argmin(np.where(near, apart, np.inf)))
+                if worst is None or apart[at] < worst[1]:
+                    worst = ((first + at) * _STEP_S, float(apart[at]))
+        return worst
+
+    def conflicts(self, starts: Mapping[int, float]) -> list[tuple[int, int, float, float]]:
+        """Pairs that come too near with these starts: both vehicles, when on the starts' clock, how near in metres."""
+        systems = sorted(set(starts) & set(self.tracks))
+        found = []
+        for index, one in enumerate(systems):
+            for other in systems[index + 1 :]:
+                meeting = self.meeting(one, other, starts[other] - starts[one])
+                if meeting is not None:
+                    found.append((one, other, starts[one] + meeting[0], meeting[1]))
+        return found
+
+    def next_start(self, system: int, earliest_s: float, others: Mapping[int, float]) -> float:
+        """The first time, not before `earliest_s`, at which a vehicle keeps apart from others that have their times.
+
+        Args:
+            system: the vehicle. earliest_s: on the clock of the others' starts.
+            others: the starts of those in the air, or of those that wait.
+        """
+        start = earliest_s
+        known = {other: at for other, at in others.items() if other != system and other in self.tracks}
+        while any(self._too_near(other, system, start - at) for other, at in known.items()):
+            start += _STEP_S
+        return start
+
+    def _too_near(self, one: int, other: int, later_s: float) -> bool:
+        launches = self._share_a_start(one, other) and abs(later_s) < self.launch_s
+        return launches or self.meeting(one, other, later_s) is not None
+
+    def _share_a_start(self, one: int, other: int) -> bool:
+        a, b = self.tracks[one].places, self.tracks[other].places
+        return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < _PAD * self.distance_m)
+
+
+def _home_of(mission: "Mission") -> tuple[float, float] | None:
+    """Where it takes off: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
+    for item in mission.items[mission.first_seq :]:
+        if item.command == TAKEOFF and (item.x or item.y):
+            return item.lat_deg, item.lon_deg
+    if mission.first_seq and mission.items and (mission.items[0].x or mission.items[0].y):
+        return mission.items[0].lat_deg, mission.items[0].lon_deg
+    return next(((i.lat_deg, i.lon_deg) for i in mission.items if i.has_place and (i.x or i.y)), None)
+
+
+def _ground_m(mission: "Mission") -> float:
+    """The level of the takeoff above the sea, for items that say their altitude that way."""
+    return mission.items[0].z if mission.first_seq and mission.items else 0.0
+
+
+def _metres(lat: float, lon: float, origin: tuple[float, float]) -> tuple[float, float]:
+    east = math.radians(lon - origin[1]) * _EARTH_M * math.cos(math.radians(origin[0]))
+    return east, math.radians(lat - origin[0]) * _EARTH_M
