@@ -15,11 +15,10 @@ import telemetry
 from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.matchers.patch_registration import apply
 from orthoswarm.model.camera import Camera
-from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.geo import LocalGrid, local_origin
 from orthoswarm.mosaic.recorded_pose import area_grid
 from orthoswarm.paper.leg_lines import find_legs, fit_line
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.strategy.swarm_refiner import local_origin
 
 MIDDLE = 0.35
 """Share of a picture's width and height about its middle that the map is made of."""

@@ -4,6 +4,7 @@ Grid coordinates are (east, north) in metres of a WGS 84 / UTM zone; the grid's 
 is taken as 1. Latitudes and longitudes are degrees here, at the edge, and nowhere further in.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +16,7 @@ from pyproj import CRS, Transformer
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Frame
 
 Array = NDArray[np.float64]
 
@@ -142,3 +144,9 @@ class GroundGrid:
         """The 3x3 matrix from (east, north, 1) to (column, row, 1), pixel CENTRES at integers."""
         s = 1.0 / self.gsd_m
         return np.array([[s, 0, -self.west * s - 0.5], [0, -s, self.north * s - 0.5], [0, 0, 1.0]])
+
+
+def local_origin(grid: LocalGrid, frames: Iterable[Frame]) -> Array:
+    """Origin (2,) of an area's local frame: the middle of the fixes, on a multiple of 16 m: pixel grids agree."""
+    fixes = np.array([(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
+    return np.asarray(np.round(np.median(grid.to_grid(fixes[:, 0], fixes[:, 1]), axis=0) / 16.0) * 16.0)

@@ -1,6 +1,6 @@
 """Placed frames and what belongs to them: the refiner's result and the renderer's input."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
+from orthoswarm.model.task_runner import Run, serial
 
 Array = NDArray[np.float64]
 Stage = Literal["realtime", "coarse", "fine"]
@@ -146,8 +147,30 @@ class MapWindow(Protocol):
         """Grey values (rows, columns), 0 to 255, and validity of a window; see GroundGrid.around for its frame."""
 
 
+@dataclass(slots=True)
+class Refinement:
+    """What a refiner made of a batch.
+
+    Attributes:
+        coarse: one solution a vehicle before the map was used; fine: the same vehicles in the same order after it.
+        terrain: ground under the fine cameras, None for flat.
+        warnings: findings that concern all vehicles.
+        equation_5: predicted and measured time by the paper's Eq. 5; empty where the refiner does not work by it.
+    """
+
+    coarse: list[Solution]
+    fine: list[Solution]
+    terrain: Terrain | None
+    warnings: list[str] = field(default_factory=list)
+    equation_5: Mapping[str, float] = field(default_factory=dict)
+
+
 class Refiner(Protocol):
-    """The seam of both refiners (swarm, paper): the unit is a vehicle."""
+    """The seam of both refiners (swarm, paper): the unit is a vehicle, a batch is a loop over vehicles.
+
+    The daemon calls `refine` when a vehicle completes and `again` when its neighbours have; the batch and the
+    benchmarks call `refine_batch`. None of them knows which refiner it is.
+    """
 
     def refine(
         self,
@@ -155,4 +178,35 @@ class Refiner(Protocol):
         neighbours: Sequence[Solution],
         basemap: MapWindow | None,
     ) -> Solution:
-        """Place one vehicle's frames; neighbours are held as they are."""
+        """Place one vehicle's frames.
+
+        Args:
+            frames: in order of time, of one vehicle.
+            neighbours: earlier solutions of this refiner, held as they are.
+            basemap: the map on the area's grid; None to stay in the receivers' frame.
+
+        Raises:
+            OrthoSwarmError: if nothing can be made of the frames.
+        """
+
+    def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place a vehicle again beside neighbours that were solved since; the same solution where nothing changes."""
+
+    def refine_batch(
+        self,
+        vehicles: Mapping[str, Sequence[Frame]],
+        basemap: MapWindow | None,
+        run: Run = serial,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> Refinement:
+        """Place all vehicles, on one height level and one terrain.
+
+        Args:
+            vehicles: id -> frames in order of time.
+            basemap: the map on the area's grid, or None.
+            run: how tasks are run; the result does not depend on it.
+            progress: called with what is being done, how many are done, how many there are.
+
+        Raises:
+            OrthoSwarmError: if there is nothing to refine.
+        """

@@ -4,6 +4,6 @@ It is here to be compared with; the default refiner (orthoswarm.refine) is more 
 the paper is ambiguous and what is done about it.
 """
 
-from orthoswarm.paper.paper_refiner import Options, PaperRefiner, Refined, refine_all
+from orthoswarm.paper.paper_refiner import Options, PaperRefiner
 
-__all__ = ["Options", "PaperRefiner", "Refined", "refine_all"]
+__all__ = ["Options", "PaperRefiner"]

@@ -1,7 +1,7 @@
 """The paper's refiner as a whole: III.C for each vehicle, III.D for each leg, then cameras for all frames.
 
 Legs are independent tasks (III.E). By Eq. 5 a run takes as long as its slowest task plus the sequential rest, given
-enough workers; `Refined.tasks_s` holds what each task took, so that this can be compared with the time measured.
+enough workers; `Refinement.equation_5` compares this with the time measured.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,13 +14,13 @@ import numpy as np
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Stage, Terrain
+from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Refinement, Solution, Stage
+from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
-from orthoswarm.refine.strategy.swarm_refiner import Run, local_origin, serial
 
 Progress = Callable[[str, int, int], None]
 _NEAREST = 3
@@ -36,68 +36,10 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
-    """Products of a batch: the same vehicles before and after the map.
-
-    Attributes:
-        coarse, fine: one solution a vehicle. terrain: always None, the paper's ground is flat.
-        tasks_s: wall seconds of each parallel task, by step: vehicles of III.C and legs of III.D.
-        sequential_s: wall seconds of what lies between and after these steps. wall_s: of all of it.
-    """
-
-    coarse: list[Solution]
-    fine: list[Solution]
-    terrain: Terrain | None = None
-    tasks_s: dict[str, list[float]] = field(default_factory=dict)
-    sequential_s: float = 0.0
-    wall_s: float = 0.0
-
-    def equation_5(self) -> dict[str, float]:
-        """Eq. 5 against the clock: slowest task of each step plus the sequential rest, and the time it really took.
-
-        They meet when there are as many free cores as tasks; the difference is what more workers could save.
-        """
-        slowest = sum(max(t, default=0.0) for t in self.tasks_s.values())
-        return {
-            "slowest_tasks_s": slowest,
-            "sequential_s": self.sequential_s,
-            "predicted_s": slowest + self.sequential_s,
-            "measured_s": self.wall_s,
-        }
-
-
-@dataclass(frozen=True, slots=True)
 class PaperState:
     """What a vehicle leaves for its neighbours: centre and shift of each leg that was found on the map."""
 
     found: list[tuple[Array, Array]]
-
-
-def refine_all(
-    vehicles: Mapping[str, Sequence[Frame]],
-    basemap: MapWindow | None,
-    grid: LocalGrid,
-    options: Options | None = None,
-    run: Run = serial,
-    progress: Progress | None = None,
-) -> Refined:
-    """Refine a batch of vehicles as the paper does.
-
-    Args:
-        vehicles: id -> frames in order of time.
-        basemap: the map on the area's grid, or None.
-        grid: the area's grid.
-        options: see Options.
-        run: how tasks are run.
-        progress: called with stage, done, all.
-
-    Raises:
-        OrthoSwarmError: if there is nothing to refine.
-    """
-    if not vehicles:
-        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
-    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
-    return _refine(split_units(vehicles), [], basemap, grid, origin, options or Options(), run, progress)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +68,25 @@ class PaperRefiner:
         grid = LocalGrid(self.epsg)
         return _refine(units, held, basemap, grid, self.origin, self.options, serial, None).fine[0]
 
+    def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Place a vehicle again beside neighbours; only one that found no leg itself can gain by them."""
+        if _found(solution) or not any(_found(n) for n in neighbours):
+            return solution
+        return self.refine([p.frame for p in solution.placed], neighbours, basemap)
+
+    def refine_batch(
+        self,
+        vehicles: Mapping[str, Sequence[Frame]],
+        basemap: MapWindow | None,
+        run: Run = serial,
+        progress: Progress | None = None,
+    ) -> Refinement:
+        """Place all vehicles of an area (placement.Refiner); the paper's ground is flat."""
+        if not vehicles:
+            raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+        grid, units = LocalGrid(self.epsg), split_units(vehicles)
+        return _refine(units, [], basemap, grid, self.origin, self.options, run, progress)
+
 
 def _found(solution: Solution) -> list[tuple[Array, Array]]:
     states = solution.state if isinstance(solution.state, list) else [solution.state]
@@ -141,7 +102,7 @@ def _refine(
     options: Options,
     run: Run,
     progress: Progress | None,
-) -> Refined:
+) -> Refinement:
     clock = perf_counter()
     first = partial(_timed_coarse, epsg=grid.epsg, origin=origin, options=options.coarse)
     coarse, tasks_s = [], {"vehicles (III.C)": [], "legs (III.D)": []}  # type: tuple[list[CoarseVehicle], dict[str, list[float]]]
@@ -171,7 +132,25 @@ def _refine(
     ]
     fine = merge_units(after)
     wall_s = perf_counter() - clock
-    return Refined(merge_units(before), fine, None, tasks_s, wall_s - parallel_s, wall_s)
+    return Refinement(merge_units(before), fine, None, [], _equation_5(tasks_s, wall_s - parallel_s, wall_s))
+
+
+def _equation_5(tasks_s: Mapping[str, Sequence[float]], sequential_s: float, wall_s: float) -> dict[str, float]:
+    """Eq. 5 against the clock: slowest task of each step plus the sequential rest, and the time it really took.
+
+    They meet when there are as many free cores as tasks; the difference is what more workers could save.
+
+    Args:
+        tasks_s: wall seconds of each parallel task, by step.
+        sequential_s: wall seconds of what lies between and after these steps. wall_s: of all of it.
+    """
+    slowest = sum(max(t, default=0.0) for t in tasks_s.values())
+    return {
+        "slowest_tasks_s": slowest,
+        "sequential_s": sequential_s,
+        "predicted_s": slowest + sequential_s,
+        "measured_s": wall_s,
+    }
 
 
 def _timed_coarse(

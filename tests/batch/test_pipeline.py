@@ -13,6 +13,7 @@ import rasterio
 
 from gcs_plugin.cli.main import main
 from orthoswarm.batch.pipeline import PRODUCTS, Options, run
+from orthoswarm.batch.refiners import REFINERS
 from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
@@ -266,14 +267,15 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing_half_written(flight, 
 
 
 def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, tmp_path, monkeypatch, capsys):
-    from orthoswarm.refine.strategy import swarm_refiner
+    class Faulty:
+        """A refiner with a bug."""
 
-    def fault(*_, **__):
-        raise ZeroDivisionError("by a bug")
+        def refine_batch(self, *_):
+            raise ZeroDivisionError("by a bug")
 
     _, _, folder = flight
     out = tmp_path / "out"
-    monkeypatch.setattr(swarm_refiner, "refine_all", fault)
+    monkeypatch.setitem(REFINERS, "swarm", lambda *_: Faulty())
     for name in ("orthoimage.tif", "coarse.tif"):  # of an earlier run: they must not pass for this one's
         out.mkdir(exist_ok=True)
         (out / name).write_bytes(b"old")
@@ -384,7 +386,7 @@ def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone
             raise InputError("the basemap map.tif is damaged; copy or export it again")
         write_page(out, report, placed, rejected, None)
 
-    monkeypatch.setattr("orthoswarm.batch.pipeline.write_page", page)
+    monkeypatch.setattr("orthoswarm.batch.run_report.write_page", page)
     photos, out = folder / "photos" / "b", tmp_path / "out"
     report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
     assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError
@@ -19,7 +20,6 @@ from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 
 _EPSG: Final = 32631
 _EAST, _NORTH = 500_000.0, 5_000_000.0
@@ -36,7 +36,7 @@ def refine_something() -> None:
         write_map(ground, place / "map.tif")
         basemap = Basemap.open(place / "map.tif", _EPSG)
         origin = np.array([_EAST, _NORTH])
-        refiner = SwarmRefiner(_EPSG, origin)
+        refiner = make_refiner("swarm", _EPSG, origin)
         first = refiner.refine(made_up_flight(ground, place, "a"), [], basemap)
         second = refiner.refine(made_up_flight(ground, place, "b"), [first], basemap)
         terrain = second.terrain

@@ -13,6 +13,7 @@ import numpy as np
 
 from gcs_plugin.daemon.jobs.solution_file import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
 from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
+from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
@@ -87,11 +88,9 @@ def solve(task: SolveTask) -> Solved:
     Raises:
         OrthoSwarmError: nothing can be made of its frames.
     """
-    from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
-
     watch = _Watch()
     others = [load_kept(path) for path in task.neighbours]
-    refiner = SwarmRefiner(task.epsg, np.array(task.origin))
+    refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
     solution = without_strays(refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task)))
     kept = Kept(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     kept.write(task.target)
@@ -153,7 +152,7 @@ def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
 
     Its exposure stays as it is: its neighbours were drawn to agree with it.
     """
-    from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner, states_of
+    from orthoswarm.refine.strategy.swarm_refiner import states_of
 
     watch = _Watch()
     before = load_kept(task.before)
@@ -162,7 +161,7 @@ def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
         return None
     others = [load_kept(path).solution for path in task.neighbours]
     basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
-    solution = SwarmRefiner(task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
+    solution = make_refiner("swarm", task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
     if solution is before.solution:
         return None
     kept = replace(before, solution=solution)

@@ -4,15 +4,15 @@ Which pairs are worth trying depends on where the photos look, and that depends 
 pairs in order of time come first, then near ones, then more for photos that have few.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.frame import Frame
+from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
 from orthoswarm.refine.features.sift_features import FINE_PIXELS, WORKING_PIXELS, Features, detect
@@ -22,7 +22,6 @@ from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
 Progress = Callable[[str, int, int], None]
-T = TypeVar("T")
 
 REACH_SHARE = 0.68
 _WIDE_REACH_SHARE = 0.8
@@ -33,18 +32,6 @@ _ENOUGH_PAIRS = 5
 _WEAK_PAIRS = 2
 _WEAK_MATCHES = 40
 _CHUNK = 64
-
-
-class Run(Protocol):
-    """How tasks are run: one after the other, in threads, in processes; results come in the order of the items."""
-
-    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
-        """Yield function(item) for each item."""
-
-
-def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
-    """Run tasks one after the other in this process."""
-    return map(function, items)
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.geo import LocalGrid, local_origin
 from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
@@ -26,7 +26,6 @@ from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
 from orthoswarm.refine.flight.weakly_held_pictures import ENOUGH, observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit
-from orthoswarm.refine.strategy.vehicle_group import local_origin
 from orthoswarm.refine.strategy.vehicle_passes import Options, from_flight, read_frame, relative
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 

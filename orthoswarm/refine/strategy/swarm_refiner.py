@@ -1,8 +1,8 @@
-"""The default refiner: one vehicle is the unit, a batch is a loop over it (DESIGN.md section 4, RECIPE.md).
+"""The default refiner: one vehicle is the unit, a batch is a loop over vehicles.
 
-Solo pass of each vehicle -> those that the map does not show beside those that it does -> second pass on a common level
-with neighbours held -> one terrain.
-The map's lean is voted over the roofs of all vehicles for the report; ties are ground, which does not lean.
+First pass of each vehicle by itself -> vehicles that the map does not show are registered on neighbours that it does
+-> second pass on a common level with neighbours held -> one terrain.
+The map's lean is voted over the roofs of all vehicles for the report; tie points lie on the ground and do not lean.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from orthoswarm.model.errors import AdjustmentError, OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution, Terrain
+from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours, place_by_neighbours, split_refinable
@@ -25,44 +26,19 @@ from orthoswarm.refine.registration.neighbour_registration import lay_beside
 from orthoswarm.refine.strategy.first_pass import first_passes
 from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
-    Run,
     coarse_terrain,
     common_terrain,
-    local_origin,
     neighbours_of,
     pooled_lean,
-    serial,
 )
 from orthoswarm.refine.strategy.vehicle_passes import Options, solo
 from orthoswarm.refine.surface.height_levels import level_network
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
-__all__ = [
-    "Options",
-    "Refined",
-    "Run",
-    "SwarmRefiner",
-    "local_origin",
-    "refine_all",
-    "serial",
-    "solo",
-    "states_of",
-]
+__all__ = ["Options", "SwarmRefiner", "solo", "states_of"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Refined:
-    """Products of the refinement of a batch: the same vehicles before and after the map; state is in `fine`.
-
-    Warnings are those that concern all vehicles.
-    """
-
-    coarse: list[Solution]
-    fine: list[Solution]
-    terrain: Terrain | None
-    warnings: list[str] = field(default_factory=list)
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +126,32 @@ class SwarmRefiner:
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
 
+    def refine_batch(
+        self,
+        vehicles: Mapping[str, Sequence[Frame]],
+        basemap: MapWindow | None,
+        run: Run = serial,
+        progress: Progress | None = None,
+    ) -> Refinement:
+        """Place all vehicles of an area (placement.Refiner)."""
+        if not vehicles:
+            raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+        grid, origin = LocalGrid(self.epsg), self.origin
+        units = split_units(vehicles)
+        states, lost = first_passes(units, basemap, grid, origin, self.options, run, progress)
+        if not states:
+            raise AdjustmentError(lost[0])
+        below = _shifted(coarse_terrain(states), origin)
+        coarse = [to_solution(s, origin, below, coarse=True) for s in states]
+        states = _second_passes(states, basemap, self.epsg, origin, run, progress)
+        _level(states)
+        terrain, warnings = common_terrain(states, self.options.ground(origin).dem)
+        terrain = _shifted(terrain, origin)
+        lean = pooled_lean(states)
+        fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
+        left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
+        return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
+
 
 def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame], had_map: bool) -> Solution:
     """A vehicle that stays where its receiver says: nothing was flown, so nothing tells the scale of its pictures."""
@@ -163,44 +165,6 @@ def states_of(solution: Solution) -> list[VehicleState]:
     """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
     state = solution.state
     return [] if state is None else list(state) if isinstance(state, list) else [state]
-
-
-def refine_all(
-    vehicles: Mapping[str, Sequence[Frame]],
-    basemap: MapWindow | None,
-    grid: LocalGrid,
-    options: Options | None = None,
-    run: Run = serial,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> Refined:
-    """Refine a batch of vehicles.
-
-    Args:
-        vehicles: id -> frames in order of time. basemap: the map on the area's grid, or None.
-        grid: the area's grid. options: see Options. run: how tasks are run. progress: called with stage, done, all.
-
-    Raises:
-        OrthoSwarmError: if there is nothing to refine.
-    """
-    if not vehicles:
-        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
-    origin = local_origin(grid, (f for frames in vehicles.values() for f in frames))
-    options = options or Options()
-    units = split_units(vehicles)
-    states, lost = first_passes(units, basemap, grid, origin, options, run, progress)
-    if not states:
-        raise AdjustmentError(lost[0])
-    below = _shifted(coarse_terrain(states), origin)
-    coarse = [to_solution(s, origin, below, coarse=True) for s in states]
-    states = _second_passes(states, basemap, grid.epsg, origin, run, progress)
-    _level(states)
-    given = options.ground(origin).dem
-    terrain, warnings = common_terrain(states, given)
-    terrain = _shifted(terrain, origin)
-    lean = pooled_lean(states)
-    fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
-    left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
-    return Refined(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
 def _left(frames: Sequence[Frame], why: str, grid: LocalGrid, had_map: bool) -> Solution:
@@ -244,7 +208,7 @@ def _second_passes(
     epsg: int,
     origin: Array,
     run: Run,
-    progress: Callable[[str, int, int], None] | None,
+    progress: Progress | None,
 ) -> list[VehicleState]:
     """All vehicles again, on a common level, each with its neighbours held as the solo pass left them."""
     states = lay_lost_beside(states, [], epsg, origin, run)

@@ -1,15 +1,12 @@
-"""What vehicles of an area have in common: who sees whom, the lean of the map, one terrain; how tasks are run."""
+"""What vehicles of an area have in common: who sees whom, the lean of the map, one terrain."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.registration.block_state import VehicleState, seen_from_above
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
@@ -21,7 +18,6 @@ from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 DIFFERS_M = 0.2
 """What is left over a height model is worth a word from here on."""
@@ -34,24 +30,6 @@ DRAWN = FitSettings(held_out_se=1.0)
 DRAWN_ON_MAP = FitSettings(held_out_se=1.0, floor_sigma_m=0.15, render_flat_sd_m=0.0)
 """Where the map told heights they hold the border, and on flat ground they take out what is wrong with the cameras
 there: nothing is taken for noise."""
-
-
-class Run(Protocol):
-    """How tasks are run: serially, in processes, on a cluster; results come in the order of the items."""
-
-    def __call__(self, function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
-        """Yield function(item) for each item."""
-
-
-def serial(function: Callable[[Any], T], items: Sequence[Any], /) -> Iterable[T]:
-    """Run tasks one after the other in this process."""
-    return map(function, items)
-
-
-def local_origin(grid: LocalGrid, frames: Iterable[Frame]) -> Array:
-    """Origin (2,) of the local frame: the middle of the fixes, on a multiple of 16 m so that pixel grids agree."""
-    fixes = np.array([(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
-    return np.asarray(np.round(np.median(grid.to_grid(fixes[:, 0], fixes[:, 1]), axis=0) / 16.0) * 16.0)
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from orthoswarm.model.geo import local_origin
 from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.features.flow_calibration import Calibration
 from orthoswarm.refine.flight.relative_block import HEIGHT_BEGIN_M, _height_prior
-from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner, local_origin
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 

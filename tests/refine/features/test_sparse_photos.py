@@ -10,6 +10,7 @@ import pytest
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.task_runner import serial
 from orthoswarm.raster.picture_file import PictureError, read_gray
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F
@@ -19,7 +20,6 @@ from orthoswarm.refine.flight.sparse_block import in_reduced_pixels, open_sparse
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records, sparse_start
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
-from orthoswarm.refine.initial.pair_graph import serial
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
 
 

@@ -5,8 +5,10 @@ import pickle
 import numpy as np
 import pytest
 
+from orthoswarm.model.geo import local_origin
 from orthoswarm.refine.strategy import vehicle_passes
-from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner, local_origin, refine_all
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
+from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 

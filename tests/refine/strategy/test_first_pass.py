@@ -5,7 +5,7 @@ import pytest
 
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.refine.strategy import first_pass, vehicle_passes
-from orthoswarm.refine.strategy.swarm_refiner import refine_all
+from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 

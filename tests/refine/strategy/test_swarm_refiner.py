@@ -10,10 +10,11 @@ import pytest
 
 from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.model.geo import GroundGrid, LocalGrid, area_epsg
+from orthoswarm.model.geo import GroundGrid, LocalGrid, area_epsg, local_origin
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner, local_origin, refine_all, solo
+from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner, solo
 from telemetry import load
+from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import rasterio
 
+from orthoswarm.model.geo import local_origin
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.extent import placed_bounds
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.height_model import HeightModel
-from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner, local_origin, refine_all
+from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
+from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 

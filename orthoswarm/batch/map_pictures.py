@@ -1,0 +1,193 @@
+"""The pictures of a run: which frames each of them shows, and drawing them as COGs."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, RunContext, RunState
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.cog import write_cog
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.mosaic.extent import drawn_window, ground_level, map_offset, placed_bounds
+from orthoswarm.mosaic.footprint import default_gsd, rejection
+from orthoswarm.mosaic.oblique import loose, strays, told
+from orthoswarm.mosaic.radiometry import estimate_fields
+from orthoswarm.mosaic.realtime import mosaic
+from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
+from orthoswarm.raster.height_model import read_dem
+
+_Map = tuple[Sequence[PlacedFrame], Terrain | None]
+"""Frames and the ground under them: what a map is drawn from."""
+_CANVAS_MB = 48.0
+"""Memory that a canvas keeps of its tiles, megabytes."""
+
+
+def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
+    """coarse.tif and orthoimage.tif; gives the frames as last placed."""
+    if refinement is None:
+        placed = _looking_down(run, state, state.recorded.placed)
+        name = ORTHOIMAGE if run.options.until == "fine" else COARSE
+        with run.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
+            stats = draw(run, name, placed, Terrain.flat(), state)
+        if name == ORTHOIMAGE:
+            _copy_coarse(run, state)
+        state.drawn = (stats.drawn_m2, stats.covered_share)
+        state.leave_out(stats.rejected, placed)
+        return [p for p in placed if p.frame.image not in state.rejected]
+    terrain = state.terrain = _ground(run, state, refinement)
+    state.warnings += refinement.warnings
+    for solution in refinement.fine:
+        reasons = dict(solution.dropped)
+        state.leave_out(reasons, state.recorded.placed)
+        state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
+    on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
+    state.warnings += map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
+    with_map = state.basemap is not None and run.options.until == "fine"
+    if with_map and not on_map:
+        state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")
+    fine = _looking_down(run, state, [p for s in refinement.fine for p in s.placed] + state.still)
+    coarse = [p for s in refinement.coarse for p in s.placed] + state.still
+    coarse = [p for p in coarse if p.frame.image not in state.rejected]
+    state.warnings += loose(fine, state.odd)
+    if run.options.gsd_m is None:
+        state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
+    if run.options.gains:
+        with run.clock.stage("final: gains", len(fine)):
+            state.gains = estimate_fields(fine, state.thumbnails, terrain or Terrain.flat())
+    if run.options.until != "fine":
+        _picture(run, state, COARSE, fine, terrain)
+    elif with_map:
+        _both(run, state, (coarse, _shared_terrain(refinement.coarse)), (fine, terrain))
+    else:
+        _picture(run, state, ORTHOIMAGE, fine, terrain)
+        _copy_coarse(run, state)
+    return [p for p in fine if p.frame.image not in state.rejected]
+
+
+def _looking_down(run: RunContext, state: RunState, placed: Sequence[PlacedFrame]) -> list[PlacedFrame]:
+    """The frames without those that look far aside among others, which are left out."""
+    aside = strays(placed)
+    state.leave_out(aside, placed)
+    state.warnings += told(aside)
+    return [p for p in placed if p.frame.image not in aside]
+
+
+def _ground(run: RunContext, state: RunState, refinement: Refinement) -> Terrain | None:
+    """The ground under the pictures: found from them, or an outside height model brought to their level."""
+    if run.options.dem is None or state.dem is not None:  # the refiner has used it
+        return refinement.terrain
+    fine = [p for s in refinement.fine for p in s.placed]
+    level = ground_level(fine, refinement.terrain)
+    nadirs = np.array([p.camera.nadir for p in fine])
+    model = read_dem(run.options.dem, state.grid.epsg, placed_bounds(fine, level, level), takeoff=nadirs)
+    return replace(model, z=model.z + np.float32(level))
+
+
+def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
+    """Render both refined maps at once, each picture read once, unless an interrupted run has one of them."""
+    if any(run.space.recall(name) is not None for name in (COARSE, ORTHOIMAGE)):
+        _picture(run, state, COARSE, *coarse)
+        _picture(run, state, ORTHOIMAGE, *fine)
+        return
+    coarse_ground, fine_ground = coarse[1] or Terrain.flat(), fine[1] or Terrain.flat()
+    with (
+        run.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage,
+        _canvas(run, ORTHOIMAGE, fine[0], fine_ground, state) as second,
+    ):
+        with _canvas(run, COARSE, coarse[0], coarse_ground, state) as first:
+            layers = [
+                Layer(coarse[0], coarse_ground, first, state.gains),
+                Layer(fine[0], fine_ground, second, state.gains),
+            ]
+            drawn = partial(run.progress, "drawing orthoimage")
+            stats = render_layers(layers, run=run.workers.map, progress=drawn)
+            _write(run, first, COARSE)
+        _write(run, second, ORTHOIMAGE)
+    run.space.clear_scratch()
+    state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
+    run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
+    run.space.remember(
+        COARSE,
+        (stats[0].rejected, (stats[0].drawn_m2, stats[0].covered_share), replace(stage, wall_s=0.0, cpu_s=0.0)),
+    )
+    for s in stats:
+        state.leave_out(s.rejected, fine[0])
+
+
+def _picture(
+    run: RunContext, state: RunState, name: str, placed: Sequence[PlacedFrame], terrain: Terrain | None
+) -> None:
+    """Render one product, unless an interrupted run has."""
+    known = run.space.recall(name)
+    if known is not None and (run.out / name).exists():
+        rejected, state.drawn, stage = known
+        run.clock.stages.append(stage)
+    else:
+        label = "orthoimage" if name == ORTHOIMAGE else "coarse picture"
+        with run.clock.stage(f"final: {label}", len(placed)) as stage:
+            stats = draw(run, name, placed, terrain or Terrain.flat(), state)
+        rejected, state.drawn = stats.rejected, (stats.drawn_m2, stats.covered_share)
+        run.space.remember(name, (rejected, state.drawn, stage))
+    state.leave_out(rejected, placed)
+
+
+def draw(
+    run: RunContext,
+    name: str,
+    placed: Sequence[PlacedFrame],
+    terrain: Terrain,
+    state: RunState,
+    *,
+    realtime: bool = False,
+) -> RenderStats:
+    """Render frames on a canvas of their own and write it as a COG."""
+    drawn = partial(run.progress, f"drawing {name.removesuffix('.tif')}")
+    with _canvas(run, name, placed, terrain, state) as canvas:
+        if realtime:
+            stats = mosaic(placed, canvas, run=run.workers.map, progress=drawn)
+        else:
+            stats = render(placed, terrain, canvas, gains=state.gains, run=run.workers.map, progress=drawn)
+        _write(run, canvas, name)
+    run.space.clear_scratch()
+    return stats
+
+
+def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState) -> Canvas:
+    """An empty canvas for a product of these frames."""
+    low, high = float(terrain.z.min()), float(terrain.z.max())
+    usable = [p for p in placed if rejection(p.camera, float(terrain.height(p.camera.nadir)), state.gsd_m) is None]
+    if not usable:
+        reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
+        raise OrthoSwarmError(f"no picture can be drawn: {reason}")
+    grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
+    return Canvas.create(run.space.scratch(name.removesuffix(".tif")), grid, plane="frame", memory_mb=_CANVAS_MB)
+
+
+def _write(run: RunContext, canvas: Canvas, name: str) -> None:
+    """Write a canvas as a COG."""
+    written = partial(run.progress, f"writing {name}")
+    write_cog(canvas, run.out / name, window=drawn_window(canvas), progress=written, threads=run.workers.count)
+
+
+def _copy_coarse(run: RunContext, state: RunState) -> None:
+    """Without a map the orthoimage is the coarse product, too."""
+    with written_whole(run.out / COARSE) as part:
+        shutil.copyfile(run.out / ORTHOIMAGE, part)
+    if run.options.basemap is None:
+        state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
+
+
+def _shared_terrain(solutions: Sequence[Solution]) -> Terrain | None:
+    """The ground that coarse solutions share, None where there is none."""
+    return next((s.terrain for s in solutions if s.terrain is not None), None)
+
+
+def _named(vehicle: str, warning: str) -> str:
+    """A warning that begins with whom it is about."""
+    return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"

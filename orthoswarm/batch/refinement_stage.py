@@ -1,0 +1,111 @@
+"""The refinement stage of a run: which frames are refined, what happens when that fails, and what it leaves."""
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from orthoswarm.batch.refiners import make_refiner
+from orthoswarm.batch.run_state import RunContext, RunState
+from orthoswarm.compute.stage_times import Clock, Stage
+from orthoswarm.compute.workers import trim_memory
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import local_origin
+from orthoswarm.model.placement import PlacedFrame, Refinement, Solution
+from orthoswarm.mosaic.recorded_pose import hint_lone_photos
+from orthoswarm.raster.map_check import UnreadableMapError
+from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
+
+
+def refine(run: RunContext, state: RunState) -> Refinement | None:
+    """Coarse and fine cameras of all vehicles, without the refiner's states; None if it could place none."""
+    by_kind = split_refinable(state.recorded.placed)
+    state.still, state.odd = by_kind.still, by_kind.odd
+    state.warnings += by_kind.warnings
+    if not by_kind.fit:
+        if state.basemap is not None and run.options.until == "fine":
+            state.warnings.append("the basemap was not used; the orthoimage lies where the receivers say")
+        return None
+    known: tuple[Refinement, list[Stage], bool] | None = run.space.recall("refinement")
+    if known is not None:
+        refinement, stages, map_unreadable = known
+        run.clock.stages += stages
+        state.basemap = None if map_unreadable else state.basemap
+        return refinement
+    outer = Clock(run.workers.usage)
+    frames = hint_lone_photos(by_kind.fit)
+    with outer.stage("refine", len(frames)) as stage:
+        try:
+            refinement = _refined(run, frames, state)
+        except OrthoSwarmError as error:
+            state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
+            return None
+        except Exception as error:  # in the field a rough map is better than none; the fault is told in full
+            logging.getLogger(__name__).exception("the refinement failed")
+            state.fault = f"the refinement failed ({type(error).__name__}: {error})"
+            state.warnings.append(f"{state.fault}; the map is the real-time one")
+            return None
+    for solutions in (refinement.coarse, refinement.fine):
+        placed = [p for s in solutions for p in s.placed]
+        _append_carried(solutions, place_by_neighbours(by_kind.odd, by_kind.fit, placed))
+    stages = _split_time(stage, refinement, run.options.until, state.basemap is not None)
+    run.clock.stages += stages
+    map_unreadable = state.basemap is None and run.options.basemap is not None
+    run.space.remember("refinement", (refinement, stages, map_unreadable))
+    return refinement
+
+
+def _refined(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:
+    """The refinement; without the map where that turns out to be unreadable after its check.
+
+    The photos adjusted to each other are worth more than the real-time picture, and hours may have gone into it.
+    """
+    try:
+        return _call_refiner(run, frames, state)
+    except UnreadableMapError as error:
+        lost = f"{error}: it was not used, the orthoimage is the coarse one and lies where the receivers say"
+    state.basemap = None
+    refinement = _call_refiner(run, frames, state)
+    refinement.warnings.append(lost)
+    return refinement
+
+
+def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:
+    refiner = make_refiner(run.options.refine, state.grid.epsg, local_origin(state.grid, frames), state.dem)
+    vehicles: dict[str, list[Frame]] = {}
+    for frame in frames:
+        vehicles.setdefault(frame.vehicle, []).append(frame)
+    basemap = state.basemap if run.options.until == "fine" else None
+    # Vehicles that were refined with a map that was lost later are not the same as those without it.
+    lost = state.basemap is None and run.options.basemap is not None
+    tasks = run.space.remembering("vehicle without map" if lost else "vehicle", run.workers.map)
+    refinement = refiner.refine_batch(vehicles, basemap, tasks, run.progress)
+    # The states behind the solutions are by far the largest part; nothing needs them any more.
+    refinement.coarse, refinement.fine = (
+        [replace(s, state=None) for s in solutions] for solutions in (refinement.coarse, refinement.fine)
+    )
+    trim_memory()
+    return refinement
+
+
+def _append_carried(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:
+    """Add frames to the solutions of their vehicles (to the first one if a vehicle has none)."""
+    for p in carried:
+        own = next((i for i, s in enumerate(solutions) if s.vehicle == p.frame.vehicle), 0)
+        solutions[own] = replace(solutions[own], placed=[*solutions[own].placed, p])
+
+
+def _split_time(stage: Stage, refinement: Refinement, until: str, with_map: bool) -> list[Stage]:
+    """The refinement's time by stage: what was done before the map counts as coarse."""
+    laps: Counter[str] = Counter()
+    for solution in refinement.fine:
+        laps.update(solution.timings)
+    total = sum(laps.values())
+    if until == "coarse" or not with_map or total <= 0:
+        return [replace(stage, name="coarse: refinement")]
+    share = sum(laps[name] for name in ("tracks", "relative")) / total
+    return [
+        Stage("coarse: refinement", share * stage.wall_s, share * stage.cpu_s, stage.items),
+        Stage("fine: refinement", (1 - share) * stage.wall_s, (1 - share) * stage.cpu_s, stage.items),
+    ]

@@ -1,0 +1,75 @@
+"""What a run says of itself: frames.jsonl, footprints, report.json and the report's page."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, RunContext, RunState
+from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.placement import PlacedFrame, Refinement
+from orthoswarm.mosaic.extent import from_takeoff, ground_level
+from orthoswarm.report.page import write_page
+
+
+def write_products(
+    run: RunContext, state: RunState, placed: list[PlacedFrame], refinement: Refinement | None
+) -> dict[str, Any]:
+    """frames.jsonl, footprints and the report."""
+    for name in PRODUCTS:  # of an earlier run with other options
+        if name not in _made(run, state.fault is not None):
+            (run.out / name).unlink(missing_ok=True)
+    with run.clock.stage("final: report", len(placed)) as stage:
+        stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
+        write_frames(run.out, stated, list(state.rejected.values()), state.grid, z)
+        report = _report(run, state, placed, refinement, z)
+        left_out = list(state.rejected.values())
+        try:
+            write_page(run.out, report, stated, left_out, state.basemap)
+        except InputError as error:  # a map that is damaged where only the report's pictures read it
+            report["warnings"].append(f"the report's pictures are without the map: {error}")
+            write_page(run.out, report, stated, left_out, None)
+    wall, cpu, memory = run.clock.totals()
+    report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
+    report["stages"].append(stage_row(stage))
+    write_json(run.out / "report.json", report)
+    return report
+
+
+def _made(run: RunContext, faulty: bool) -> set[str]:
+    names = set(PRODUCTS)
+    if run.options.until != "fine" or faulty:
+        names.discard(ORTHOIMAGE)
+    if run.options.until == "realtime" or faulty:
+        names.discard(COARSE)
+    return names
+
+
+def _report(
+    run: RunContext, state: RunState, placed: Sequence[PlacedFrame], refinement: Refinement | None, ground_z_m: float
+) -> dict[str, Any]:
+    """The content of report.json so far."""
+    solutions = refinement.fine if refinement else []
+    wall, cpu, memory = run.clock.totals()
+    count, left_out = len(placed), len(state.rejected)
+    return {
+        "frames": {"input": count + left_out, "used": count, "rejected": left_out},
+        "vehicles": vehicle_rows(solutions, placed),
+        "legs": leg_rows(solutions),
+        "stages": [stage_row(s) for s in run.clock.stages],
+        "wall_s": wall,
+        "cpu_s": cpu,
+        "peak_rss_mb": memory,
+        "ground_z_m": ground_z_m,
+        "refine": run.options.refine if solutions else "none",
+        "warnings": list(dict.fromkeys(state.warnings)),
+        "epsg": state.grid.epsg,
+        "gsd_m": state.gsd_m,
+        "area_ha": state.drawn[0] / 1e4,
+        "covered_share": state.drawn[1],
+        "basemap": str(run.options.basemap) if state.basemap else None,
+        "until": run.options.until,
+        "config": {stage: dict(values) for stage, values in run.options.config.items()},
+        "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],
+        "root": image_root(state.ingest.frames),
+        **({"equation_5": dict(refinement.equation_5)} if refinement and refinement.equation_5 else {}),
+    }

@@ -1,0 +1,112 @@
+"""What a run was asked for, what it works with, and what it knows so far."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.batch.refiners import RefinerName
+from orthoswarm.batch.workspace import Workspace
+from orthoswarm.compute.stage_times import Clock
+from orthoswarm.compute.workers import Workers
+from orthoswarm.config import Overrides
+from orthoswarm.model.frame import Ingest, Rejection
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.recorded_pose import Recorded
+from orthoswarm.raster.basemap import Basemap
+from orthoswarm.raster.height_model import HeightModel
+
+Bytes = NDArray[np.uint8]
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many are done, how many there are."""
+Load = Callable[[Progress], Ingest]
+
+REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
+PRODUCTS = (REALTIME, COARSE, ORTHOIMAGE, "frames.jsonl", "footprints.gpkg", "report.json", "report.html")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to make of the frames.
+
+    Attributes:
+        basemap: the pre-disaster map, None to stay in the receivers' frame.
+        refine: which refiner. until: the last stage to run.
+        fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
+        gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
+        dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
+        gains: even out brightness between pictures.
+        config: thresholds of the refiner in the place of their defaults.
+    """
+
+    basemap: Path | None = None
+    refine: RefinerName = "swarm"
+    until: Literal["realtime", "coarse", "fine"] = "fine"
+    fov_min_deg: float | None = None
+    gsd_m: float | None = None
+    dem: Path | None = None
+    split_legs: bool = False
+    gains: bool = True
+    config: Overrides = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class RunContext:
+    """What the stages of a run work with.
+
+    Attributes:
+        out: output folder; space: its lock and what an interrupted run left there.
+        options: see Options. workers: where work runs. progress: called during long work. clock: times by stage.
+    """
+
+    out: Path
+    space: Workspace
+    options: Options
+    workers: Workers
+    progress: Progress
+    clock: Clock
+
+
+@dataclass(slots=True)
+class RunState:
+    """What is known so far in a run.
+
+    Attributes:
+        ingest: the frames as read. grid: the area's. recorded: cameras as recorded. gsd_m: pixel of the products.
+        basemap: the map; None without one, or once it turned out to be unreadable. dem: heights for the refiner.
+        warnings: for the report. rejected: image -> why it was left out.
+        thumbnails, gains: image -> small picture, factors that even out brightness.
+        still: frames of vehicles that stood at one spot. odd: frames that look elsewhere than their vehicle's others.
+        terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
+        undrawn: image -> why the real-time picture does not show it.
+        fault: what went wrong inside the refiner, None if nothing did.
+    """
+
+    ingest: Ingest
+    grid: LocalGrid
+    recorded: Recorded
+    gsd_m: float
+    basemap: Basemap | None
+    dem: HeightModel | None = None
+    warnings: list[str] = field(default_factory=list)
+    rejected: dict[str, Rejection] = field(default_factory=dict)
+    thumbnails: dict[str, Bytes] = field(default_factory=dict)
+    gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    still: list[PlacedFrame] = field(default_factory=list)
+    odd: list[PlacedFrame] = field(default_factory=list)
+    terrain: Terrain | None = None
+    drawn: tuple[float, float] = (0.0, 1.0)
+    undrawn: Mapping[str, str] = field(default_factory=dict)
+    fault: str | None = None
+
+    def leave_out(self, reasons: Mapping[str, str], placed: Iterable[PlacedFrame]) -> None:
+        """Move frames to the rejected ones."""
+        frames = {p.frame.image: p.frame for p in placed} if reasons else {}
+        for image, reason in reasons.items():
+            frame = frames.get(image)
+            vehicle, time_s = (frame.vehicle, frame.time_s) if frame else ("", None)
+            self.rejected.setdefault(image, Rejection(image, reason, vehicle, time_s))
