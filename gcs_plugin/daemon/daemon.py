@@ -19,7 +19,7 @@ from gcs_plugin.daemon.jobs.leg_placement import Coarse
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import Press
 from gcs_plugin.daemon.jobs.sortie_refinement import Refinement
-from gcs_plugin.daemon.jobs.worker_pool import LAST, Crew
+from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer, frame_of_row
@@ -82,7 +82,7 @@ class Daemon:
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
             fov_rad=fov, on_area=self._area_changed,
         )  # fmt: skip
-        self.crew, self.background = Crew(settings.workers), Crew(1, LAST)
+        self.crew, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
         self.coarse = Coarse(self.journal, self.store, press, self.background, settings.basemap, self._published)
         self.refinement = Refinement(
@@ -100,6 +100,8 @@ class Daemon:
         self.jobs.on_end(self._after_job)
         if press.lost:
             self.jobs.add("redraw")
+        for vehicle, sortie in press.outdated:
+            self.jobs.add("refine", vehicle, sortie)
         self.legwatch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
         self.plans = Plans(folder / "plans")
@@ -323,8 +325,7 @@ class Daemon:
         self.together.give_up()
         if layer is None:
             self.jobs.drop("coarse", vehicle, _REPLACED)
-        else:
-            self.coarse.give_up(None, layer)
+        self.coarse.give_up(None, layer)
 
     def _after_job(self, job: Job) -> None:
         """Note what a completion led to; write the products once nothing is left to refine."""

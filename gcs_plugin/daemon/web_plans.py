@@ -6,10 +6,11 @@ import re
 import shutil
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.plans.plan_request import ENDS, METHODS, MOST_ITEMS, PlanRequest, make_plan
@@ -33,8 +34,10 @@ class Plans:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def make(self, body: Mapping[str, Any], crew: Crew) -> dict[str, Any]:
+    def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
         """Plan; gives the figures of `orthoswarm plan --json` with the plan's `id`.
+
+        The work runs in a process of its own, so that neither a refinement nor a plan waits for the other.
 
         Raises:
             InputError: the area or a value is of no use.
@@ -48,13 +51,12 @@ class Plans:
         path.mkdir(parents=True)
         try:
             (path / "area.geojson").write_text(json.dumps(area), encoding="utf-8")
-            figures: dict[str, Any] = crew.run(plan_into, PlanRequest(area=path / "area.geojson", **values)) | {
-                "id": name
-            }
+            with closing(WorkerPool(1)) as pool:
+                figures = pool.run(plan_into, PlanRequest(area=path / "area.geojson", **values))
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
             raise
-        return figures
+        return figures | {"id": name}
 
     def all(self) -> list[dict[str, Any]]:
         """The figures of all plans, oldest first."""

@@ -150,7 +150,7 @@ class Served:
         from gcs_plugin.web.app import make_app
         from gcs_plugin.web.guard import take_token
 
-        token, _ = take_token(daemon.settings.workspace / "token")
+        token = take_token(daemon.settings.workspace / "token")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -189,7 +189,7 @@ def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
         "speed_m_s": 12.0, "forward_overlap": 0.85, "side_overlap": 0.6, "method": "columns", "starts": starts,
         "end": "rtl", "separation_m": 4.0,
     }  # fmt: skip
-    plan = daemon.plans.make(body, daemon.crew)
+    plan = daemon.plans.make(body)
     tell("planning", 1, 1)
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
     began = time.monotonic()

@@ -237,7 +237,7 @@ class Routes:
     async def plan(self, request: Request) -> Response:
         """Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}."""
         body = await self.body(request)
-        return Ascii(await self.work(self.daemon.plans.make, body, self.daemon.crew), status_code=201)
+        return Ascii(await self.work(self.daemon.plans.make, body), status_code=201)
 
     async def plans(self) -> Response:
         """The figures of all plans."""

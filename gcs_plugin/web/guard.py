@@ -30,8 +30,8 @@ _HEADERS: Final = [
 ]
 
 
-def take_token(path: Path) -> tuple[str, bool]:
-    """The token in a file, made if there is none; and whether it is new.
+def take_token(path: Path) -> str:
+    """The token in a file, made if there is none.
 
     Raises:
         InputError: the file holds none, or cannot be read or written.
@@ -42,7 +42,7 @@ def take_token(path: Path) -> tuple[str, bool]:
             token = path.read_text(encoding="ascii").strip()
             if len(token) < 8:
                 raise InputError(f"{path} holds no token; put at least eight characters there, or remove it")
-            return token, False
+            return token
         token = secrets.token_urlsafe(24)
         part = path.with_name(f".{path.name}.part")
         part.unlink(missing_ok=True)
@@ -54,7 +54,7 @@ def take_token(path: Path) -> tuple[str, bool]:
         os.replace(part, path)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the token file {path} cannot be used ({error}); name another with --token-file") from None
-    return token, True
+    return token
 
 
 class Guard:
@@ -92,33 +92,43 @@ class Guard:
         if self.local and _host_name(host) not in self._hosts:
             return 403, "the Host header does not name this daemon; use the address that it printed"
         origin = headers.get("origin")
-        if origin is not None and (urlsplit(origin).scheme not in ("http", "https") or _netloc(origin) != host.lower()):
+        if origin is not None and not _is_same_site(origin, host):
             return 403, "pages of other sites may not use this daemon; open its own page"
         path = scope["path"]
         if not self.local and path not in _OPEN and not path.startswith(_OPEN_FOLDERS):
-            return None if self._has_token(scope, headers, query=True) else _NEEDS_TOKEN
+            return self._token_refusal(scope, headers, query=True)
         unsafe = scope["type"] == "http" and scope["method"] not in _SAFE
         if unsafe and any(path == command or path.startswith(command + "/") for command in _COMMANDS):
-            return None if self._has_token(scope, headers, query=False) else _NEEDS_TOKEN
+            return self._token_refusal(scope, headers, query=False)
         return None
 
-    def _has_token(self, scope: dict[str, Any], headers: dict[str, str], *, query: bool) -> bool:
-        """Whether the token is in a header, or (for what changes nothing: tile sources, events) in the address."""
-        said = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
+    def _token_refusal(self, scope: dict[str, Any], headers: dict[str, str], *, query: bool) -> tuple[int, str] | None:
+        """Why a request's token does not do, None if it does.
+
+        It comes in a header, or (with `query`, for what changes nothing: tile sources, events) in the address.
+        """
+        sent = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
         reading = scope["type"] == "websocket" or scope["method"] in _SAFE
-        if not said and query and reading:
-            said = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        return hmac.compare_digest(said.encode("utf-8", "replace"), self._token.encode())
+        if not sent and query and reading:
+            sent = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        if not sent:
+            return _TOKEN_MISSING
+        # latin-1 is what headers are decoded by; a token is ASCII
+        return None if hmac.compare_digest(sent.encode("utf-8", "replace"), self._token.encode()) else _TOKEN_WRONG
 
 
-_NEEDS_TOKEN: Final = (401, "this needs the daemon's token, as the header 'Authorization: Bearer TOKEN'")
+_SHOW: Final = "`orthoswarm serve --show-token --workspace DIR` prints"
+_TOKEN_MISSING: Final = (401, f"send the daemon's token as the header 'Authorization: Bearer TOKEN'; {_SHOW} it")
+_TOKEN_WRONG: Final = (401, f"this is not this daemon's token, each workspace has its own; {_SHOW} the right one")
 
 
-def _netloc(origin: str) -> str:
+def _is_same_site(origin: str, host: str) -> bool:
+    """Whether an Origin header names the daemon itself; one that cannot be read is foreign."""
     try:
-        return urlsplit(origin).netloc.lower()
+        parts = urlsplit(origin)
     except ValueError:
-        return ""
+        return False
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower()
 
 
 def _host_name(host: str) -> str:

@@ -24,7 +24,7 @@ from orthoswarm.canvas.overviews import FACTORS, Overview, reduce_rgba
 from orthoswarm.canvas.tile_store import Key, Tile, TileStore
 from orthoswarm.canvas.tile_versions import VersionIndex
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, StorageError
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
@@ -112,7 +112,7 @@ class Canvas:
 
         Raises:
             InputError: if there is a canvas already.
-            OrthoSwarmError: if the folder cannot be written.
+            StorageError: if the folder cannot be written.
         """
         if tile_px < 64 or tile_px % 64:
             raise InputError(f"a tile of {tile_px} pixels is not a multiple of 64")
@@ -128,7 +128,7 @@ class Canvas:
             canvas = cls(path, Header(grid, tile_px, plane), memory_mb=memory_mb, writable=True)
             os.replace(new, header)
         except OSError as error:
-            raise OrthoSwarmError(f"no canvas can be made in {path} ({error.strerror})") from None
+            raise StorageError(f"no canvas can be made in {path} ({error.strerror})") from None
         return canvas
 
     @classmethod
@@ -206,7 +206,7 @@ class Canvas:
         """A tile to draw on, made if it was empty; end with `commit`. For one writing thread.
 
         Raises:
-            OrthoSwarmError: if the disk is full.
+            StorageError: if the disk is full.
         """
         with self._lock:
             tile = self._store.get(key, create=True)
@@ -243,7 +243,7 @@ class Canvas:
                     else:
                         target.unlink()
                 except OSError as error:
-                    raise OrthoSwarmError(f"the canvas in {self.path} cannot be written ({error.strerror})") from None
+                    raise StorageError(f"the canvas in {self.path} cannot be written ({error.strerror})") from None
                 self.commit(key)
 
     def staging(self, name: str, *, memory_mb: float = 128.0) -> TileStore:

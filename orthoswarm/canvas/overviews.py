@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import StorageError
 
 Bytes = NDArray[np.uint8]
 FACTORS = (8, 64)
@@ -81,7 +81,7 @@ class Overview:
         """Store a tile's reduced copies; None for a tile that is gone.
 
         Raises:
-            OrthoSwarmError: if the disk is full.
+            StorageError: if the disk is full.
         """
         small = rgba
         done = 1
@@ -116,7 +116,7 @@ def _write(descriptor: int, data: bytes, offset: int) -> None:
             os.lseek(descriptor, offset, os.SEEK_SET)
             os.write(descriptor, data)
     except OSError as error:
-        raise OrthoSwarmError(f"the canvas cannot be written ({error.strerror}); free some disk space") from None
+        raise StorageError(f"the canvas cannot be written ({error.strerror}); free some disk space") from None
 
 
 def _read(descriptor: int, size: int, offset: int) -> bytes:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import StorageError
 
 Key = tuple[int, int]
 _SUFFIX = ".tile"
@@ -97,7 +97,7 @@ class TileStore:
         """A tile; None if it does not exist and is not to be made.
 
         Raises:
-            OrthoSwarmError: if the disk is full or the folder cannot be written.
+            StorageError: if the disk is full or the folder cannot be written.
         """
         with self._lock:
             tile = self._open.get(key)
@@ -161,7 +161,7 @@ class TileStore:
         except OSError as error:
             with contextlib.suppress(OSError):
                 new.unlink()
-            raise OrthoSwarmError(
+            raise StorageError(
                 f"the canvas in {self.folder} cannot grow ({error.strerror}); free some disk space"
             ) from None
 

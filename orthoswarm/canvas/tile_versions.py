@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from orthoswarm.canvas.tile_store import Key
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import StorageError
 
 
 class VersionIndex:
@@ -36,7 +36,7 @@ class VersionIndex:
         """Record a version on disk; in memory, too, if visible.
 
         Raises:
-            OrthoSwarmError: if the disk is full.
+            StorageError: if the disk is full.
         """
         data = version.to_bytes(8, "little")
         offset = (key[0] * self._cols + key[1]) * 8
@@ -47,7 +47,7 @@ class VersionIndex:
                 os.lseek(self._file, offset, os.SEEK_SET)
                 os.write(self._file, data)
         except OSError as error:
-            raise OrthoSwarmError(f"the canvas cannot be written ({error.strerror}); free some disk space") from None
+            raise StorageError(f"the canvas cannot be written ({error.strerror}); free some disk space") from None
         if visible:
             self.publish(key, version)
 

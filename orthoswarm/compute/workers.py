@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
 from orthoswarm.config import Overrides, overridden, override
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import WorkerStoppedError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -56,7 +56,7 @@ class Workers(Protocol):
         """Results in the order of the items; items are taken as workers become free.
 
         Raises:
-            OrthoSwarmError: if a worker died. What the function raises is raised at its item's turn.
+            WorkerStoppedError: if a worker died. What the function raises is raised at its item's turn.
         """
 
     def usage(self) -> Usage:
@@ -159,7 +159,7 @@ class Processes:
             outcome = future.result()
         except BrokenProcessPool:
             self.close()
-            raise OrthoSwarmError(
+            raise WorkerStoppedError(
                 "a worker process was stopped from outside, mostly for lack of memory; run again with fewer --workers"
             ) from None
         if outcome.pid != os.getpid():

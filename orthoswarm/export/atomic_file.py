@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import DiskFullError, StorageError
 
 
 @contextmanager
@@ -15,7 +15,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     """Give a name to write a file or folder under; on success it takes the place of `path`, on failure it goes.
 
     Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+        StorageError: if the disk is full or the folder cannot be written.
     """
     part = path.with_name(f".{path.stem}.part{os.getpid()}{path.suffix}")
     try:
@@ -33,11 +33,11 @@ def written_whole(path: Path) -> Iterator[Path]:
         raise
 
 
-def disk_error(error: OSError, path: Path) -> OrthoSwarmError:
+def disk_error(error: OSError, path: Path) -> StorageError:
     """One clear sentence about a file that could not be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return OrthoSwarmError(f"the disk is full, {path.name} was not written; free some space and run again")
-    return OrthoSwarmError(f"{path} cannot be written ({error.strerror or error}); choose another folder")
+        return DiskFullError(f"the disk is full, {path.name} was not written; free some space and run again")
+    return StorageError(f"{path} cannot be written ({error.strerror or error}); choose another folder")
 
 
 def _remove(path: Path) -> None:

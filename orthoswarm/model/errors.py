@@ -15,3 +15,15 @@ class InputError(OrthoSwarmError):
 
 class AdjustmentError(OrthoSwarmError):
     """Pictures of a vehicle do not hold together: their adjustment is singular."""
+
+
+class StorageError(OrthoSwarmError):
+    """A file cannot be written, or its disk not reached; the same may succeed later."""
+
+
+class DiskFullError(StorageError):
+    """There is no room left on the disk."""
+
+
+class WorkerStoppedError(OrthoSwarmError):
+    """A worker process was ended from outside, mostly for lack of memory; the same may succeed later."""

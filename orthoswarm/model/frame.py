@@ -62,12 +62,18 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A picture that could not become a frame, or that was left out later, and why (one clear sentence)."""
+    """A picture that could not become a frame, or that was left out later.
+
+    Attributes:
+        image: its name. reason: why, in one clear sentence. vehicle, time_s: whose and when, as far as known.
+        lacks_position: True where only a position is missing, so that a log that comes later may still help.
+    """
 
     image: str
     reason: str
     vehicle: str = ""
     time_s: float | None = None
+    lacks_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -175,7 +175,7 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
             placed.append(photo)
         else:
             reason = "the picture has no position; put a geo.txt beside it or name a log, too"
-            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
+            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
     return placed
 
 

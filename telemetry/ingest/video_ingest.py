@@ -81,7 +81,7 @@ def _take(
 ) -> None:
     """Take pictures and make frames of them."""
     if not poses.has_positions:
-        result.rejected.append(Rejection(name, NO_POSITION, vehicle))
+        result.rejected.append(Rejection(name, NO_POSITION, vehicle, lacks_position=True))
         return
     try:
         taken = extract(

@@ -9,7 +9,7 @@ import pytest
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.solution_file import load_kept
+from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 
@@ -63,7 +63,7 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert daemon.completions() == note  # what the completion led to stays as it was
     row = daemon.journal.one("SELECT path FROM solutions")
     placed = {
-        p.frame.image: p for p in load_kept(daemon.settings.workspace / "solutions" / row["path"]).solution.placed
+        p.frame.image: p for p in read_solution(daemon.settings.workspace / "solutions" / row["path"]).solution.placed
     }
     assert len(placed) == 20
     for frame in late:

@@ -11,7 +11,7 @@ from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
 from gcs_plugin.daemon.jobs.joint_refinement import Together
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
-from gcs_plugin.daemon.jobs.solution_file import load_kept
+from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import without_strays
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
@@ -41,7 +41,7 @@ def daemon(tmp_path, flights):
 
 def solution(daemon, vehicle):
     row = daemon.journal.one("SELECT path FROM solutions WHERE vehicle = ?", (packed(vehicle),))
-    return row["path"], load_kept(daemon.settings.workspace / "solutions" / row["path"]).solution
+    return row["path"], read_solution(daemon.settings.workspace / "solutions" / row["path"]).solution
 
 
 def errors(found, frames):

@@ -1,6 +1,5 @@
 """The coarse layer in flight: legs are noticed, placed and drawn as they finish; completion takes their place."""
 
-import json
 import threading
 import time
 
@@ -13,7 +12,7 @@ from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.solution_file import Kept, load_kept
+from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.model.frame import Fix, Frame
@@ -131,8 +130,9 @@ def test_refinement_goes_before_what_is_in_the_background(journal):
     jobs.start()
     finished(jobs, 5)
     jobs.close()
-    assert order[0] == ("refine", "v3")
-    assert order[1:] == [("coarse", "v0"), ("export", None), ("coarse", "v1"), ("coarse", "v2")]
+    coarse = [vehicle for kind, vehicle in order if kind == "coarse"]
+    assert coarse == ["v0", "v1", "v2"]
+    assert order.index(("refine", "v3")) < order.index(("coarse", "v0"))  # an export may run beside the refinement
 
 
 def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
@@ -226,7 +226,7 @@ def test_legs_are_on_the_map_before_the_refinement_and_beside_it(tmp_path):
 
 def it_is_drawn_evenly(workspace):
     """The refined sortie was kept with a gain for each picture, near one for even pictures."""
-    kept = [load_kept(path) for path in (workspace / "solutions").glob("solution*.pickle")]
+    kept = [read_solution(path) for path in (workspace / "solutions").glob("solution*.pickle")]
     assert len(kept) == 1
     gains = np.array(list(kept[0].gains.values()))
     assert gains.shape == (28, 3, 6)
@@ -274,12 +274,3 @@ def test_pictures_that_do_not_hold_together_leave_the_real_time_map_alone(tmp_pa
         assert (jobs[-1]["kind"], jobs[-1]["state"]) == ("coarse", "done")
         assert jobs[-1]["detail"]["note"]
         assert not layer_named("coarse")(served.get("/api/layers").json())
-
-
-def test_a_solution_of_an_earlier_version_can_be_read(tmp_path):
-    import pickle
-
-    solution = {"a": "stand-in"}
-    (tmp_path / "old.pickle").write_bytes(pickle.dumps(solution))
-    assert load_kept(tmp_path / "old.pickle") == Kept(solution)
-    assert json.dumps(load_kept(tmp_path / "old.pickle").solution) == json.dumps(solution)

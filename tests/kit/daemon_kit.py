@@ -114,7 +114,7 @@ class Served:
             if done(value):
                 return value
             if time.monotonic() > end:
-                raise AssertionError(f"{path} is still {value}")
+                raise AssertionError(f"{path} is still {value}; jobs {self.get('/api/jobs').text}")
             time.sleep(0.1)
 
 

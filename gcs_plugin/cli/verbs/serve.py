@@ -2,10 +2,14 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.settings import Settings
+
+
+ADDRESS_FILE: Final = "address"
+"""In the workspace: where its daemon was served last."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--gsd", type=float, metavar="M", help="ground pixel of the map (default: that of the first pictures)")
     add("--workers", type=int, metavar="N", help="processes that refine (default: one less than cores)")
     add("--source", action="append", default=[], metavar="ID=WHERE", help="pictures of a vehicle: stream or folder")
+    add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
     add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
 
 
@@ -43,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     if args.workspace.exists() and not args.workspace.is_dir():
         raise InputError(f"{args.workspace} is a file; choose a folder for --workspace")
     try:
-        args.workspace.mkdir(parents=True, exist_ok=True)
+        args.workspace.mkdir(mode=0o700, parents=True, exist_ok=True)
         if args.init:
             path = args.workspace / FILE
             if path.exists():
@@ -54,7 +59,35 @@ def run(args: argparse.Namespace) -> int:
             return 0
     except OSError as error:
         raise disk_error(error, args.workspace) from None
-    return serve(settings_of(args))
+    settings = settings_of(args)
+    return _show_token(settings) if args.show_token else serve(settings)
+
+
+def _show_token(settings: "Settings") -> int:
+    """Print the page's link with the workspace's token, for a daemon that runs there or will."""
+    import contextlib
+
+    from gcs_plugin.web.guard import take_token
+
+    token, url = take_token(_token_file(settings)), _url(settings, settings.port)
+    with contextlib.suppress(OSError, UnicodeDecodeError):  # a daemon was started there, perhaps on another port
+        url = (settings.workspace / ADDRESS_FILE).read_text(encoding="utf-8").strip() or url
+    _print_link(url, token)
+    return 0
+
+
+def _print_link(url: str, token: str) -> None:
+    print(f"map: {url}#token={token}", flush=True)
+    print(f"token: {token}", flush=True)
+
+
+def _token_file(settings: "Settings") -> Path:
+    return settings.token_file or settings.workspace / "token"
+
+
+def _url(settings: "Settings", port: int) -> str:
+    host = f"[{settings.bind}]" if ":" in settings.bind else settings.bind
+    return f"http://{host}:{port}/"
 
 
 def settings_of(args: argparse.Namespace) -> "Settings":
@@ -86,7 +119,6 @@ def serve(settings: "Settings") -> int:
     """Run daemon and web server until SIGINT or SIGTERM."""
     import logging
     import os
-    import socket
     import sys
     import threading
 
@@ -96,33 +128,21 @@ def serve(settings: "Settings") -> int:
     from gcs_plugin.daemon.intake.picture_sources import STREAM_THREAD
     from gcs_plugin.web.app import make_app
     from gcs_plugin.web.guard import take_token
-    from orthoswarm.model.errors import InputError
+    from gcs_plugin.web.listener import open_listener
 
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
-    family = socket.AF_INET6 if ":" in settings.bind else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((settings.bind, settings.port))
-    except OSError as error:
-        listener.close()
-        where = f"{settings.bind}:{settings.port}"
-        raise InputError(f"{where} cannot be served ({error.strerror}); choose another --port") from None
-    port = listener.getsockname()[1]
+    os.umask(0o077)  # pictures, plans and the token are their owner's alone
+    listener = open_listener(settings.bind, settings.port)
+    url = _url(settings, listener.getsockname()[1])
     with Daemon(settings) as daemon, listener:
-        token, new = take_token(settings.token_file or settings.workspace / "token")
+        token = take_token(_token_file(settings))
         config = uvicorn.Config(
             make_app(daemon, token, settings.bind), log_level="warning", access_log=False, server_header=False,
             timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=2048,
         )  # fmt: skip
-        shown = f"[{settings.bind}]" if ":" in settings.bind else settings.bind
-        address = f"http://{shown}:{port}/"
         listener.listen(config.backlog)  # whoever reads the address may come at once, and waits until it is served
-        print(f"map: {address}{'#token=' + token if new else ''}", flush=True)
-        if new:
-            print(f"token: {token}", flush=True)
-        else:
-            print(f"token: in {settings.token_file or settings.workspace / 'token'}", flush=True)
+        (settings.workspace / ADDRESS_FILE).write_text(url + "\n", encoding="utf-8")
+        _print_link(url, token)
         server = uvicorn.Server(config)
 
         def end(*_: object) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from gcs_plugin.daemon.intake.watched_folder import Desk, FolderReader
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from telemetry.samples.sample import Sample
 
 _SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
@@ -144,9 +144,9 @@ class Source:
                 _, new = self._take(pose, data)
                 self.taken += new
                 return
-            except OrthoSwarmError as error:
-                if "disk" not in str(error) and "journal" not in str(error):
-                    _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
-                    return
+            except StorageError as error:
                 self._tell(str(error))
                 self._stop.wait(2.0)
+            except OrthoSwarmError as error:
+                _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
+                return

@@ -245,7 +245,7 @@ class FolderReader:
         for path, (data, digest) in left.items():
             rejection = rejected.get(os.path.normpath(path.absolute()))
             self._files[path].done = True
-            if rejection is None or "no position" not in rejection.reason:
+            if rejection is None or not rejection.lacks_position:
                 _log.warning("%s: %s", self._name(path), rejection.reason if rejection else "it gives no picture")
                 continue
             pose = None if rejection.time_s is None else self._desk.pose_at(rejection.time_s)
@@ -288,7 +288,7 @@ class FolderReader:
         if found.frames:
             self._done(path, digest)
             return
-        if any("no position" in rejection.reason for rejection in found.rejected):
+        if any(rejection.lacks_position for rejection in found.rejected):
             self.poseless.add(path)
         for rejection in found.rejected:
             _log.warning("%s: %s", self._name(path), rejection.reason)

@@ -1,9 +1,9 @@
 """Jobs: what takes long, kept in the journal from the wish to the result, so that none is forgotten or done twice.
 
 A job that was queued or running when the daemon ended is queued again; what it does must be repeatable up to the one
-change of the journal that also marks it as done. Refinement of completed vehicles goes before everything; what belongs
-to the background (coarse maps in flight, neighbours solved together, exports) runs one at a time and never takes a
-refinement's place; neighbours are solved together only while no refinement waits or runs.
+change of the journal that also marks it as done. Refinements have threads of their own; what belongs to the background
+(coarse maps in flight, neighbours solved together, exports) runs one at a time in another thread. Coarse maps and
+neighbours begin only while no refinement waits or runs.
 """
 
 import json
@@ -12,20 +12,22 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
 _KEPT: Final = 1000
 _BACKGROUND: Final = frozenset({"coarse", "together", "redraw", "export"})
-_ORDER: Final = (
-    "CASE WHEN kind = 'refine' THEN 0 WHEN kind = 'coarse' AND detail NOT LIKE '%\"after\"%' THEN 2 ELSE 1 END, id"
-)
+_IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
+"""A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
+_GIVES_WAY: Final = frozenset({"coarse", "together"})
+_WAITING_THREADS: Final = 2
+_JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
 
@@ -88,11 +90,15 @@ After = Callable[[Job], None]
 class Jobs:
     """The queue of jobs.
 
+    Attributes:
+        problem: why the end of a job cannot be written at present; empty if all is well.
+
     Args:
         journal: where they are kept.
         events: told of every change.
         handlers: kind -> what does it.
-        slots: how many refinements run at once; one job of the background runs beside them.
+        slots: how many refinements can be computed at once. Two more may be at a part that needs no worker process
+            (waiting for a vehicle's last pictures, publishing).
         on_drop: called with a running job that is not wanted any more, so that its work may be given up.
     """
 
@@ -111,9 +117,12 @@ class Jobs:
         self._on_drop = on_drop
         self._stop = False
         self._after: list[After] = []
+        self.problem = ""
         self._threads = [
-            threading.Thread(target=self._run, name=f"jobs {n}", daemon=True) for n in range(max(1, slots) + 1)
+            threading.Thread(target=self._run, args=(False,), name=f"refinement {n}", daemon=True)
+            for n in range(max(1, slots) + _WAITING_THREADS)
         ]
+        self._threads.append(threading.Thread(target=self._run, args=(True,), name="background jobs", daemon=True))
         journal.write(_requeue)
 
     def on_end(self, listener: After) -> None:
@@ -179,25 +188,24 @@ class Jobs:
 
     def find(self, number: int) -> Job | None:
         """A job by its number."""
+        if not 0 < number < 1 << 63:  # SQLite's integers have 64 bits
+            return None
         row = self._journal.one("SELECT * FROM jobs WHERE id = ?", (number,))
         return None if row is None else Job.of(row)
 
     def open(self, *kinds: str) -> int:
         """How many jobs of these kinds (any, if none is named) wait or run; coarse maps in flight do not count."""
-        query = (
-            "SELECT kind FROM jobs WHERE state IN ('queued', 'running')"
-            " AND (kind != 'coarse' OR detail LIKE '%\"after\"%')"
-        )
+        query = f"SELECT kind FROM jobs WHERE state IN ('queued', 'running') AND NOT {_IN_FLIGHT}"
         return sum(not kinds or row["kind"] in kinds for row in self._journal.rows(query))
 
     # -- the threads ----------------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def _run(self, background: bool) -> None:
         while True:
             with self._condition:
                 job = None
                 while not self._stop:
-                    job = self._next()
+                    job = self._next(background)
                     if job is not None:
                         break
                     self._condition.wait(5.0)
@@ -205,20 +213,22 @@ class Jobs:
                     return
             try:
                 self._do(job)
-            except Exception:  # the disk is full or gone: the job is still in the journal, try again
-                _log.exception("job %d (%s) waits", job.id, job.kind)
+            except Exception as error:  # its beginning cannot be written: it is still queued in the journal
+                _log.error("job %d (%s) waits: %s", job.id, job.kind, error)
                 with self._condition:
                     self._running.pop(job.id, None)
-                    self._condition.wait(1.0)
+                    self._condition.wait(_JOURNAL_AGAIN_S)
 
-    def _next(self) -> Job | None:
-        """Take the next job that may run: refinement goes first, and a vehicle's jobs one after the other."""
-        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_ORDER}")
+    def _next(self, background: bool) -> Job | None:
+        """Take the next job of the background, or the next refinement; a vehicle's jobs run one after the other."""
+        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_IN_FLIGHT}, id")
         busy = {_lane(job) for job in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(row["kind"] == "refine" for row in rows)
         for row in rows:
             job = Job.of(row)
-            if row["id"] in self._running or _lane(job) in busy or (refining and job.kind == "together"):
+            if (job.kind in _BACKGROUND) != background or row["id"] in self._running or _lane(job) in busy:
+                continue
+            if refining and job.kind in _GIVES_WAY:
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
             self._running[job.id] = job
@@ -239,49 +249,72 @@ class Jobs:
             self._tell(job)
 
         try:
-            change = self._handlers[job.kind](job, progress)
-            if self._stop:
-                return
-            job.state, job.progress, job.message, job.ended = "done", 1.0, "", time.time()
-            self._journal.write(_both(change, _ended(job)))
-        except Exception as error:
-            if self._stop:  # its worker was taken away: it is queued again at the next start
-                return
-            if job.id in self._unwanted:
-                job.state, job.progress, job.ended = "done", 1.0, time.time()
-                job.message = self._unwanted[job.id]
-                self._journal.write(_ended(job))
-            elif isinstance(error, GaveWay):
-                job.state, job.progress, job.started, job.attempts = "queued", 0.0, None, job.attempts - 1
-                self._journal.write(_ended(job))
-            else:
-                self._failed(job, error)
+            outcome = self._outcome(job, progress)
+            if outcome is None or not self._write_end(*outcome):
+                return  # the daemon ends; the job is queued again at the next start
+            ended = outcome[0]
         finally:
             with self._condition:
                 self._running.pop(job.id, None)
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
-        self._tell(job)
+        self._tell(ended)
         for listener in self._after:
             try:
-                listener(job)
+                listener(ended)
             except OrthoSwarmError as error:
                 _log.error("after job %d: %s", job.id, error)
 
-    def _failed(self, job: Job, error: Exception) -> None:
-        known = isinstance(error, OrthoSwarmError)
-        if not known:
-            _log.error("job %d (%s) failed", job.id, job.kind, exc_info=error)
-        job.message = str(error) if known else f"{type(error).__name__}: {error}"
-        again = "stopped from outside" in job.message and job.attempts < _MOST_ATTEMPTS
-        job.state, job.ended = ("queued", None) if again else ("failed", time.time())
+    def _outcome(self, job: Job, progress: Tell) -> tuple[Job, Change] | None:
+        """Do a job; gives the job as it ended and the change that makes it so, None if the daemon ends."""
         try:
-            self._journal.write(_ended(job))
-        except OrthoSwarmError as reason:
-            _log.error("job %d: %s", job.id, reason)
+            change = self._handlers[job.kind](job, progress)
+            if self._stop:
+                return None
+            ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
+            return ended, _both(change, _ended(ended))
+        except Exception as error:
+            if self._stop:  # its worker was taken away
+                return None
+            if job.id in self._unwanted:
+                ended = replace(job, state="done", progress=1.0, message=self._unwanted[job.id], ended=time.time())
+            elif isinstance(error, GaveWay):
+                ended = replace(job, state="queued", progress=0.0, started=None, attempts=job.attempts - 1)
+            else:
+                ended = _failed(job, error)
+            return ended, _ended(ended)
+
+    def _write_end(self, job: Job, change: Change) -> bool:
+        """Write how a job ended, again and again while the disk is full; False if the daemon ends before that."""
+        while True:
+            try:
+                self._journal.write(change)
+            except StorageError as error:
+                if not self.problem:
+                    _log.error("the end of job %d (%s) waits: %s", job.id, job.kind, error)
+                    self._events.publish("problem", text=str(error))
+                self.problem = str(error)
+            else:
+                self.problem = ""
+                return True
+            with self._condition:
+                if self._stop:
+                    return False
+                self._condition.wait(_JOURNAL_AGAIN_S)
 
     def _tell(self, job: Job) -> None:
         self._events.publish("job", **job.document())
+
+
+def _failed(job: Job, error: Exception) -> Job:
+    """A job that has failed; queued again where only its worker process was lost."""
+    known = isinstance(error, OrthoSwarmError)
+    if not known:
+        _log.error("job %d (%s) failed", job.id, job.kind, exc_info=error)
+    message = str(error) if known else f"{type(error).__name__}: {error}"
+    if isinstance(error, WorkerStoppedError) and job.attempts < _MOST_ATTEMPTS:
+        return replace(job, state="queued", message=message)
+    return replace(job, state="failed", message=message, ended=time.time())
 
 
 def new_job(kind: str, vehicle: str | None, sortie: int | None, detail: dict[str, Any]) -> Callable[
@@ -314,7 +347,7 @@ def drop_change(kind: str, vehicle: str, why: str) -> Change:
     def change(db: sqlite3.Connection) -> None:
         db.execute(
             "UPDATE jobs SET state = 'done', progress = 1, message = ?, ended = ? WHERE kind = ? AND vehicle = ?"
-            " AND state = 'queued' AND detail NOT LIKE '%\"after\"%'",
+            " AND state = 'queued' AND json_extract(detail, '$.after') IS NULL",
             values,
         )
 

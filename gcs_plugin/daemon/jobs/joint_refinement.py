@@ -17,7 +17,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell, new_job
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
 from gcs_plugin.daemon.jobs.publisher import Press
-from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import AgainTask, Solved, solve_again
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
@@ -47,7 +47,7 @@ class Together:
 
     journal: Journal
     press: Press
-    crew: Crew
+    crew: WorkerPool
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     _working: bool = False

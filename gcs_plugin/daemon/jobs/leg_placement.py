@@ -19,14 +19,14 @@ import numpy as np
 from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Press
-from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, coarse_after, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.product_files import finite
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.refine.flight.finished_legs import ended_legs
@@ -49,7 +49,7 @@ class Coarse:
     journal: Journal
     store: PictureStore
     press: Press
-    crew: Crew
+    crew: WorkerPool
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     _working: str | None = None
@@ -66,7 +66,7 @@ class Coarse:
             target.unlink(missing_ok=True)
             if self._aside:
                 raise GaveWay from None
-            if "stopped from outside" in str(error) or "disk" in str(error):
+            if isinstance(error, WorkerStoppedError | StorageError):
                 raise
             job.detail["note"] = str(error)  # the map in flight stays as it is; the refinement will see
             return lambda db: None

@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.solution_file import is_readable
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
@@ -33,6 +34,8 @@ class Press:
     Attributes:
         folder: of the layers' canvases. kept: folder of kept sorties.
         lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
+        outdated: vehicle and sortie of those that were refined by another version of the program, and are to be
+            refined again from their pictures.
     """
 
     def __init__(
@@ -47,6 +50,7 @@ class Press:
         self._turns = {name: threading.Lock() for name in REFINED}
         self.printing: set[str] = set()
         self.kept.mkdir(parents=True, exist_ok=True)
+        self.outdated = self._forget_outdated()
         begun = journal.fact("lost") or []
         self.lost = [name for name in REFINED if not self._opened(name, trusted) or name in begun]
         journal.write(fact_change("lost", self.lost))
@@ -67,7 +71,35 @@ class Press:
             return False
         return True
 
-    def draw_again(self, crew: Crew, tell: Callable[[float, str], None]) -> Change:
+    def _forget_outdated(self) -> list[tuple[str, int]]:
+        """Forget solution files that cannot be read, and the layers that show them; gives the refined ones."""
+        outdated = {
+            table: [row for row in self._rows(table) if not is_readable(self.kept / row["path"])]
+            for table in ("solutions", "coarse")
+        }
+        keys = [(row["vehicle"], row["sortie"]) for rows in outdated.values() for row in rows]
+        if not keys:
+            return []
+
+        def change(db: sqlite3.Connection) -> None:
+            for table, rows in outdated.items():
+                names = [(row["vehicle"], row["sortie"]) for row in rows]
+                db.executemany(f"DELETE FROM {table} WHERE vehicle = ? AND sortie = ?", names)
+            db.executemany(
+                "UPDATE frames SET stage = 'realtime' WHERE vehicle = ? AND sortie = ? AND stage IN ('coarse', 'fine')",
+                keys,
+            )
+            for layer in REFINED:
+                fact_change(layer, None)(db)
+
+        self.journal.write(change)
+        refined = [(unpacked(row["vehicle"]), int(row["sortie"])) for row in outdated["solutions"]]
+        _log.warning(
+            "the refined map was made by another version of the program; %d sorties are refined again", len(refined)
+        )
+        return refined
+
+    def draw_again(self, crew: WorkerPool, tell: Callable[[float, str], None]) -> Change:
         """Draw the layers that were lost from the kept sorties, one after the other; gives the change that says so."""
         todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
         for n, (layer, (vehicle, sortie)) in enumerate(todo):
@@ -114,7 +146,7 @@ class Press:
     def print(
         self,
         layer: str,
-        crew: Crew,
+        crew: WorkerPool,
         sortie: tuple[str, int | None],
         target: Path,
         changed: BoundingBox,

@@ -1,9 +1,11 @@
-"""What the daemon keeps of a placed sortie beside its journal: a pickle of the solution and what drawing it needs."""
+"""Solution files: a placed sortie and what drawing it needs, pickled beside the journal."""
 
+import hashlib
 import os
 import pickle
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -12,21 +14,30 @@ from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
+from orthoswarm.model.camera import Camera, Lens
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.placement import Leg, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
 from orthoswarm.mosaic.radiometry import estimate_fields
 
 Bytes = NDArray[np.uint8]
 Gain = NDArray[np.float32]
 
+_FORMAT: Final = 2
+"""To be raised when the refiner's own part of a solution (`Solution.state`) changes."""
 _OVERLAP_M: Final = 50.0
 _THUMBNAIL: Final = (12, 16, 3)
 OWN, OTHER = "own", "other"
 
 
+class SolutionFileError(OrthoSwarmError):
+    """A solution file is damaged, or of another version of the program."""
+
+
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """A placed sortie.
+class SolutionFile:
+    """A placed sortie with what drawing it needs, as it lies in a file beside the journal.
 
     Attributes:
         solution: its frames' cameras.
@@ -46,18 +57,50 @@ class Kept:
         """Write it, whole and synced or not at all.
 
         Raises:
-            OrthoSwarmError: the disk is full.
+            StorageError: the disk is full.
         """
         with written_whole(path) as part, part.open("wb") as file:
+            file.write(_header())
             pickle.dump(self, file, pickle.HIGHEST_PROTOCOL)
             file.flush()
             os.fsync(file.fileno())
 
 
-def load_kept(path: Path) -> Kept:
-    """What `Kept.write` wrote; also a bare solution, as earlier versions did."""
-    found = pickle.loads(path.read_bytes())
-    return found if isinstance(found, Kept) else Kept(found)
+def is_readable(path: Path) -> bool:
+    """Whether a solution file is of this version of the program, by its first bytes."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_header())) == _header()
+    except OSError:
+        return False
+
+
+def read_solution(path: Path) -> SolutionFile:
+    """What `SolutionFile.write` wrote.
+
+    Raises:
+        SolutionFileError: the file is gone, damaged, or of another version of the program.
+    """
+    reason = f"{path.name} was written by another version of the program; refine its vehicle again"
+    if not is_readable(path):
+        raise SolutionFileError(reason if path.exists() else f"{path.name} is gone; refine its vehicle again")
+    try:
+        with path.open("rb") as file:
+            file.seek(len(_header()))
+            found = pickle.load(file)
+    except Exception:  # a pickle that is torn, or whose classes have moved, can raise anything
+        raise SolutionFileError(f"{path.name} is damaged; refine its vehicle again") from None
+    if not isinstance(found, SolutionFile):
+        raise SolutionFileError(reason)
+    return found
+
+
+@cache
+def _header() -> bytes:
+    """Begins each file: the format's number, and a digest of the names and fields that the pickle relies on."""
+    classes = (SolutionFile, Solution, PlacedFrame, Leg, Terrain, Camera, Lens, Frame, Fix)
+    names = [(c.__module__, c.__qualname__, [f.name for f in fields(c)]) for c in classes]
+    return f"OrthoSwarm solution {_FORMAT} {hashlib.sha256(repr(names).encode()).hexdigest()[:16]}\n".encode()
 
 
 def thumbnail_of(data: bytes) -> Bytes:
@@ -87,7 +130,10 @@ def marked(placed: PlacedFrame, number: int, *, own: bool) -> PlacedFrame:
 
 
 def gains_of(
-    solution: Solution, thumbnails: Mapping[str, Bytes], others: Iterable[Kept], held: Mapping[str, Gain] | None = None
+    solution: Solution,
+    thumbnails: Mapping[str, Bytes],
+    others: Iterable[SolutionFile],
+    held: Mapping[str, Gain] | None = None,
 ) -> dict[str, Gain]:
     """Gains of a solution's frames, even with each other and with those of others that are drawn already.
 

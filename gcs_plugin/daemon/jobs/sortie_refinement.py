@@ -13,7 +13,7 @@ from gcs_plugin.daemon.jobs.job_queue import Job, Tell, new_job
 from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Press
-from gcs_plugin.daemon.jobs.worker_pool import Crew
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, lay_beside, near, solve
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
@@ -43,7 +43,7 @@ class Refinement:
     journal: Journal
     store: PictureStore
     press: Press
-    crew: Crew
+    crew: WorkerPool
     drawer: Drawer
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
@@ -61,9 +61,32 @@ class Refinement:
         self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
         if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
             return _nothing_came(job)
-        job.detail["refine_started_s"] = time.time()
+        tell(0.03, "waiting for a free worker process")
+        with self.crew.reserved():
+            before, target, frames, solved = self._solve(job, tell)
+        if before is not None:
+            job.detail["beside"] = len(solved.stages)
+            if not solved.stages and not solved.dropped:
+                target.unlink(missing_ok=True)
+                return _nothing_came(job)
+        job.detail |= {
+            "frames": frames, "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
+            "warnings": solved.warnings,
+        }  # fmt: skip
+        self._show(job, tell, target, solved, before)
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return lambda db: None
+
+    def _solve(self, job: Job, tell: Tell) -> tuple[Any, Path, int, Solved]:
+        """Solve what has come by now in the process that is reserved.
+
+        Returns:
+            The row of the solution beside which late pictures were laid (None: all were refined), the new solution's
+            file, how many pictures there are, and what became of them.
+        """
+        job.detail["refine_started_s"] = time.time()  # what arrives later is late
         area = self.press.area()
-        frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
+        frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
         before = self._beside(job, len(frames))
         tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
         target = self.press.kept / f"{new_name('solution')}.pickle"
@@ -71,19 +94,7 @@ class Refinement:
             frames, area.epsg, area.origin, self.basemap, thumbnails, self._neighbours(job, near(frames, area.epsg)),
             target, None if before is None else self.press.kept / before["path"],
         )  # fmt: skip
-        solved = self.crew.run(solve if before is None else lay_beside, task)
-        if before is not None:
-            job.detail["beside"] = len(solved.stages)
-            if not solved.stages and not solved.dropped:
-                target.unlink(missing_ok=True)
-                return _nothing_came(job)
-        job.detail |= {
-            "frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
-            "warnings": solved.warnings,
-        }  # fmt: skip
-        self._show(job, tell, target, solved, before)
-        job.detail["seconds"] = round(time.monotonic() - began, 3)
-        return lambda db: None
+        return before, target, len(frames), self.crew.run(solve if before is None else lay_beside, task)
 
     def _show(self, job: Job, tell: Tell, target: Path, solved: Solved, before: Any) -> None:
         """Draw and publish what was solved."""

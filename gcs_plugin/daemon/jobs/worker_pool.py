@@ -4,23 +4,25 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from gcs_plugin.daemon.jobs.process_usage import used_by
 from orthoswarm.compute.workers import Usage, single_threaded
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
 Result = TypeVar("Result")
 
 NICE: Final = 5
 LAST: Final = 10
 """Priority of what may wait while anything else has work."""
+_LOOK_S: Final = 0.5
 
 
-class Crew:
+class WorkerPool:
     """A few processes that run one function at a time each.
 
     Args:
@@ -30,6 +32,8 @@ class Crew:
     def __init__(self, count: int, nice: int = NICE) -> None:
         self.count, self._nice = max(1, count), nice
         self._lock = threading.Lock()
+        self._free = threading.BoundedSemaphore(self.count)
+        self._reserved = threading.local()
         self._pool: ProcessPoolExecutor | None = None
         self._closed = self._started = self._warm = False
         self._ended_cpu_s = 0.0
@@ -69,12 +73,32 @@ class Crew:
                 self._pool = None
         return self.submit(function, item)
 
-    def run(self, function: Callable[[Any], Result], item: Any) -> Result:
-        """Run a function and wait for it.
+    @contextmanager
+    def reserved(self) -> Iterator[None]:
+        """Wait until a process is free, and keep it for what this thread runs meanwhile.
 
         Raises:
-            OrthoSwarmError: the process was stopped from outside. What the function raises is raised here.
+            OrthoSwarmError: the daemon is stopping.
         """
+        while not self._free.acquire(timeout=_LOOK_S):
+            if self._closed:
+                raise OrthoSwarmError("the daemon is stopping; start it again")
+        self._reserved.held = True
+        try:
+            yield
+        finally:
+            self._reserved.held = False
+            self._free.release()
+
+    def run(self, function: Callable[[Any], Result], item: Any) -> Result:
+        """Run a function once a process is free, and wait for it.
+
+        Raises:
+            WorkerStoppedError: the process was stopped from outside. What the function raises is raised here.
+        """
+        if not getattr(self._reserved, "held", False):
+            with self.reserved():
+                return self.run(function, item)
         future = self.submit(function, item)
         pool = self._pool
         try:
@@ -83,7 +107,7 @@ class Crew:
             with self._lock:
                 if self._pool is pool:
                     self._pool = None
-            raise OrthoSwarmError("a worker process was stopped from outside, mostly for lack of memory") from None
+            raise WorkerStoppedError("a worker process was stopped from outside, mostly for lack of memory") from None
 
     def usage(self) -> Usage:
         """CPU time of all its processes so far, and the largest memory of each one that lives, added up."""

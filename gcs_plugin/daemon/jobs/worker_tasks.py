@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from gcs_plugin.daemon.jobs.solution_file import OWN, Bytes, Kept, gains_of, load_kept, marked, seen, touches
+from gcs_plugin.daemon.jobs.solution_file import (
+    OWN,
+    Bytes,
+    SolutionFile,
+    gains_of,
+    marked,
+    read_solution,
+    seen,
+    touches,
+)
 from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.canvas.canvas import Canvas
@@ -73,7 +82,7 @@ class _Watch:
     def __init__(self) -> None:
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def solved(self, solution: Solution, frames: Sequence[Frame], kept: Kept, changed: BoundingBox) -> Solved:
+    def solved(self, solution: Solution, frames: Sequence[Frame], kept: SolutionFile, changed: BoundingBox) -> Solved:
         return Solved(
             {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
             [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
@@ -89,10 +98,10 @@ def solve(task: SolveTask) -> Solved:
         OrthoSwarmError: nothing can be made of its frames.
     """
     watch = _Watch()
-    others = [load_kept(path) for path in task.neighbours]
+    others = [read_solution(path) for path in task.neighbours]
     refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
     solution = without_strays(refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task)))
-    kept = Kept(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
+    kept = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     kept.write(task.target)
     return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
 
@@ -104,14 +113,14 @@ def lay_beside(task: SolveTask) -> Solved:
 
     assert task.before is not None
     watch = _Watch()
-    before = load_kept(task.before)
+    before = read_solution(task.before)
     refined = before.solution
     known = {p.frame.image for p in refined.placed} | set(refined.dropped)
     placed, dropped = lay_late([f for f in task.frames if f.image not in known], refined, task.epsg, read_frame)
     whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], before.gains)
-    kept = Kept(whole, thumbnails, gains)
+    gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)
+    kept = SolutionFile(whole, thumbnails, gains)
     kept.write(task.target)
     new = replace(whole, placed=placed, dropped=dropped, legs=[])
     return watch.solved(new, [], kept, seen(placed, kept.terrain))
@@ -155,11 +164,11 @@ def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
     from orthoswarm.refine.strategy.swarm_refiner import states_of
 
     watch = _Watch()
-    before = load_kept(task.before)
+    before = read_solution(task.before)
     frames = [frame for state in states_of(before.solution) for frame in state.flight.frames]
     if not frames:
         return None
-    others = [load_kept(path).solution for path in task.neighbours]
+    others = [read_solution(path).solution for path in task.neighbours]
     basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
     solution = make_refiner("swarm", task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
     if solution is before.solution:
@@ -198,14 +207,14 @@ def place(task: SolveTask) -> Solved:
     watch = _Watch()
     solution = place_in_flight(task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task))
     mine = {frame.image for frame in task.frames}
-    before = Kept(replace(solution, placed=[])) if task.before is None else load_kept(task.before)
+    before = SolutionFile(replace(solution, placed=[])) if task.before is None else read_solution(task.before)
     earlier = [p for p in before.solution.placed if p.frame.image not in mine]
     moved = [p for p in before.solution.placed if p.frame.image in mine]
     whole = replace(solution, placed=[*earlier, *solution.placed])
     stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(whole, thumbnails, [load_kept(path) for path in task.neighbours], stays)
-    kept = Kept(whole, thumbnails, gains)
+    gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], stays)
+    kept = SolutionFile(whole, thumbnails, gains)
     kept.write(task.target)
     changed = seen([*solution.placed, *moved], kept.terrain)
     return watch.solved(solution, _in_units(task.frames), kept, changed)
@@ -224,7 +233,7 @@ def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
 
     watch = _Watch()
     source, origin, target = task
-    fine = load_kept(source)
+    fine = read_solution(source)
     solution = coarse_of(fine.solution, np.array(origin))
     there = {p.frame.image for p in solution.placed}
     solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # laid beside the others
@@ -290,9 +299,9 @@ def draw(task: DrawTask) -> dict[str, str]:
     """
     placed: list[PlacedFrame] = []
     gains: dict[str, Any] = {}
-    terrain = load_kept(task.changed).terrain
+    terrain = read_solution(task.changed).terrain
     for path in task.solutions:
-        kept = load_kept(path)
+        kept = read_solution(path)
         for p in kept.solution.placed:
             if touches(p, task.bounds):
                 frame = marked(p, len(placed), own=path == task.changed)
@@ -311,8 +320,3 @@ def draw(task: DrawTask) -> dict[str, str]:
             old.close()
     named = ([*key.split(" ", 2), why] for key, why in stats.rejected.items())
     return {image: why for _, whose, image, why in named if whose == OWN}
-
-
-def load_solution(path: Path) -> Solution:
-    """The solution of a kept sortie."""
-    return load_kept(path).solution

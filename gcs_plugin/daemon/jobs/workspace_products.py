@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.jobs.worker_tasks import load_solution
+from gcs_plugin.daemon.jobs.solution_file import read_solution
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import Usage
 from orthoswarm.model.errors import InputError
@@ -62,8 +62,8 @@ def write_products(task: ExportTask) -> dict[str, str]:
     made, area_ha = _pictures(task)
     if not made:
         raise InputError("there is no map yet; wait for pictures")
-    refined = [load_solution(path) for path in task.solutions]
-    solutions = [*(load_solution(path) for path in task.coarse), *refined]
+    refined = [read_solution(path).solution for path in task.solutions]
+    solutions = [*(read_solution(path).solution for path in task.coarse), *refined]
     placed, rejected = _placements(task, solutions)
     placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)

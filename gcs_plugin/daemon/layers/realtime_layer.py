@@ -27,7 +27,7 @@ from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid, utm_epsg
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
@@ -268,9 +268,9 @@ class Drawer:
             mosaic = self._mosaic
             assert mosaic is not None
             added = mosaic.add(picture, camera)
+        except StorageError:  # the disk is full, or gone: later
+            raise
         except OrthoSwarmError as error:
-            if "canvas" in str(error):  # the disk is full: later
-                raise
             reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
             return self._told(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:

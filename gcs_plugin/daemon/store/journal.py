@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError
 
 Result = TypeVar("Result")
 
@@ -60,6 +60,13 @@ def packed(text: str) -> str:
 def unpacked(text: str) -> str:
     """The text that `packed` took."""
     return str(json.loads(text))
+
+
+def _write_error(error: Exception) -> StorageError:
+    """Why a commit failed, as our own error."""
+    if isinstance(error, sqlite3.Error) and getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
+        return DiskFullError("the disk is full, the journal cannot be written; free some space")
+    return StorageError(f"the journal cannot be written ({error}); check the workspace's disk")
 
 
 class Journal:
@@ -153,7 +160,7 @@ class Journal:
         except Exception as error:  # the disk is full or gone: nothing of this batch has happened
             with contextlib.suppress(sqlite3.Error):
                 self._writer.execute("ROLLBACK")
-            reason = OrthoSwarmError(f"the journal cannot be written ({error}); free some disk space")
+            reason = _write_error(error)
             for _, future in batch:
                 future.set_exception(reason)
             return
@@ -261,7 +268,7 @@ SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sorti
         WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie AND id != :job), 0)
     AND (EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
         OR EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie
-            AND detail LIKE '%"trigger": "lost"%'))
+            AND json_extract(detail, '$.trigger') = 'lost'))
 """
 
 

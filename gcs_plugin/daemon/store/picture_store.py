@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoswarm.export.atomic_file import disk_error
-from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError
 
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
@@ -73,7 +73,7 @@ class PictureStore:
             Its name within the folder.
 
         Raises:
-            OrthoSwarmError: the disk is full or gone.
+            StorageError: the disk is full or gone.
         """
         digits = key.hex()
         name = f"{digits[:2]}/{digits}{suffix}"
@@ -90,7 +90,7 @@ class PictureStore:
             with contextlib.suppress(OSError):
                 part.unlink()
             reason = disk_error(error, path)
-            raise OrthoSwarmError(str(reason).replace(path.name, "a picture")) from None
+            raise type(reason)(str(reason).replace(path.name, "a picture")) from None
         return name
 
 

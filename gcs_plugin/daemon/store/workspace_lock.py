@@ -11,7 +11,7 @@ from typing import Final
 
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.batch.workspace import Workspace
-from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import DiskFullError, InputError, StorageError
 from orthoswarm.raster.basemap import Basemap
 
 _LOCK_S: Final = 5.0
@@ -39,14 +39,14 @@ def require_space(workspace: Path, size: int) -> None:
     """Refuse what would fill the disk, while there is room to say so.
 
     Raises:
-        OrthoSwarmError: there is too little room.
+        StorageError: there is too little room.
     """
     try:
         free = shutil.disk_usage(workspace).free
     except OSError as error:
-        raise OrthoSwarmError(f"the workspace cannot be reached ({error.strerror}); connect its disk") from None
+        raise StorageError(f"the workspace cannot be reached ({error.strerror}); connect its disk") from None
     if free < _FREE_MB * 1e6 + size:
-        raise OrthoSwarmError(f"the disk is nearly full ({free / 1e6:.0f} MB left); free some space")
+        raise DiskFullError(f"the disk is nearly full ({free / 1e6:.0f} MB left); free some space")
 
 
 def distrust_after_power_cut(journal: Journal) -> bool:
