@@ -1,8 +1,6 @@
 """What a machine has for mapping: programs, codecs, weights, cores, memory, disk; and what a lack of it costs."""
 
-import contextlib
 import importlib
-import io
 import json
 import os
 import platform
@@ -10,7 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -183,13 +181,14 @@ def _cluster() -> Check:
 
 
 def kernel_modules() -> list[tuple[str, bool]]:
-    """Modules of the core with compiled kernels, and whether compiled forms of the present source are cached."""
+    """Modules with compiled kernels that mapping and planning use, and whether their present source is compiled."""
     import orthoswarm
 
     root = Path(str(orthoswarm.__file__)).parent
     out = []
     for source in sorted(root.rglob("*.py")):
-        if "\n@kernel\n" in source.read_text(encoding="utf-8"):
+        simulated = "twin" in source.relative_to(root).parts
+        if not simulated and "\n@kernel\n" in source.read_text(encoding="utf-8"):
             name = ".".join(["orthoswarm", *source.relative_to(root).with_suffix("").parts])
             out.append((name, _is_warm(name, source)))
     return out
@@ -207,26 +206,47 @@ def _is_warm(module: str, source: Path) -> bool:
 
 
 def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels by making two tiny maps of made-up pictures and two plans; gives the seconds it took."""
+    """Compile the kernels by making two tiny maps of simulated pictures and two plans; gives the seconds it took."""
     import tempfile
 
     started = time.perf_counter()
-    from gcs_plugin.cli.main import main
-
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        say("making tiny maps of made-up pictures, to compile the kernels")
-        twin, out = Path(folder, "twin"), Path(folder, "map")
-        main(["twin", "make", "tiny", "--out", str(twin), "--json"])
-        photos = sorted((twin / "photos").rglob("*.JPG"))
-        common = ["--basemap", str(twin / "basemap.tif"), "--workers", "1"]
-        main(["mosaic", str(twin / "photos"), *common, "--out", str(out)])
-        # Photos with little overlap go another way.
-        main(["mosaic", *map(str, photos[::3]), *common, "--out", str(out)])
-        ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]
-        hole = [[9.004, 47.002], [9.004, 47.004], [9.006, 47.004], [9.006, 47.002], [9.004, 47.002]]
-        area = Path(folder, "area.geojson")
-        area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring, hole]}), encoding="utf-8")
-        flags = ["--vehicles", "3", "--altitude", "60", "--fov-min", "60", "--start", "46.999,9.0", "--endurance", "12"]
-        for method in ("bcd", "tmstc"):
-            main(["plan", str(area), *flags, "--method", method, "--out", str(Path(folder, method))])
+    say("making tiny maps of simulated pictures, to compile the kernels")
+    with tempfile.TemporaryDirectory() as folder:
+        _make_maps(Path(folder))
+        _make_plans(Path(folder))
     return time.perf_counter() - started
+
+
+def _make_maps(folder: Path) -> None:
+    """A dense flight, and a sparse one, whose pictures are matched in pairs instead of being followed."""
+    import telemetry
+    from orthoswarm.batch.pipeline import Options, run
+    from orthoswarm.compute.workers import Serial
+    from orthoswarm.model.frame import Ingest
+    from orthoswarm.twin.make import make_twin
+    from orthoswarm.twin.presets import spec
+
+    make_twin(spec("tiny"), folder / "twin")
+    photos = sorted((folder / "twin" / "photos").rglob("*.JPG"))
+    options = Options(basemap=folder / "twin" / "basemap.tif")
+    for name, some in (("dense", photos), ("sparse", photos[::3])):
+
+        def load(_: Callable[[str, int, int], None], some: list[Path] = some) -> Ingest:
+            return telemetry.load(some)
+
+        run(load, folder / name, options, Serial(), lambda *_: None)
+
+
+def _make_plans(folder: Path) -> None:
+    """Plans of two methods round a hole."""
+    from gcs_plugin.plans.plan_request import PlanRequest, make_plan
+
+    ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]
+    hole = [[9.004, 47.002], [9.004, 47.004], [9.006, 47.004], [9.006, 47.002], [9.004, 47.002]]
+    area = folder / "area.geojson"
+    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring, hole]}), encoding="utf-8")
+    request = PlanRequest(
+        area=area, vehicles=3, altitude_m=60.0, fov_min_deg=60.0, starts=[(46.999, 9.0)], endurance_min=12.0
+    )
+    for method in ("bcd", "tmstc"):
+        make_plan(replace(request, method=method))
