@@ -13,10 +13,12 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
-from telemetry.formats.table import pose_table
+from telemetry.formats.table import geo_txt, pose_csv
+from telemetry.formats.table.pose_row import PoseTable, lookup
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
 from telemetry.ingest.photo_order import in_order
+from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings
@@ -79,21 +81,24 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     return result
 
 
-def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, pose_table.PoseTable]]:
+def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable]]:
     """Pose tables with the folder they apply to (and what lies below), innermost last."""
-    tables: list[tuple[Path, str, pose_table.PoseTable]] = []
+    tables: list[tuple[Path, str, PoseTable]] = []
     for folder in found.folders:
         for path in folder.tables:
-            table: pose_table.PoseTable | Unreadable | None
-            if pose_table.is_geo_txt(path):
-                table, kind = read_or_reason(pose_table.read_geo_txt, path), "geo.txt"
-            elif path.suffix.lower() == ".csv":
-                table, kind = read_or_reason(pose_table.read_pose_csv, path), "CSV"
+            table: PoseTable | Unreadable | None
+            if geo_txt.is_geo_txt(path):
+                table, kind = read_or_reason(geo_txt.read_geo_txt, path), "geo.txt"
             else:
-                continue
+                table = read_or_reason(pose_csv.read_pose_csv, path)
+                kind = "CSV" if path.suffix.lower() == ".csv" else "table"
             if isinstance(table, Unreadable):
                 result.findings.append(Finding("table-unreadable", f"{found.name(path)} is not used: {table}"))
-            elif table is not None:
+            elif table is None:
+                if pose_csv.names_pictures(path) and read_control_points(path) is None:
+                    text = f"{found.name(path)} names pictures, but is no table of poses that is known; it is not used"
+                    result.findings.append(Finding("table-unknown", text, note=True))
+            else:
                 where = found.scope(path)
                 tables.append((where, kind, table))
                 source = SourceInfo(found.name(path), kind)
@@ -102,7 +107,7 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, pose_tabl
     return sorted(tables, key=lambda entry: len(entry[0].parts))
 
 
-def _table_findings(path: Path, folder: Path, table: pose_table.PoseTable, found: Discovery) -> list[Finding]:
+def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery) -> list[Finding]:
     """Lines of a pose table that say nothing, or are about pictures that are not there."""
     findings = []
     if table.useless:
@@ -121,7 +126,7 @@ def _photo_folder(
     folder: Folder,
     tags: Iterable[PhotoTags | Unreadable | None],
     found: Discovery,
-    tables: Sequence[tuple[Path, str, pose_table.PoseTable]],
+    tables: Sequence[tuple[Path, str, PoseTable]],
     logs: Sequence[LogSource],
     result: Survey,
 ) -> None:
@@ -183,13 +188,13 @@ def _photo_key(photo: PhotoTags) -> tuple[object, ...]:
     return (math.inf if photo.time_s is None else photo.time_s, natural_key(photo.path.name))
 
 
-def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, pose_table.PoseTable]]) -> str | None:
+def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, PoseTable]]) -> str | None:
     """Put what tables say over the photo's own tags, field by field; returns a vehicle's name if one is given."""
     vehicle = None
     for where, kind, table in tables:
         if not path.is_relative_to(where):
             continue
-        row = pose_table.lookup(table, path.relative_to(where).as_posix())
+        row = lookup(table, path.relative_to(where).as_posix())
         if row is None:
             continue
         vehicle = row.vehicle or vehicle

@@ -148,7 +148,7 @@ def _without_coincidences(
     expected = offset + (1.0 + drift) * problem.e[np.clip(first + best, 0, len(problem.e) - 1)]
     farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s
     total = probability.sum(axis=1)
-    alone = (farthest < least) & (probability[rows, best] > 0.5)
+    alone = (farthest < least) & (probability[rows, best] > 0.05)
     return np.where(alone[:, None], probability / np.maximum(total, 1e-300)[:, None], probability)
 
 
@@ -173,7 +173,7 @@ class _Problem:
 
     Attributes:
         p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
-        resolution_s: width of a photo's interval. interval_s: usual time between exposures.
+        resolution_s: width of a photo's interval. interval_s: time between exposures that matches are weighed with.
         jitter_s: one sigma. missing: odds of one exposure missing from one of the recordings.
     """
 
@@ -196,6 +196,15 @@ class _Problem:
         else:
             density = np.exp(-0.5 * (u / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
         return np.asarray(np.where(inside, self.interval_s * density, 0.0))
+
+    def regular(self) -> "_Problem":
+        """The same for exposures at even intervals.
+
+        There a clock that is wrong by whole intervals brings photos onto events, too, so that a coincidence weighs no
+        more than the exposure that it spares; only how well it fits still counts.
+        """
+        widest = max(self.resolution_s, self.jitter_s * float(np.sqrt(2.0 * np.pi)))
+        return replace(self, interval_s=min(self.interval_s, widest))
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +294,7 @@ def _plausible(problem: _Problem) -> tuple[_Problem, list[tuple[float, float]]]:
     tried.sort(reverse=True)
     if not tried or not np.isfinite(tried[0][0]):
         return problem, []
-    problem = _fitted(problem, tried[0][1], tried[0][2])
+    problem = _fitted(problem, tried[0][1], tried[0][2]).regular()
     # The first parameters were guesses: leave out only what they make impossible.
     return problem, [(o, d) for value, o, d in tried if value > tried[0][0] - 3.0 * _NEGLIGIBLE]
 
@@ -393,10 +402,10 @@ def _probabilities(
         for i, shift in enumerate((lo - first).tolist()):
             joined[i, shift : shift + part.shape[1]] += part[i]
     offset, drift, doubt = float(best.offset[at]), float(best.drift[at]), 0.0
-    half = 0.5 * float(np.ptp(problem.e))
+    half, usual = 0.5 * float(np.ptp(problem.e)), float(np.median(np.diff(problem.e)))
     for grid, evidence in scored:
         moved = np.abs(grid.offset - offset) + half * np.abs(grid.drift - drift)
-        doubt += float(np.exp(evidence - total)[moved > 0.6 * problem.interval_s].sum())
+        doubt += float(np.exp(evidence - total)[moved > 0.6 * usual].sum())
     return first, joined, offset, drift, doubt
 
 

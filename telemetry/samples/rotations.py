@@ -58,3 +58,18 @@ def mounted_down_deg(body_ned: Array) -> tuple[float, float, float]:
     """Our yaw, pitch, roll in degrees of a camera fixed under an airframe, its picture's up towards the nose."""
     down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # optical axis = body z, picture up = body x
     return camera_angles_deg(body_ned @ down)
+
+
+def camera_angles_from_opk_deg(omega: float, phi: float, kappa: float) -> tuple[float, float, float]:
+    """Our yaw, pitch, roll in degrees of photogrammetry's omega, phi, kappa in degrees.
+
+    R = Rx(omega) Ry(phi) Rz(kappa) turns image axes (x right, y up, z away from the ground) to east-north-up (Förstner
+    and Wrobel, "Photogrammetric Computer Vision", section 8.1). East and north are those of the table's grid.
+    """
+    o, p, k = np.radians([omega, phi, kappa])
+    co, so, cp, sp, ck, sk = np.cos(o), np.sin(o), np.cos(p), np.sin(p), np.cos(k), np.sin(k)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, co, -so], [0.0, so, co]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_z = np.array([[ck, -sk, 0.0], [sk, ck, 0.0], [0.0, 0.0, 1.0]])
+    yaw, pitch, roll = angles_from_rotation(about_x @ about_y @ about_z @ np.diag([1.0, -1.0, -1.0]))
+    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))

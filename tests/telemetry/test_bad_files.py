@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from telemetry.formats.log import flight_logs
-from telemetry.formats.table import pose_table
+from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.video import srt
 from telemetry.ingest import log_ingest, video_ingest
 from telemetry.ingest.ingest import LoadOptions, load, survey
@@ -78,8 +78,8 @@ def make_subtitles(folder):
 
 READERS = [
     (photo_tags, "read_photo", make_photo),
-    (pose_table, "read_geo_txt", make_geo_txt),
-    (pose_table, "read_pose_csv", make_csv),
+    (geo_txt, "read_geo_txt", make_geo_txt),
+    (pose_csv, "read_pose_csv", make_csv),
     (log_ingest, "read_log", make_log),
     (flight_logs, "read_ulog", make_log),
     (video_ingest, "scan", make_clip),

@@ -10,7 +10,7 @@ from telemetry.formats.log.flight_logs import NotALog, read_log
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import NotAPicture, read_container
-from telemetry.formats.table import pose_table
+from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.video import bitstream, djmd, klv, sei, srt
 from telemetry.photos.photo_tags import read_photo
 from tests.telemetry.test_sei import dji_payload, packet
@@ -145,12 +145,12 @@ def file_parser(name: str):
         from orthoswarm.model.errors import InputError
 
         try:
-            pose_table.read_geo_txt(path)
+            geo_txt.read_geo_txt(path)
         except InputError as reason:
             assert str(reason)
 
     def poses(path: Path) -> None:
-        pose_table.read_pose_csv(path)
+        pose_csv.read_pose_csv(path)
 
     return {"photo": photo, "log": log, "table": table, "poses": poses}[name]
 

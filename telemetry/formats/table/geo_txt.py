@@ -1,0 +1,113 @@
+"""OpenDroneMap's geo.txt.
+
+A line with the projection ("EPSG:4326", a PROJ string, "WGS84 UTM 17N"), then, with blanks between,
+
+    name x y [z] [yaw] [pitch] [roll] [horizontal accuracy] [vertical accuracy] [anything else]
+
+z is an absolute altitude. Pitch is 0 at nadir in some files and -90 in others; the file's own values decide. Angles of
+0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "Image Geolocation Files".
+"""
+
+import math
+import re
+from pathlib import Path
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
+from telemetry.samples.sample import is_position
+
+_MOST_NUMBERS = 8
+
+
+def is_geo_txt(path: Path) -> bool:
+    """Whether a text file looks like ODM's geo.txt: by its name or by a projection in its first line."""
+    if path.suffix.lower() != ".txt":
+        return False
+    try:
+        with path.open("rb") as handle:
+            first = handle.readline(512).decode("utf-8-sig", "replace").strip()
+    except OSError:
+        return False
+    return path.name.lower() == "geo.txt" or (path.name.lower().startswith("geo") and projection_of(first) is not None)
+
+
+def projection_of(line: str) -> str | None:
+    """The projection that a line names, None where it names none."""
+    text = line.strip()
+    if re.fullmatch(r"EPSG:\d{4,6}", text, re.IGNORECASE):
+        return text.upper()
+    if "+proj" in text or "+init" in text:
+        return text
+    match = re.fullmatch(r"WGS\s*84\s*/?\s*UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", text, re.IGNORECASE)
+    if match and 1 <= int(match[1]) <= 60:
+        return f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
+    return None
+
+
+def read_geo_txt(path: Path) -> PoseTable:
+    """Read an ODM geo.txt.
+
+    Raises:
+        InputError: no projection in its first line, or no line that can be read.
+    """
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    projection = projection_of(lines[0]) if lines else None
+    if projection is None:
+        raise InputError(f"{path.name} has no projection in its first line; write EPSG:4326 or the projection there")
+    table = PoseTable()
+    for line in lines[1:]:
+        name, numbers = _fields(line)
+        if name is None or len(numbers) < 2:
+            table.useless += 1
+            continue
+        n: list[float | None] = [v if math.isfinite(v) else None for v in numbers] + [None] * 8
+        row = PoseRow(n[1], n[0], n[2], None, n[3], n[4], n[5], n[6])
+        if row.yaw_deg == row.pitch_deg == row.roll_deg == 0.0:
+            row.yaw_deg = row.pitch_deg = row.roll_deg = None  # fillers before the accuracies
+        if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
+            row.sigma_m = None
+        table[name.lower()] = row
+    if not table:
+        raise InputError(f"{path.name} has no line `name x y`; check its format (ODM geo.txt)")
+    to_geographic(table, projection, path)
+    pitch_by_value(table)
+    return table
+
+
+def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
+    """Turn coordinates of a projection (x in lon_deg, y in lat_deg) into degrees; impossible ones become None.
+
+    Raises:
+        InputError: the projection is not understood.
+    """
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        transformer = Transformer.from_crs(CRS.from_user_input(projection), 4326, always_xy=True)
+        x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
+        lon, lat = transformer.transform([x for x, _ in x_y], [y for _, y in x_y])
+    except ProjError as error:
+        raise InputError(f"{path.name}: the projection '{projection}' is not understood ({error})") from None
+    for row, x, y in zip(table.values(), lon, lat, strict=True):
+        if is_position(y, x):
+            row.lon_deg, row.lat_deg = float(x), float(y)
+        else:
+            row.lon_deg = row.lat_deg = None
+            table.useless += 1
+
+
+def _fields(line: str) -> tuple[str | None, list[float]]:
+    """Name and the numbers after it; a name with blanks ends where its suffix does."""
+    words = line.split()
+    ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
+    first = next(ends, 0) + 1
+    numbers: list[float] = []
+    for word in words[first : first + _MOST_NUMBERS]:
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            break
+    return " ".join(words[:first]) or None, numbers

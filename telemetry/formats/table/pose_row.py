@@ -1,0 +1,64 @@
+"""What a table says about pictures, whichever program wrote it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from orthoswarm.model.errors import InputError
+
+MOST_BYTES = 256 << 20
+
+
+@dataclass(slots=True)
+class PoseRow:
+    """What a table says about one picture; None where it says nothing."""
+
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    altitude_m: float | None = None
+    height_m: float | None = None
+    yaw_deg: float | None = None
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+    sigma_m: float | None = None
+    time_s: float | None = None
+    fov_deg: float | None = None
+    vehicle: str | None = None
+
+
+class PoseTable(dict[str, PoseRow]):
+    """Lower-case picture name (or relative path with forward slashes) -> row.
+
+    Attributes:
+        useless: lines that name a picture and give no position that can be one.
+    """
+
+    useless: int = 0
+
+
+def lookup(table: PoseTable, relative: str) -> PoseRow | None:
+    """The row of a picture by its path relative to the table's folder, else by its name alone."""
+    relative = relative.lower()
+    return table.get(relative) or table.get(relative.rsplit("/", 1)[-1])
+
+
+def read_text(path: Path) -> str:
+    """A table's text.
+
+    Raises:
+        InputError: it is too large, or cannot be read.
+    """
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path.name} is larger than {MOST_BYTES >> 20} MB; split it")
+        return path.read_bytes().decode("utf-8-sig", "replace").replace("\0", "")
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be read ({error.strerror}); check the file") from None
+
+
+def pitch_by_value(table: PoseTable) -> None:
+    """Bring pitch to -90 looking straight down: some programs count from nadir, which the usual value shows."""
+    pitches = sorted(r.pitch_deg for r in table.values() if r.pitch_deg is not None)
+    if pitches and pitches[len(pitches) // 2] > -45.0:
+        for row in table.values():
+            if row.pitch_deg is not None:
+                row.pitch_deg -= 90.0
