@@ -69,7 +69,7 @@ TABLES = {
         "exif.csv",
         "SourceFile,DateTimeOriginal,GPSLatitude,GPSLongitude,GPSAltitude,GimbalYawDegree,GimbalPitchDegree,"
         "GimbalRollDegree,RelativeAltitude\n"
-        './a.JPG,2024:05:06 12:00:01,"47 deg 30\' 0.00"" N","8 deg 15\' 0.00"" E",612.5 m Above Sea Level,31,-44,0,80\n',
+        './a.JPG,2024:05:06 12:00:01,"47 deg 30\' 0.00"" N","8 deg 15\' 0.00"" E",612.5 m Above Sea Level,31,-44,0,8\n',
         (47.5, 8.25, 612.5, 31.0, -44.0, 0.0, None),
     ),
     "mission planner": (
