@@ -77,8 +77,9 @@ def read_pose_csv(path: Path) -> PoseTable | None:
         header = [_column(cell) for cell in _cells(line, separator)]
         if "image" in header and ({"lat_deg", "lon_deg"} <= set(header) or {"x", "y"} <= set(header)):
             return _read(path, at, separator, header, line)
-    if head and (header := _pix4d_header(head[0])) is not None:
-        return _read(path, -1, _separator(head[0]), header, "")
+    columns = _pix4d_header(head[0]) if head else None
+    if columns is not None:
+        return _read(path, -1, _separator(head[0]), columns, "")
     return None
 
 
