@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.registration.block_state import VehicleState, seen_from_above
@@ -21,15 +22,8 @@ Array = NDArray[np.float64]
 
 DIFFERS_M = 0.2
 """What is left over a height model is worth a word from here on."""
-DRAWN_NODES = 4_000_000
-"""Nodes of the ground that pictures are drawn on; tasks get the part that they need."""
 WHOLE = 0.97
 """A height model that covers more than this of the area covers it."""
-DRAWN = FitSettings(held_out_se=1.0)
-"""The surface for drawing reaches to the border, where few points hold it: rubble in the middle must not roughen it."""
-DRAWN_ON_MAP = FitSettings(held_out_se=1.0, floor_sigma_m=0.15, render_flat_sd_m=0.0)
-"""Where the map told heights they hold the border, and on flat ground they take out what is wrong with the cameras
-there: nothing is taken for noise."""
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
@@ -79,13 +73,14 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     bounds = BoundingBox.around_points(path[:, :2], reach)
     lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
-    how = DRAWN_ON_MAP if any(s.on_map for s in states) else DRAWN
+    how = FitSettings.for_drawing(on_map=any(s.on_map for s in states))
+    drawn_nodes = active().surface.drawn_nodes
     if given is not None:
-        fit, off = fit_over_dem(given, points, sigma, bounds, settings=how, most_nodes=DRAWN_NODES)
+        fit, off = fit_over_dem(given, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
     tops = np.concatenate([seen_from_above(s) for s in states])
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
-    drawn = with_tall_surfaces(drawn, tops, cell, DRAWN_NODES)
+    drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
     return drawn, _doubts(given, fit is None, off, states) if given is not None else []
 
 
@@ -104,7 +99,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     path = np.concatenate(paths)
     reach = 1.1 * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    step = max(min(steps), float(np.sqrt(np.prod(high - low) / DRAWN_NODES)))
+    step = max(min(steps), float(np.sqrt(np.prod(high - low) / active().surface.drawn_nodes)))
     columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
     nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
     vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])

@@ -1,9 +1,9 @@
-"""Ground whose shape an outside height model gives, and what the pictures say against it.
+"""Ground whose shape comes from a height model (DEM) of the user, corrected where the pictures contradict it.
 
-The model's datum is another than that of heights over the takeoff, and it may be old (a debris flow lies on it now),
-coarse, or end in the middle of the area. So only what is left of the points' heights over the model is fitted, as
-ground is fitted without one. Where that is level, as over a right model, it is one vertical shift and the model's own
-shape stays; where it is not, the pictures are right. A model that explains nothing is not used at all.
+The model's vertical datum differs from heights over the takeoff, and it may be old (a debris flow lies on it now),
+coarse, or end in the middle of the area. So a smooth surface is fitted to the points' heights over the model. Where
+that surface is level, as over a right model, it is one vertical shift and the model's own shape stays; where it is not,
+the pictures are right. A model that explains nothing is not used at all.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
@@ -20,22 +21,6 @@ from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
 
 Array = NDArray[np.float64]
-
-BLOCK_M = 64.0
-"""Windows lie on multiples of this, so that a path that moves by metres does not have the file read again."""
-NODES = 150_000
-"""Nodes of the model in memory for one vehicle."""
-ROUGHER_M = 0.3
-"""If what is left over the model varies by so much more than the ground itself, the model contradicts the pictures."""
-NOISE_M, AROUND = 0.4, 2.0
-"""Differences from a model of this size, over so many nodes around, are the errors of the points' own surface."""
-TRUSTED_M, DOUBTED_M = 0.15, 0.3
-"""Usual difference up to which a model is better than the points' own surface, and from which it is not."""
-LEVEL_KERNEL_M = 0.2
-FEWEST = 60
-"""With fewer points on a model its level is a guess, and it is left out."""
-SEAM_M = 90.0
-"""Over this distance the ground beyond a model is led to its level at the border."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +34,13 @@ class LocalDem:
     model: HeightModel
     origin: tuple[float, float]
 
-    def over(self, bounds: BoundingBox, most_nodes: int = NODES) -> KnownGround:
+    def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
         """Heights over the model's zero on bounds, both in the local frame."""
-        low = [float(np.floor((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[:2], self.origin)]
-        high = [float(np.ceil((v + o) / BLOCK_M) * BLOCK_M) for v, o in zip(bounds[2:], self.origin)]
-        ground = self.model.window(BoundingBox(*low, *high), most_nodes)
+        c = active().surface
+        block = c.dem_block_m
+        low = [float(np.floor((v + o) / block) * block) for v, o in zip(bounds[:2], self.origin)]
+        high = [float(np.ceil((v + o) / block) * block) for v, o in zip(bounds[2:], self.origin)]
+        ground = self.model.window(BoundingBox(*low, *high), most_nodes or c.dem_nodes)
         t = ground.terrain
         return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
 
@@ -63,7 +50,7 @@ class LocalDem:
         if not ok.any():
             return np.zeros(len(xy))
         low, high = np.quantile(xy[ok], [0.01, 0.99], axis=0)
-        ground = self.over(BoundingBox.around_points([low, high]))
+        ground = self.window(BoundingBox.around_points([low, high]))
         return ground.terrain.height(np.where(ok[:, None], xy, low))
 
 
@@ -81,10 +68,10 @@ class SurfaceSum:
 
 @dataclass(frozen=True)
 class DemFit:
-    """A dem ground at the points' level; takes the place of a TerrainFit.
+    """A height model at the points' level; takes the place of a TerrainFit.
 
     Attributes:
-        dem: the shape. bounds: of the nodes, local frame. most_nodes: how many at most.
+        dem: the height model. bounds: of the nodes, local frame. most_nodes: of the model, at most.
         shift_m: what has to be added to the model's heights.
         rest: where and by how much the ground differs from the model so shifted.
         points_above_m: how far the robust centre of the points lies over the ground (see TerrainFit).
@@ -108,19 +95,19 @@ class DemFit:
 
     def prior(self, z0_m: float = 0.0) -> SurfaceSum:
         """The surface around which point heights are held, the model's zero at z0."""
-        return SurfaceSum(self._shape(), _raised(self.rest, z0_m))
+        return SurfaceSum(self._shape(), _shifted(self.rest, z0_m))
 
     def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
-        """The ground for rectifying pictures, plus a lift."""
+        """The ground for rectifying pictures, plus an offset."""
         if "drawn" not in self._made:
             shape = self._shape()
             z = shape.z + self.rest.height(_nodes(shape)) + self.shift_m
             self._made["drawn"] = replace(shape, z=z.astype(np.float32))
-        return _raised(self._made["drawn"], ground_offset_m) if ground_offset_m else self._made["drawn"]
+        return _shifted(self._made["drawn"], ground_offset_m) if ground_offset_m else self._made["drawn"]
 
     def _shape(self) -> Terrain:
         if "shape" not in self._made:
-            self._made["shape"] = _joined(self.dem.over(self.bounds, self.most_nodes), self.beyond)
+            self._made["shape"] = _completed(self.dem.window(self.bounds, self.most_nodes), self.beyond)
         return self._made["shape"]
 
 
@@ -132,7 +119,7 @@ def fit_over_dem(
     *,
     kappa: float | None = None,
     settings: FitSettings | None = None,
-    most_nodes: int = NODES,
+    most_nodes: int | None = None,
 ) -> tuple[DemFit | None, float]:
     """Fit the ground under points over a height model (see `fit_terrain` for what is not said here).
 
@@ -141,21 +128,23 @@ def fit_over_dem(
         most_nodes: how finely the model is read.
 
     Returns:
-        The fit, None where the model contradicts the points (or has nothing to say); and how far the ground differs
+        The fit, None where the model contradicts the points (or has no heights there); and how far the ground differs
         from the model, the median over nodes with data.
     """
-    ground = dem.over(bounds, most_nodes)
+    c = active().surface
+    most_nodes = most_nodes or c.dem_nodes
+    ground = dem.window(bounds, most_nodes)
     if not ground.known.any():
         return None, 0.0
     beyond = None
     if not ground.known.all():
         found = fit_terrain(points, sigma_z, bounds, kappa=kappa, settings=settings)
         on = ground.knows(points[:, :2])
-        if int(on.sum()) < FEWEST:
+        if int(on.sum()) < c.dem_least_points:
             return None, 0.0
         above = points[on, 2] - ground.terrain.height(points[on, :2])
-        beyond = _raised(found.rendering(), -kernel_mode(above, LEVEL_KERNEL_M))
-    shape = _joined(ground, beyond)
+        beyond = _shifted(found.rendering(), -kernel_mode(above, c.dem_level_kernel_m))
+    shape = _completed(ground, beyond)
     over = points.copy()
     over[:, 2] -= shape.height(points[:, :2])
     left = fit_terrain(over, sigma_z, bounds, kappa=kappa, settings=settings)
@@ -163,32 +152,35 @@ def fit_over_dem(
     if not known.any():
         return None, 0.0
     sd = float((nodes.z + shape.height(_nodes(nodes)))[known].std())
-    shift = kernel_mode(nodes.z[known].astype(np.float64), LEVEL_KERNEL_M)
+    shift = kernel_mode(nodes.z[known].astype(np.float64), c.dem_level_kernel_m)
     difference = nodes.z - np.float32(shift)
     off = float(np.median(np.abs(difference[known])))
-    if float(difference[known].std()) > sd + ROUGHER_M:
+    if float(difference[known].std()) > sd + c.dem_rougher_m:
         return None, off
-    rest = replace(nodes, z=difference * _believed(difference, left.support, off))
+    rest = replace(nodes, z=difference * _difference_share(difference, left.support, off))
     good = np.isfinite(over).all(1) & (sigma_z > 0)
     pull = robust_centre(over[good, 2] - rest.height(over[good, :2]) - shift)
     return DemFit(dem, bounds, most_nodes, shift, rest, pull, sd, beyond), off
 
 
-def _believed(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
-    """Share (rows, columns) of a difference from the model that is believed: none where it is small around a node.
+def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
+    """Share (rows, columns) of a difference from the model that is taken over: none where it is small around a node.
 
     A surface through points errs by decimetres, most where they end; a model that agrees with it nearly everywhere is
     better than that. One that seldom agrees is not.
     """
     from scipy.ndimage import gaussian_filter
 
-    noise = NOISE_M * float(np.clip((DOUBTED_M - usual_m) / (DOUBTED_M - TRUSTED_M), 0.25, 1.0))
+    c = active().surface
+    doubt = (c.dem_doubted_m - usual_m) / (c.dem_doubted_m - c.dem_trusted_m)
+    noise = c.dem_noise_m * float(np.clip(doubt, c.dem_noise_least_share, 1.0))
     weight = known.astype(np.float64)
-    power = gaussian_filter(weight * difference**2, AROUND) / np.maximum(gaussian_filter(weight, AROUND), 1e-3)
+    power = gaussian_filter(weight * difference**2, c.dem_noise_nodes)
+    power /= np.maximum(gaussian_filter(weight, c.dem_noise_nodes), 1e-3)
     return np.asarray(np.maximum(0.0, 1.0 - noise**2 / np.maximum(power, 1e-9)), np.float32)
 
 
-def _raised(terrain: Terrain, by_m: float) -> Terrain:
+def _shifted(terrain: Terrain, by_m: float) -> Terrain:
     return replace(terrain, z=terrain.z + np.float32(by_m))
 
 
@@ -200,17 +192,18 @@ def _nodes(terrain: Terrain) -> Array:
     return np.stack(np.meshgrid(east, north), -1)
 
 
-def _joined(ground: KnownGround, beyond: Terrain | None) -> Terrain:
-    """The known heights, and where there are none other ground, led to the known at the border."""
+def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
+    """The model's heights, and where it has none other ground, brought to the model's level at the border."""
     t, known = ground.terrain, ground.known
     if beyond is None or known.all():
         return t
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     other = beyond.height(_nodes(t))
-    blur = SEAM_M / 3.0 / t.step_m
+    seam_m = active().surface.dem_seam_m
+    blur = seam_m / 3.0 / t.step_m
     gap = gaussian_filter(np.where(known, t.z - other, 0.0), blur, mode="nearest")
     gap /= np.maximum(gaussian_filter(known.astype(np.float64), blur, mode="nearest"), 1e-6)
     away = distance_transform_edt(~known) * t.step_m
-    other += gap * np.clip(1.0 - away / SEAM_M, 0.0, 1.0)
+    other += gap * np.clip(1.0 - away / seam_m, 0.0, 1.0)
     return replace(t, z=np.where(known, t.z, other).astype(np.float32))

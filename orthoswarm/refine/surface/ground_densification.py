@@ -1,40 +1,32 @@
-"""Ground between the tracks of one vehicle: its lift under the corners, and denser points (RECIPE.md 5b and 9)."""
+"""Ground between the tracks of one vehicle: heights at free positions for its terrain, and a dense grid of them."""
 
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.surface.ground_offset import draw_positions, measure_ground_offset
 from orthoswarm.refine.surface.terrain import TerrainFit
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
-from orthoswarm.refine.surface.vertical_line_locus import LARGE, SMALL, dense_ground, spaced_cameras
+from orthoswarm.refine.surface.vertical_line_locus import Sweep, dense_ground, spaced_cameras
 
 Array = NDArray[np.float64]
-
-CELL_M = 14.0
-USUAL_HEIGHT_M = 150.0
-HIGH_FROM_M, HIGH_SHARE = 6.0, 0.25
-"""Heights over the ground, metres and a share of the flying height, between which cells without ground are searched."""
-HIGH_SMALL, HIGH_LARGE = (replace(s, baselines_m=(25.0, 50.0, 75.0)) for s in (SMALL, LARGE))
-"""What stands high is near the cameras: fewer pictures show it."""
 
 
 def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
     """The ground fitted to the points now and to heights at free positions between them.
 
-    Corners sit on raised things; small patches at free positions tell the ground itself, so that what is left over
-    (the lift) is small. as_smooth: the ground stays as smooth as it is, which saves the search for its smoothness.
+    Corners sit on raised things; small patches at free positions measure the ground itself, so that the offset that is
+    left is small and becomes 0. as_smooth: the ground stays as smooth as it is, which saves the search.
     """
     if surface.fit is None:
         surface = fit_surface(flight.adjustment, surface)
         if surface.fit is None:
             return surface
     cameras = flight.cameras()
-    positions = draw_positions(
-        cameras.position[:, :2], spread_m=100.0 * flying_height(flight, surface) / USUAL_HEIGHT_M
-    )
+    positions = draw_positions(cameras.position[:, :2], flying_height(flight, surface))
     gray = flight.pictures.gray
     free = measure_ground_offset(cameras, gray, positions, surface.terrain(), flight.leg).points
     kappa = surface.fit.kappa if as_smooth and isinstance(surface.fit, TerrainFit) else None
@@ -44,6 +36,7 @@ def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = Fals
 
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Array]:
     """Ground points (K, 3) and their sigmas, one in each cell that shows its height; points (H, 3) high above it."""
+    c = active().surface
     cameras, height = flight.cameras(), flying_height(flight, surface)
     cells = cells_near(cameras.position[:, :2], dense_cell(height), sight_reach(flight))
     if not len(cells):
@@ -51,11 +44,13 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
     ground, gray = surface.terrain(), flight.pictures.gray
     found = dense_ground(cameras, gray, cells, ground, flight.leg)
     high = np.zeros((0, 3))
-    above = 0.5 * (HIGH_FROM_M + HIGH_SHARE * height), 0.5 * (HIGH_SHARE * height - HIGH_FROM_M)
-    if above[1] > 0.0:
+    middle_m = 0.5 * (c.high_from_m + c.high_to_share * height)
+    reach_m = 0.5 * (c.high_to_share * height - c.high_from_m)
+    if reach_m > 0.0:
         left = np.delete(cells, found.cell, axis=0)
-        raised = replace(ground, z=ground.z + np.float32(above[0]))
-        sweeps = [replace(s.at_height(height), reach_m=above[1]) for s in (HIGH_SMALL, HIGH_LARGE)]
+        raised = replace(ground, z=ground.z + np.float32(middle_m))
+        patches = (replace(s, baselines_m=c.high_baselines_m) for s in (Sweep.small(), Sweep.large()))
+        sweeps = [replace(s.at_height(height), reach_m=reach_m) for s in patches]
         high = dense_ground(cameras, gray, left, raised, flight.leg, sweeps).points
     return found.points, found.sigma_z, high
 
@@ -63,11 +58,10 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
 def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
     """The pictures from which `dense_points` takes heights, bool (N,), and those between legs.
 
-    They show all that there is to see: what needs no more than these has fewer to decode.
+    They show all the ground there is to see; whatever needs no more than these has fewer pictures to decode.
     """
-    _, camera, _ = spaced_cameras(
-        flight.cameras(), flight.leg, SMALL.at_height(flying_height(flight, surface)).spacing_m
-    )
+    spacing_m = Sweep.small().at_height(flying_height(flight, surface)).spacing_m
+    _, camera, _ = spaced_cameras(flight.cameras(), flight.leg, spacing_m)
     out = np.asarray(flight.leg < 0)
     out[camera] = True
     return out
@@ -75,7 +69,8 @@ def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
 
 def dense_cell(height_m: float) -> float:
     """Distance of the cells at a flying height, metres."""
-    return CELL_M * height_m / USUAL_HEIGHT_M
+    c = active().surface
+    return c.dense_cell_m * height_m / c.reference_height_m
 
 
 def sight_reach(flight: Flight) -> float:
@@ -89,7 +84,7 @@ def cells_near(path: Array, cell_m: float, reach_m: float) -> Array:
     """Centres of the cells within reach of the path."""
     low = np.floor((path.min(0) - reach_m) / cell_m).astype(int)
     high = np.ceil((path.max(0) + reach_m) / cell_m).astype(int)
-    if (high - low).prod() > 400_000:
+    if (high - low).prod() > active().surface.dense_most_cells:
         return np.zeros((0, 2))
     near = np.zeros(tuple(high - low), bool)
     k = int(reach_m / cell_m)

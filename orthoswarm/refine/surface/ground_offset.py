@@ -1,8 +1,8 @@
-"""The ground under the corners: how far a surface through corner points lies above the ground around them.
+"""How far the open ground lies from a surface through corner points.
 
-Corners sit at the edges of raised things, and a surface through them is a little too high, although every point
-lies on it: the height on which pictures are rectified and compared with the map is then wrong everywhere by the same
-amount. Small patches at free positions, not at corners, tell the level of the ground itself.
+Corners sit at the edges of raised things, so a surface through them lies a little above the open ground, although every
+point is right: all that is rectified on it and compared with the map is then shifted by that height times the lean of
+the view. Small patches at free positions, not at corners, measure the ground itself.
 """
 
 from dataclasses import dataclass, replace
@@ -10,26 +10,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.surface.vertical_line_locus import SMALL, Gray, LocusPoints, Sweep, dense_ground, height_above
+from orthoswarm.refine.surface.vertical_line_locus import Gray, LocusPoints, Sweep, dense_ground, height_above
 
 Array = NDArray[np.float64]
 
-NEAR = replace(SMALL, reach_m=3.0, height_step_m=0.25, rival_m=np.inf)
-"""Small patches (a large one straddles rubble and finds only half of the lift), searched near the surface."""
+
+def near_surface() -> Sweep:
+    """Small patches searched near the surface; a large one straddles rubble and finds only half of the offset."""
+    c = active().surface
+    return replace(Sweep.small(), reach_m=c.offset_reach_m, height_step_m=c.offset_height_step_m, rival_m=np.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class GroundOffset:
-    """Level of the ground against a surface.
+    """Level of the open ground against a surface.
 
     Attributes:
         ground_offset_m: to be added to the surface wherever height above ground matters (usually negative).
-        count: heights found; 0 lift below the minimum.
-        points: what the level was taken from. They are good ground points by themselves: a surface fitted to them
-            and the tracks together follows the ground where the lift differs from place to place (rubble here,
-            streets there), and then the lift that is left is a few centimetres.
+        count: heights found; with too few the offset is 0.
+        points: the heights found. They are good ground points: a surface fitted to them and the tracks together
+            follows the ground where the offset differs from place to place (rubble here, streets there), and then the
+            offset that is left is a few centimetres.
     """
 
     ground_offset_m: float
@@ -37,12 +41,13 @@ class GroundOffset:
     points: LocusPoints
 
 
-def draw_positions(camera_xy: Array, *, count: int = 900, spread_m: float = 100.0, seed: int = 0) -> Array:
-    """Free positions, float64 (count, 2): around pictures' positions (N, 2) evenly in a square of +-spread_m.
+def draw_positions(camera_xy: Array, height_m: float, *, seed: int = 0) -> Array:
+    """Free positions, float64 (K, 2): around pictures' positions (N, 2) evenly in a square that grows with the height.
 
-    Drawn once and kept, so that the lift changes with the surface and not with the draw. The default spread, for
-    150 m above ground, reaches to the border of what the outer pictures see.
+    The same for the same cameras, so that the offset changes with the surface and not with the draw.
     """
+    c = active().surface
+    count, spread_m = c.offset_positions, c.offset_spread_m * height_m / c.reference_height_m
     rng = np.random.default_rng(seed)
     at = np.asarray(camera_xy, float)[np.linspace(0, len(camera_xy) - 1, count).round().astype(int)]
     return np.asarray(at[:, :2] + rng.uniform(-spread_m, spread_m, (count, 2)))
@@ -55,10 +60,6 @@ def measure_ground_offset(
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
     sweep: Sweep | None = None,
-    *,
-    least: int = 60,
-    kernel_m: float = 0.2,
-    limits_m: tuple[float, float] = (-1.5, 0.5),
 ) -> GroundOffset:
     """Level of the ground over the terrain at free positions (see `draw_positions`), with small patches.
 
@@ -68,18 +69,16 @@ def measure_ground_offset(
         positions: float64 (C, 2).
         terrain: the surface, within sweep.reach_m of the ground.
         leg_of_camera: int (N,), -1 for cameras that must not be used.
-        sweep: how heights are searched; None: NEAR, for the cameras' height above the terrain.
-        least: with fewer heights than this the lift is 0.
-        kernel_m: width of the kernel whose mode is taken.
-        limits_m: the lift is clipped to this range.
+        sweep: how heights are searched; None: `near_surface` for the cameras' height above the terrain.
     """
-    found = dense_ground(
-        cameras, gray, positions, terrain, leg_of_camera, (sweep or NEAR.at_height(height_above(cameras, terrain)),)
-    )
+    c = active().surface
+    sweep = sweep or near_surface().at_height(height_above(cameras, terrain))
+    found = dense_ground(cameras, gray, positions, terrain, leg_of_camera, (sweep,))
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
-    if len(above) < least:
+    if len(above) < c.offset_least_heights:
         return GroundOffset(0.0, len(above), found)
-    return GroundOffset(float(np.clip(kernel_mode(above, kernel_m), *limits_m)), len(above), found)
+    offset_m = float(np.clip(kernel_mode(above, c.offset_kernel_m), *c.offset_limits_m))
+    return GroundOffset(offset_m, len(above), found)
 
 
 def kernel_mode(values: Array, kernel_m: float, rounds: int = 20) -> float:

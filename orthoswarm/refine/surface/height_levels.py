@@ -7,13 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.config import active
+
 Array = NDArray[np.float64]
-
-SPREAD_FLAT_M, SPREAD_RELIEF_M = 0.8, 1.6
-"""Spread of the levels up to which the zero is the least lifted vehicle's, and from which it is the mean's."""
-
-ENOUGH = 400
-"""Points of each vehicle that are compared in a pair: a median of more is no better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,44 +33,38 @@ class LevelNetwork:
     residual_m: Array
 
 
-def level_network(
-    ground: Sequence[Array], *, radius_m: float = 25.0, neighbours: int = 3, least: int = 15
-) -> LevelNetwork:
-    """Level vehicles on each other by their ground points.
+def level_network(ground: Sequence[Array]) -> LevelNetwork:
+    """Level vehicles on each other by their ground points: a least-squares levelling network.
 
-    Every vehicle's own datum holds the mode of ITS points at the takeoff level. Rubble and bushes lift that mode
+    Every vehicle's own datum holds the mode of ITS points at the takeoff level. Rubble and bushes raise that mode
     over the ground, so a vehicle's ground can only come out too low: where the levels differ little, the vehicle
     that needs the least correction is right and stays (a low quantile of many, as the lowest of many is noise).
     Large differences come from relief, where each vehicle took the median of its own piece for the takeoff level:
-    then the mean is the best guess. Between SPREAD_FLAT_M and SPREAD_RELIEF_M the anchor moves from one to the
-    other, so that it does not jump when a vehicle joins. Levels are never chained from the first vehicle.
+    then the mean is the best guess. Between the two the anchor moves from one to the other, so that it does not jump
+    when a vehicle joins. Levels are never chained from the first vehicle: that more than doubled the map's error.
 
     Args:
         ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame.
-        radius_m: greatest horizontal distance of a point to the other vehicle's points.
-        neighbours: points of the other vehicle that must lie within it (their median height is compared).
-        least: common points that make a pair.
     """
+    c = active().surface
     count = len(ground)
-    trees = [cKDTree(g[:, :2]) if len(g) >= neighbours else None for g in ground]
+    trees = [cKDTree(g[:, :2]) if len(g) >= c.level_neighbours else None for g in ground]
     pairs: list[tuple[int, int]] = []
     difference: list[float] = []
     sigma: list[float] = []
     for i in range(count):
         for j in range(i + 1, count):
-            d = _common_difference(ground[i], ground[j], trees[i], trees[j], radius_m, neighbours, least)
-            if len(d) >= least:
+            d = _common_difference(ground[i], ground[j], trees[i], trees[j])
+            if len(d) >= c.level_least_points:
                 pairs.append((i, j))
                 difference.append(float(np.median(d)))
                 spread = 1.4826 * float(np.median(np.abs(d - difference[-1])))
-                sigma.append(float(np.hypot(1.25 * spread / np.sqrt(len(d)), 0.03)))
+                sigma.append(float(np.hypot(1.25 * spread / np.sqrt(len(d)), c.level_sigma_floor_m)))
     edge = np.array(pairs, np.int64).reshape(-1, 2)
     return _adjust(count, edge, np.array(difference, float), np.array(sigma, float))
 
 
-def _common_difference(
-    a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None, radius: float, k: int, least: int
-) -> Array:
+def _common_difference(a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None) -> Array:
     """Heights of a over b, at the points of both where they meet.
 
     At the border all neighbours lie on one side and a slope would count as a difference: the half of the points
@@ -82,20 +72,22 @@ def _common_difference(
     """
     if tree_a is None or tree_b is None:
         return np.empty(0)
+    c = active().surface
+    radius, k = c.level_radius_m, c.level_neighbours
     low, high = np.maximum(tree_a.mins, tree_b.mins) - radius, np.minimum(tree_a.maxes, tree_b.maxes) + radius
     if (low > high).any():
         return np.empty(0)
-    difference, beside = [np.empty(0)], [np.empty(0)]
+    difference, off_centre = [np.empty(0)], [np.empty(0)]
     for points, other, tree, sign in ((a, b, tree_b, 1.0), (b, a, tree_a, -1.0)):
         near = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
-        near = near[:: max(1, len(near) // ENOUGH)]
+        near = near[:: max(1, len(near) // c.level_most_points)]
         distance, index = tree.query(near[:, :2], k=k, distance_upper_bound=radius)
         ok = np.isfinite(distance).reshape(len(near), k).all(1)
         around = other[index.reshape(len(near), k)[ok]]
         difference.append(sign * (near[ok, 2] - np.median(around[..., 2], axis=1)))
-        beside.append(np.hypot(*(around[..., :2].mean(1) - near[ok, :2]).T))
-    d, away = np.concatenate(difference), np.concatenate(beside)
-    return d[np.argsort(away, kind="stable")[: max(least, len(d) // 2)]]
+        off_centre.append(np.hypot(*(around[..., :2].mean(1) - near[ok, :2]).T))
+    d, away = np.concatenate(difference), np.concatenate(off_centre)
+    return d[np.argsort(away, kind="stable")[: max(c.level_least_points, len(d) // 2)]]
 
 
 def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:
@@ -127,7 +119,10 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
 
 def _anchor(correction: Array) -> float:
     """Which of the corrections (about their mean) becomes zero."""
-    lowest = float(np.quantile(correction, 0.1 if len(correction) > 10 else 0.0))
-    spread = float(np.quantile(correction, 0.9 if len(correction) > 10 else 1.0)) - lowest
-    share = float(np.clip((spread - SPREAD_FLAT_M) / (SPREAD_RELIEF_M - SPREAD_FLAT_M), 0.0, 1.0))
+    c = active().surface
+    tail = c.level_quantile if len(correction) > c.level_many_vehicles else 0.0
+    lowest = float(np.quantile(correction, tail))
+    spread = float(np.quantile(correction, 1.0 - tail)) - lowest
+    share = (spread - c.level_spread_flat_m) / (c.level_spread_relief_m - c.level_spread_flat_m)
+    share = float(np.clip(share, 0.0, 1.0))
     return (1.0 - share) * lowest

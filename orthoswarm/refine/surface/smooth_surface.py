@@ -1,59 +1,79 @@
-"""A smooth surface on regular nodes below points: the least-squares machinery behind the terrain.
+"""A smooth surface on regular nodes below points: the least-squares fit behind the terrain.
 
-Unknowns are the heights of the nodes; points observe them bilinearly, robustly and not alike above and below;
-second differences (xx, yy, sqrt 2 xy) and first differences are held near zero. The normal equations are banded
-along the shorter side of the grid.
+Unknowns are the heights of the nodes. Points observe them by bilinear interpolation, with a robust kernel that is wider
+below the surface than above; second differences (xx, yy, sqrt 2 xy) and first differences have a prior at zero. The
+normal equations are banded along the shorter side of the grid.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 
 Array = NDArray[np.float64]
 
-KAPPAS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Smoothness tried by the hold-out, from smooth to rough: one sigma of the second difference between nodes 30 m apart,
-metres (for other distances it is scaled, so that it means the same ground)."""
+KAPPA_SPACING_M = 30.0
+"""Kappa, the smoothness, is defined as the sigma of second differences between nodes this far apart, metres; for other
+distances it is scaled, so that it means the same ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """How a surface is fitted; lengths in metres.
+    """How a surface is fitted: the values of `config.SurfaceConfig` by default, or others for drawing.
 
     Attributes:
         step_m: distance of the nodes.
-        floor_sigma_m: added to every point's own sigma.
+        floor_sigma_m: added in squares to every point's own sigma.
         scale_start_m, scale_end_m: robust scale above the surface in the first and the last solve.
-        below_factor, below_min_m: below the surface the scale is this multiple, but never less than the minimum:
-            equal scales climb roofs at the border. The end scales seek the mode of the heights: 0.6 and 1.5 m let
-            cars and bushes lift the surface by 0.1-0.2 m.
+        below_factor, below_min_m: the scale below the surface is this multiple, but never less than the minimum.
         solves: number of solves over which the scale shrinks.
-        slope_sigma_m: one sigma of first differences (times min(1, kappa / 0.8)): ground is rather level.
-        level_ratio: sigma of first differences next to nodes without data, as a multiple of kappa: beyond the
-            data the surface goes on level instead of diving.
-        flat_sd_m: relief of this standard deviation or less is taken for noise.
-        render_flat_sd_m: the same for rendering, where following noise costs less than missing relief.
+        slope_sigma_m: sigma of first differences.
+        level_ratio: sigma of first differences next to nodes without data, as a multiple of kappa.
+        flat_sd_m: relief of this standard deviation or less is taken for noise by the height prior.
+        render_flat_sd_m: the same for drawing.
         held_out_se: the smoothest surface is taken whose error at points left out is within so many standard errors
             of the best.
     """
 
-    step_m: float = 30.0
-    floor_sigma_m: float = 0.25
-    scale_start_m: float = 10.0
-    scale_end_m: float = 0.3
-    below_factor: float = 3.0
-    below_min_m: float = 0.8
-    solves: int = 12
-    slope_sigma_m: float = 6.0
-    level_ratio: float = 1.5
-    flat_sd_m: float = 0.5
-    render_flat_sd_m: float = 0.15
-    held_out_se: float = 0.5
+    step_m: float
+    floor_sigma_m: float
+    scale_start_m: float
+    scale_end_m: float
+    below_factor: float
+    below_min_m: float
+    solves: int
+    slope_sigma_m: float
+    level_ratio: float
+    flat_sd_m: float
+    render_flat_sd_m: float
+    held_out_se: float
+
+    @classmethod
+    def configured(cls, **changes: Any) -> "FitSettings":
+        """The configuration in force, with some fields changed."""
+        c = active().surface
+        settings = cls(
+            step_m=c.node_spacing_m, floor_sigma_m=c.point_sigma_floor_m, scale_start_m=c.robust_start_m,
+            scale_end_m=c.robust_end_m, below_factor=c.robust_below_factor, below_min_m=c.robust_below_least_m,
+            solves=c.robust_solves, slope_sigma_m=c.slope_sigma_m, level_ratio=c.open_slope_ratio,
+            flat_sd_m=c.flat_relief_m, render_flat_sd_m=c.drawn_flat_relief_m,
+            held_out_se=c.hold_out_standard_errors,
+        )  # fmt: skip
+        return replace(settings, **changes)
+
+    @classmethod
+    def for_drawing(cls, *, on_map: bool) -> "FitSettings":
+        """Of the surface that pictures are drawn on; on_map: heights by the map are among its points."""
+        c = active().surface
+        drawn = cls.configured(held_out_se=c.drawn_hold_out_standard_errors)
+        if not on_map:
+            return drawn
+        return replace(drawn, floor_sigma_m=c.drawn_on_map_sigma_floor_m, render_flat_sd_m=c.drawn_on_map_flat_relief_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +172,8 @@ class Surface:
         """Heights of the nodes (N,), in the solver's order, for one smoothness."""
         s, inner = self.settings, self.inner
         base = self.base if base is None else base
-        ratio = s.step_m / 30.0
-        slope_sigma = s.slope_sigma_m * min(1.0, kappa / 0.8) * ratio
+        ratio = s.step_m / KAPPA_SPACING_M
+        slope_sigma = s.slope_sigma_m * min(1.0, kappa / active().surface.slope_full_kappa_m) * ratio
         kappa *= ratio**2
         penalty = self.curvature / kappa**2 + self.slope / slope_sigma**2 + self.level / (s.level_ratio * kappa) ** 2
         band, rhs = np.empty_like(penalty), np.empty(len(self.support))
@@ -170,27 +190,27 @@ class Surface:
     def choose_kappa(self) -> float:
         """The smoothest surface whose error at points left out is about that of the best (settings.held_out_se).
 
-        Every fourth point is left out. The best itself would be too rough: rubble is rough and real, but no ground.
+        The best itself would be too rough: rubble is rough and real, but no ground.
         """
-        s = self.settings
-        out = np.flatnonzero(self.base > 0)[3::4]
-        if len(out) < 10:
-            return KAPPAS[0]
+        s, c = self.settings, active().surface
+        out = np.flatnonzero(self.base > 0)[c.hold_out_every - 1 :: c.hold_out_every]
+        if len(out) < c.hold_out_points:
+            return c.kappas_m[0]
         base = self.base.copy()
         base[out] = 0.0
         costs: list[Array] = []
         mean: list[float] = []
-        for kappa in KAPPAS:
-            z = self.solve(kappa, base, max(6, 2 * s.solves // 3))
+        for kappa in c.kappas_m:
+            z = self.solve(kappa, base, c.hold_out_solves)
             e = self.z[out] - _interpolate(z, self.cell[out], self.share[out], self.inner)
             q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
             costs.append(q / (1.0 + q))
             mean.append(float(costs[-1].mean()))
-            if min(mean[-2:]) > min(mean):  # rougher twice in vain
+            if min(mean[-2:]) > min(mean):  # two rougher ones were no better
                 break
         best = int(np.argmin(mean))
         limit = mean[best] + s.held_out_se * float(costs[best].std()) / np.sqrt(len(out))
-        return KAPPAS[next(i for i, m in enumerate(mean) if m <= limit)]
+        return c.kappas_m[next(i for i, m in enumerate(mean) if m <= limit)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,14 +231,14 @@ def fit_nodes(
     kappa: float | None,
     s: FitSettings,
     *,
-    core: int = 40,
-    overlap: int = 8,
+    tile_nodes: int | None = None,
 ) -> Nodes | None:
     """Solve for nodes that cover bounds; None without a point. Large areas in overlapping tiles, blended.
 
-    The band's cost grows with the square of the shorter side, and ground 8 nodes away has no influence where there
-    is data. The smoothness of tiles is the median of what the four fullest ask for.
+    The smoothness of tiles is the median of what the fullest ask for. tile_nodes: other than configured, for tests.
     """
+    config = active().surface
+    core, overlap = tile_nodes or config.tile_nodes, config.tile_overlap_nodes
     grid = _Grid.over(bounds, s.step_m)
     if max(grid.columns, grid.rows) <= core + 3 * overlap:
         surface = Surface.over(points, sigma_z, grid, s)
@@ -236,7 +256,7 @@ def fit_nodes(
     if not tiles:
         return None
     if kappa is None:
-        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[:4]
+        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[: config.tile_kappa_votes]
         asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
         kappa = sorted(asked)[len(asked) // 2]
     total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))

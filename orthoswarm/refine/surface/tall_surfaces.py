@@ -1,8 +1,8 @@
-"""What stands on the ground and is as broad as a hall, a grandstand or a wood: pictures are drawn on its top.
+"""What stands on the ground and is as wide as a hall, a grandstand or a wood: pictures are drawn on its top.
 
 The ground is fitted from below, which is right for houses and single trees: drawn on the ground they lean, and the
-streets beside them lie where they are. Over something broad no ground is seen at all, and its top, 10 m over the ground
-and 40 degrees off the vertical, would be drawn 8 m beside its place.
+streets next to them lie where they are. Over something wide no ground is seen at all, and its top, 10 m over the ground
+and seen 40 degrees off the vertical, would be drawn 8 m from its place.
 """
 
 from collections.abc import Iterator
@@ -14,68 +14,55 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 
 Array = NDArray[np.float64]
 
-RISE_M = 1.5
-"""What differs less from the ground belongs to it."""
-REACH_M, REACH_CELLS = 25.0, 1.8
-"""Half of what counts as broad, metres; at least so many distances of the points."""
-FEWEST, MOST_SHARE = 5, 0.5
-"""So many points within that reach, and this share of them, must stand as high."""
-TALL_M, TALL_SHARE = 6.0, 0.7
-"""From this height on it must be this share: haze that drifts along has a false parallax where the ground fails."""
-RIM_SHARE = 0.3
-"""At a rim this share of the points within reach must belong to something broad and stand as high."""
-AS_HIGH_M = 4.0
-NODE_M = 7.5
-"""Distance of the nodes on which tops are drawn: their walls become slopes of about so much."""
-NEAREST, HOLE_CELLS = 5, 1.5
-"""So many points tell a node, the second no farther than so many distances of the points."""
-WALL_NODES = 0.7
-"""One sigma, in nodes, of the smoothing of walls."""
 _AT_ONCE = 20_000
+"""Points whose neighbours are held in memory at a time."""
 
 
 def with_tall_surfaces(ground: Terrain, points: Array, cell_m: float, most_nodes: int) -> Terrain:
-    """The ground with the tops of what is broad, as the pictures show it from above.
+    """The ground with the tops of tall surfaces, as the pictures show it from above.
 
     Args:
         ground: bare ground.
         points: float64 (K, 3) at free positions about cell_m apart, on whatever is seen there.
         cell_m: their distance. most_nodes: the ground gets no more nodes than this.
     """
+    c = active().surface
     over = points[:, 2] - ground.height(points[:, :2])
-    top, counts = _broad(points[:, :2], over, max(REACH_M, REACH_CELLS * cell_m))
+    top, counts = _tall_points(points[:, :2], over, max(c.tall_reach_m, c.tall_reach_cells * cell_m))
     if not (counts & (top != 0.0)).any():
         return ground
-    parts = max(1, round(ground.step_m / NODE_M))
+    parts = max(1, round(ground.step_m / c.tall_node_spacing_m))
     while parts > 1 and ground.z.size * parts**2 > most_nodes:
         parts -= 1
     fine = _finer(ground, parts)
-    tops = _spread(points[counts, :2], top[counts], fine, HOLE_CELLS * cell_m)
+    tops = _spread(points[counts, :2], top[counts], fine, c.tall_hole_cells * cell_m)
     return replace(fine, z=fine.z + tops, bare=fine.z)
 
 
-def _broad(xy: Array, over: Array, reach_m: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Height over the ground that each point stands for (0 on it), and which points tell one; lone ones do not."""
+def _tall_points(xy: Array, over: Array, reach_m: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Smoothed height over the ground at each point (0 on it), and which points count; lone raised ones do not."""
+    c = active().surface
     tree = cKDTree(xy)
-    raised = np.abs(over) > RISE_M
+    raised = np.abs(over) > c.tall_from_m
     core, top = np.zeros(len(xy), bool), np.zeros(len(xy))
     for some in _parts(np.flatnonzero(raised)):
         own, other = _pairs(tree, xy[some], reach_m)
-        as_high = np.abs(over[other] - over[some][own]) < AS_HIGH_M
+        as_high = np.abs(over[other] - over[some][own]) < c.tall_agreement_m
         count = np.bincount(own, minlength=len(some))
-        most = np.where(np.abs(over[some]) > TALL_M, TALL_SHARE, MOST_SHARE)
-        core[some] = (count >= FEWEST) & (np.bincount(own, as_high, len(some)) >= most * count)
+        share = np.where(np.abs(over[some]) > c.very_tall_from_m, c.very_tall_share, c.tall_share)
+        core[some] = (count >= c.tall_points) & (np.bincount(own, as_high, len(some)) >= share * count)
         weight = as_high / (1.0 + ((xy[other] - xy[some][own]) ** 2).sum(1) / (0.5 * reach_m) ** 2)
         top[some] = np.bincount(own, weight * over[other], len(some)) / np.bincount(own, weight, len(some))
     counts = core | ~raised
-    for some in _parts(np.flatnonzero(raised & ~core)):  # corners and rims of what is broad
+    for some in _parts(np.flatnonzero(raised & ~core)):  # corners and rims of tall surfaces
         own, other = _pairs(tree, xy[some], reach_m)
-        as_high = core[other] & (np.abs(top[other] - over[some][own]) < AS_HIGH_M)
-        counts[some] = np.bincount(own, as_high, len(some)) >= RIM_SHARE * np.bincount(own, minlength=len(some))
+        as_high = core[other] & (np.abs(top[other] - over[some][own]) < c.tall_agreement_m)
+        counts[some] = np.bincount(own, as_high, len(some)) >= c.tall_rim_share * np.bincount(own, minlength=len(some))
     return top, counts
 
 
@@ -104,12 +91,13 @@ def _finer(ground: Terrain, parts: int) -> Terrain:
 
 def _spread(xy: Array, top: Array, nodes: Terrain, reach_m: float) -> NDArray[np.float32]:
     """What to add at each node: the median of the nearest points' tops, nothing far from all of them."""
+    c = active().surface
     tree, (rows, columns) = cKDTree(xy), nodes.z.shape
     add = np.zeros((rows, columns))
     east = nodes.west + nodes.step_m * np.arange(columns)
     for row in range(rows):
         at = np.column_stack([east, np.full(columns, nodes.south + nodes.step_m * row)])
-        away, which = tree.query(at, k=min(NEAREST, len(xy)))
+        away, which = tree.query(at, k=min(c.tall_node_points, len(xy)))
         away, which = np.reshape(away, (columns, -1)), np.reshape(which, (columns, -1))
         add[row] = np.where(away[:, min(1, away.shape[1] - 1)] < reach_m, np.median(top[which], axis=1), 0.0)
-    return np.asarray(gaussian_filter(add, WALL_NODES), np.float32)
+    return np.asarray(gaussian_filter(add, c.tall_wall_sigma_nodes), np.float32)

@@ -9,12 +9,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
 
 Array = NDArray[np.float64]
+
+HALF_MAXIMUM_SIGMAS = 1.1774
+"""Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +31,9 @@ class TerrainFit:
         kappa: smoothness, sigma of the second difference between nodes 30 m apart, metres.
         sd_m: standard deviation of T over nodes with data; median_m: its median there.
         ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
-            the mode of the heights (rubble, cars and bushes only lift points, nothing digs them in).
-        points_above_m: how far the robust centre (scale 2 m) of the points lies over that ground; a height prior around
-            level + pull lets the ground itself settle at the level.
+            the mode of the heights (rubble, cars and bushes only raise points).
+        points_above_m: how far the robust centre of the points lies over that ground; with a height prior around
+            level + points_above_m the ground itself comes to lie at the level.
         support: bool (rows, columns), nodes that have data in a cell next to them.
         settings: how it was fitted.
     """
@@ -42,11 +46,11 @@ class TerrainFit:
     ground_m: float
     points_above_m: float
     support: NDArray[np.bool_]
-    settings: FitSettings = field(default_factory=FitSettings)
+    settings: FitSettings = field(default_factory=FitSettings.configured)
 
     @property
     def shrink(self) -> float:
-        """Share of the relief that is believed by the height prior, 0 to 1."""
+        """Share of the relief that enters the height prior, 0 to 1."""
         return _shrink(self.sd_m, self.settings.flat_sd_m)
 
     @property
@@ -57,12 +61,12 @@ class TerrainFit:
     def prior(self, z0_m: float = 0.0) -> Terrain:
         """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
 
-        With z0 = level + pull the ground itself settles at the level, and not the centre of all points.
+        With z0 = level + points_above_m the ground itself comes to lie at the level, not the centre of all points.
         """
         return _about(self.terrain, self.median_m, self.shrink, z0_m)
 
     def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
-        """T shrunk about its own median for rectifying pictures (never about zero), plus a lift."""
+        """T shrunk about its own median for rectifying pictures (never about zero), plus an offset."""
         s = _shrink(self.sd_m, self.settings.render_flat_sd_m)
         return _about(self.terrain, self.median_m, s, self.median_m + ground_offset_m)
 
@@ -90,7 +94,7 @@ def fit_terrain(
     Raises:
         OrthoSwarmError: if no point lies within the bounds.
     """
-    s = settings or FitSettings()
+    s = settings or FitSettings.configured()
     points, sigma_z = np.asarray(points, float).reshape(-1, 3), np.asarray(sigma_z, float)
     nodes = fit_nodes(points, sigma_z, bounds, kappa, s)
     if nodes is None:
@@ -110,40 +114,44 @@ def fit_terrain(
     return TerrainFit(terrain, weight, nodes.kappa, sd, median, ground, pull, nodes.support, s)
 
 
-def lower_flank(height: Array, sigma: Array | None = None, kernel_m: float = 0.15) -> float:
-    """Level of the ground among heights of which most are on it and the rest above it.
+def lower_flank(height: Array, sigma: Array | None = None) -> float:
+    """Level of the ground among heights most of which are on it and the rest above it.
 
     The half-maximum point on the lower side of the mode, moved up by the half width that a peak of the heights' own
     noise would have: a symmetric peak returns its mode, one that is smeared upwards returns its lower edge. Of
-    several peaks the lowest counts that has at least 0.4 of the highest one's density: corners crowd on car roofs.
+    several peaks the lowest one of sufficient density counts: corners crowd on car roofs.
     """
+    c = active().surface
+    window_m, bin_m, kernel_m = c.ground_mode_window_m, c.ground_mode_bin_m, c.ground_mode_kernel_m
     z = np.asarray(height, float)
     if len(z) == 0:
         return 0.0
     centre = float(np.median(z))
-    z = z[np.abs(z - centre) < 15.0]
-    edges = np.arange(-15.5, 15.55, 0.05)
+    z = z[np.abs(z - centre) < window_m]
+    edges = np.arange(-window_m - 0.5, window_m + 0.5 + bin_m, bin_m)
     counts = np.histogram(z - centre, edges)[0].astype(float)
-    reach = np.arange(-int(5 * kernel_m / 0.05), int(5 * kernel_m / 0.05) + 1) * 0.05
+    bins = int(5 * kernel_m / bin_m)
+    reach = np.arange(-bins, bins + 1) * bin_m
     density = np.convolve(counts, np.exp(-0.5 * (reach / kernel_m) ** 2), mode="same")
     peak = np.r_[False, (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:]), False]
-    peak &= density >= 0.4 * density.max()
+    peak &= density >= c.ground_mode_share * density.max()
     top = int(np.flatnonzero(peak)[0]) if peak.any() else int(density.argmax())
     below = np.flatnonzero(density[:top] < 0.5 * density[top])
     if len(below) == 0:
-        return centre + float(edges[top]) + 0.025
+        return centre + float(edges[top]) + bin_m / 2
     i = int(below[-1])
     part = (0.5 * density[top] - density[i]) / max(density[i + 1] - density[i], 1e-12)
-    flank = edges[i] + 0.025 + 0.05 * part
-    mode = edges[top] + 0.025
+    flank = edges[i] + bin_m / 2 + bin_m * part
+    mode = edges[top] + bin_m / 2
     noise = kernel_m
     if sigma is not None and len(sigma):
         noise = float(np.hypot(kernel_m, np.median(sigma)))
-    return centre + float(min(flank + 1.1774 * noise, mode))
+    return centre + float(min(flank + HALF_MAXIMUM_SIGMAS * noise, mode))
 
 
-def robust_centre(x: Array, scale_m: float = 2.0, rounds: int = 20) -> float:
+def robust_centre(x: Array, rounds: int = 20) -> float:
     """Geman-McClure centre of values, started at their median."""
+    scale_m = active().surface.points_centre_scale_m
     if len(x) == 0:
         return 0.0
     c = float(np.median(x))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class GroundModel:
-    """Ground as it is believed now.
+    """The present estimate of the ground.
 
     Attributes:
         fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`, or has
@@ -36,7 +37,7 @@ class GroundModel:
     contradicted_m: float = 0.0
 
     def height(self, xy: Array) -> Array:
-        """Ground height (M,) at positions (M, 2): the fitted surface and the lift."""
+        """Ground height (M,) at positions (M, 2): the fitted surface and its offset."""
         if self.fit is None:
             return self._initial_height(xy)
         return np.asarray(self.terrain().height(xy))
@@ -45,27 +46,35 @@ class GroundModel:
         """The ground for rectifying pictures."""
         return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.ground_offset_m)
 
-    def height_prior(self, points: Array, sigma_m: float = 2.0, c: float = 1.0) -> HeightPrior:
-        """The height prior of points (P, 3)."""
+    def height_prior(self, points: Array, sigma_m: float | None = None, robust_c: float | None = None) -> HeightPrior:
+        """The height prior of points (P, 3); sigma and robust scale are the configuration's unless given."""
+        config = active().surface
         if self.fit is None:
             expected = self._initial_height(points[:, :2])
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.points_above_m
-        return HeightPrior(expected, sigma_m, 20.0, c)
+        return HeightPrior(
+            expected,
+            sigma_m or config.height_prior_sigma_m,
+            config.height_prior_soft_sigma_m,
+            robust_c or config.height_prior_robust_c,
+        )
 
     def _initial_height(self, xy: Array) -> Array:
         level = np.full(len(xy), self.level_m)
         return level if self.dem is None else level + self.dem.height(xy)
 
 
-def ground_points(adjustment: Adjustment, min_observations: int = 4) -> tuple[Array, Array]:
+def ground_points(adjustment: Adjustment) -> tuple[Array, Array]:
     """Points fit for the terrain, float64 (K, 3), and one sigma of their heights (K,)."""
+    c = active().surface
     n = len(adjustment.points)
     point = adjustment.tracks.point
     total = np.maximum(np.bincount(point, minlength=n), 1)
     weight = np.bincount(point, adjustment.obs_weight, minlength=n) / total
     sigma = np.sqrt(np.maximum(adjustment.point_inverse[:, 2, 2], 0.0))
-    good = (total >= min_observations) & (weight > 0.6) & (sigma < 1.5) & (sigma > 0)
+    good = (total >= c.ground_point_observations) & (weight > c.ground_point_weight)
+    good &= (sigma < c.ground_point_sigma_m) & (sigma > 0)
     return adjustment.points[good], sigma[good]
 
 
@@ -77,18 +86,34 @@ def fit_surface(
     extra: tuple[Array, Array] | None = None,
     settings: FitSettings | None = None,
 ) -> GroundModel:
-    """Fit the ground to the points now (and to extra ones with their sigmas); few points leave it as it was."""
+    """Fit the ground to an adjustment's points (and to extra ones with their sigmas); see `fit_ground`."""
     points, sigma = ground_points(adjustment)
     if extra is not None:
         points, sigma = np.concatenate([points, extra[0]]), np.concatenate([sigma, extra[1]])
-    if len(points) < 60:
+    return fit_ground(points, sigma, adjustment.cameras.position, before, kappa=kappa, settings=settings)
+
+
+def fit_ground(
+    points: Array,
+    sigma: Array,
+    camera_position: Array,
+    before: GroundModel,
+    *,
+    kappa: float | None = None,
+    settings: FitSettings | None = None,
+) -> GroundModel:
+    """Fit the ground below cameras (N, 3) to points (P, 3) with sigmas (P,); too few points leave it as it was.
+
+    A height model that contradicts the points is not used from then on.
+    """
+    c = active().surface
+    if len(points) < c.terrain_points:
         return before
-    position = adjustment.cameras.position[:, :2]
-    reach = 0.9 * float(np.median(adjustment.cameras.position[:, 2])) * 1.2
-    bounds = BoundingBox.around_points(position, reach)
+    reach = c.terrain_reach_heights * float(np.median(camera_position[:, 2]))
+    bounds = BoundingBox.around_points(camera_position[:, :2], reach)
     if before.dem is not None:
         fit, off = fit_over_dem(before.dem, points, sigma, bounds, kappa=kappa, settings=settings)
         if fit is not None:
             return replace(before, fit=fit)
-        before = replace(before, dem=None, contradicted_m=off)  # for good: its level is another than the points' own
+        before = replace(before, dem=None, contradicted_m=off)
     return replace(before, fit=fit_terrain(points, sigma, bounds, kappa=kappa, settings=settings))

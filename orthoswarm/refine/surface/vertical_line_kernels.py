@@ -9,13 +9,10 @@ from orthoswarm.compute.jit import kernel
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.bundle.block_arrays import project_point
 
-ENOUGH = 3
-"""Partners of a reference below which other legs are asked for some."""
-
 
 @kernel
 def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped-def]
-    """True where a camera sees a patch of this half width whole (its diagonal counts)."""
+    """True where a camera sees a complete patch of this half width (its diagonal counts)."""
     u, v = project_point(position, rotation, lens, x, y, z)
     margin = 1.42 * half_m * lens[0] / max(position[2] - z, 1.0) + 1.5
     return u > margin and v > margin and u < lens[6] - 1.0 - margin and v < lens[7] - 1.0 - margin
@@ -23,9 +20,12 @@ def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped
 
 @kernel
 def choose(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, ref, partner
+    position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, enough, ref, partner
 ):
-    """For each cell the nearest-nadir picture and its partners: those closest to the wished signed baselines."""
+    """For each cell the nearest-nadir picture and its partners: those closest to the wished signed baselines.
+
+    least: shortest baseline. enough: with fewer partners pictures of other legs are added.
+    """
     for c in range(len(cells)):
         x, y, z = cells[c, 0], cells[c, 1], plane[c, 0]
         best, r = np.inf, -1
@@ -49,28 +49,28 @@ def choose(  # type: ignore[no-untyped-def]
                 if b * wished[w] <= 0.0 or abs(b) < least or abs(b - wished[w]) >= nearest:
                     continue
                 i = key[k]
-                taken = False
+                chosen = False
                 for q in range(w):
-                    taken = taken or partner[c, q] == i
-                if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                    chosen = chosen or partner[c, q] == i
+                if not chosen and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
                     nearest, choice = abs(b - wished[w]), i
             partner[c, w] = choice
         _fill_from_other_legs(
-            position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner[c]
+            position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner[c]
         )
 
 
 @kernel
 def _fill_from_other_legs(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, partner
+    position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner
 ):
-    """Where the reference's own leg ends before ENOUGH partners are found, those of other legs that see best."""
+    """Where the reference's own leg ends before enough partners are found, those of other legs nearest above."""
     count, reach = 0, 0.0
     for w in range(len(wished)):
         count += partner[w] >= 0
         reach = max(reach, abs(wished[w]))
     o = key[r]
-    while count < ENOUGH:
+    while count < enough:
         best, choice = np.inf, -1
         for k in range(len(key)):
             i = key[k]
@@ -80,10 +80,10 @@ def _fill_from_other_legs(  # type: ignore[no-untyped-def]
             d = (position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2
             if b < least or b > reach or d >= best:
                 continue
-            taken = False
+            chosen = False
             for w in range(len(wished)):
-                taken = taken or partner[w] == i
-            if not taken and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
+                chosen = chosen or partner[w] == i
+            if not chosen and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
                 best, choice = d, i
         if choice < 0:
             return
@@ -172,7 +172,7 @@ def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-
 
 
 @kernel
-def _zncc_along(patch, strip, first, last, score):  # type: ignore[no-untyped-def]
+def _zncc_along(patch, strip, first, last, least_variance, score):  # type: ignore[no-untyped-def]
     """Normalised correlation of a square patch with every place in a strip; NaN where the strip has no data."""
     n = len(patch)
     count = np.float32(n * n)
@@ -183,7 +183,7 @@ def _zncc_along(patch, strip, first, last, score):  # type: ignore[no-untyped-de
             patch[j, i] -= mean
             energy += patch[j, i] * patch[j, i]
     score[:] = np.nan
-    if energy < 2.0 * count:  # grey values vary by less than the noise of a JPEG: nothing to find
+    if energy < least_variance * count:
         return
     for k in range(first, last - n + 2):
         dot, total, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -198,7 +198,24 @@ def _zncc_along(patch, strip, first, last, score):  # type: ignore[no-untyped-de
 
 @kernel
 def _pair(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, stack, slot, factor, x, y, plane, r, p, heights, half, step, total, seen
+    position,
+    rotation,
+    lens_id,
+    lens,
+    stack,
+    slot,
+    factor,
+    x,
+    y,
+    plane,
+    r,
+    p,
+    heights,
+    half,
+    step,
+    least_variance,
+    total,
+    seen,
 ):
     """Add one partner's correlation at each height to `total` and count it in `seen`."""
     n, top = 2 * half + 1, heights[-1]
@@ -230,7 +247,7 @@ def _pair(  # type: ignore[no-untyped-def]
         ex, ey, step, half_u, half, strip,
     )  # fmt: skip
     score = np.empty(2 * reach + 1, np.float32)
-    _zncc_along(patch, strip, a, b, score)
+    _zncc_along(patch, strip, a, b, least_variance, score)
     for h in range(len(heights)):
         qx, qy = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, heights[h])
         s = ((qx - x) * ex + (qy - y) * ey) / step + reach
@@ -248,7 +265,22 @@ def _pair(  # type: ignore[no-untyped-def]
 
 @kernel
 def correlate(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, stack, slot, factor, cells, plane, ref, partner, heights, half, step, curve
+    position,
+    rotation,
+    lens_id,
+    lens,
+    stack,
+    slot,
+    factor,
+    cells,
+    plane,
+    ref,
+    partner,
+    heights,
+    half,
+    step,
+    least_variance,
+    curve,
 ):
     """Mean normalised correlation over partners for each cell and height; NaN with fewer than two partners."""
     total, seen = np.empty(len(heights)), np.empty(len(heights), np.int64)
@@ -258,7 +290,7 @@ def correlate(  # type: ignore[no-untyped-def]
             if partner[c, k] >= 0:
                 _pair(
                     position, rotation, lens_id, lens, stack, slot, factor, cells[c, 0], cells[c, 1], plane[c],
-                    ref[c], partner[c, k], heights, half, step, total, seen,
+                    ref[c], partner[c, k], heights, half, step, least_variance, total, seen,
                 )  # fmt: skip
         for h in range(len(heights)):
             curve[c, h] = total[h] / seen[h] if seen[h] >= 2 else np.nan

@@ -1,10 +1,10 @@
-"""Ground points where tracks are missing: a vertical line locus through several pictures.
+"""Ground points where tracks are missing: the vertical line locus method with several pictures.
 
-At a free position the picture that sees it from nearest above is the reference; partners fore and aft on the same
-leg are compared with it for every height, and where the leg ends too early pictures of other legs. A patch of the
-reference is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on
-that plane: on it a change of height is a plain shift, so each picture is sampled once and the sweep is a correlation
-along the strip. Pictures are read one after the other along the legs and only a window of them is kept.
+At a free position the picture nearest to the vertical is the reference. Partners before and behind it on the same leg
+are compared with it for every height, and where the leg ends too early pictures of other legs. A patch of the reference
+is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on that plane:
+there a change of height is a shift, so each picture is sampled once and all heights are tried by one correlation along
+the strip. Pictures are read one after the other along the legs, and only a window of them is held.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
@@ -21,16 +22,13 @@ from orthoswarm.refine.surface import vertical_line_kernels as kernels
 Array = NDArray[np.float64]
 Gray = Callable[[int], NDArray[np.uint8]]
 
-STEEPEST = 1.5
-"""Ground is no steeper for a patch: a given height model has walls, and no patch is a plane across one."""
-
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """How heights are searched. Lengths in metres, chosen for 150 m above ground; see `at_height`.
+    """How heights are searched. Lengths in metres, for the reference height above ground; see `at_height`.
 
     Attributes:
-        half: half width of the square patch in samples (7: 15 x 15).
+        half: half width of the square patch in samples (7: 15 x 15 samples).
         step_m: distance of samples.
         reach_m: heights searched above and below the terrain; height_step_m: their distance (peaks are
             interpolated by a parabola).
@@ -42,20 +40,41 @@ class Sweep:
         spacing_m: only pictures this far apart along a leg are used, so that few have to be decoded.
     """
 
-    half: int = 7
-    step_m: float = 0.7
-    reach_m: float = 9.0
-    height_step_m: float = 0.375
-    min_score: float = 0.6
-    rival_m: float = 4.0
-    rival_share: float = 0.95
-    sigma_m: float = 0.25
-    baselines_m: tuple[float, ...] = (40.0, 75.0, 110.0)
-    spacing_m: float = 17.0
+    half: int
+    step_m: float
+    reach_m: float
+    height_step_m: float
+    min_score: float
+    rival_m: float
+    rival_share: float
+    sigma_m: float
+    baselines_m: tuple[float, ...]
+    spacing_m: float
+
+    @classmethod
+    def small(cls) -> "Sweep":
+        """Small patches, which fit between cars, bushes and houses: most of their heights are those of bare ground."""
+        c = active().surface
+        return cls._with_patch(c.small_patch_half, c.small_patch_step_m, c.small_patch_score, c.small_patch_sigma_m)
+
+    @classmethod
+    def large(cls) -> "Sweep":
+        """Large patches, which find heights on ground with little texture."""
+        c = active().surface
+        return cls._with_patch(c.large_patch_half, c.large_patch_step_m, c.large_patch_score, c.large_patch_sigma_m)
+
+    @classmethod
+    def _with_patch(cls, half: int, step_m: float, min_score: float, sigma_m: float) -> "Sweep":
+        c = active().surface
+        return cls(
+            half=half, step_m=step_m, reach_m=c.sweep_reach_m, height_step_m=c.sweep_height_step_m,
+            min_score=min_score, rival_m=c.sweep_rival_m, rival_share=c.sweep_rival_share, sigma_m=sigma_m,
+            baselines_m=c.sweep_baselines_m, spacing_m=c.sweep_spacing_m,
+        )  # fmt: skip
 
     def at_height(self, height_m: float) -> "Sweep":
         """The same sweep for cameras at another height above ground: all but the reach scales."""
-        k = height_m / 150.0
+        k = height_m / active().surface.reference_height_m
         return replace(
             self,
             step_m=self.step_m * k,
@@ -73,20 +92,12 @@ class Sweep:
         return np.asarray(np.arange(-count, count + 1) * self.height_step_m, np.float64)
 
 
-SMALL = Sweep(half=4, step_m=0.5, min_score=0.7, sigma_m=0.15)
-"""9 x 9 samples of 0.5 m fit between cars, bushes and houses: on a street scene three quarters of its heights lie
-within 0.2 m of the bare ground, of the large patch's half, most others above it."""
-
-LARGE = Sweep()
-"""15 x 15 samples of 0.7 m find heights on ground with little texture."""
-
-
 @dataclass(frozen=True, slots=True)
 class LocusPoints:
     """Points that a sweep found.
 
     Attributes:
-        points: float64 (M, 3), on the reference's ray through the position, so slightly beside it.
+        points: float64 (M, 3), on the reference's ray through the position, so slightly off it.
         sigma_z: float64 (M,), one sigma of each height.
         score: float64 (M,), mean normalised correlation at the peak.
         cell: int64 (M,), which of the positions each point belongs to, ascending.
@@ -106,7 +117,7 @@ def dense_ground(
     leg_of_camera: NDArray[np.integer],
     sweeps: Sequence[Sweep] | None = None,
     *,
-    slots: int = 64,
+    slots: int | None = None,
 ) -> LocusPoints:
     """Heights at free positions from correlation between pictures, of one leg where there are enough.
 
@@ -118,26 +129,31 @@ def dense_ground(
         terrain: where heights are searched around; its slope tilts the patches.
         leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
         sweeps: how to search, one after the other, each at the positions where those before found nothing. Baselines
-            and spacing are the first one's. None: SMALL, then LARGE, for the cameras' height above the terrain.
-        slots: number of pictures held at a time (more only where the cells of one reference need more).
+            and spacing are the first one's. None: small patches, then large, for the cameras' height above the terrain.
+        slots: pictures held at a time (more only where the cells of one reference need more); None: as configured.
     """
+    c = active().surface
     if sweeps is None:
         height = height_above(cameras, terrain)
-        sweeps = (SMALL.at_height(height), LARGE.at_height(height))
+        sweeps = (Sweep.small().at_height(height), Sweep.large().at_height(height))
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
-    plane = _planes(terrain, cells, max(5.0, s.half * s.step_m))
-    keys = _key_cameras(cameras, np.asarray(leg_of_camera), s.spacing_m)
+    plane = _planes(terrain, cells, max(c.sweep_slope_reach_m, s.half * s.step_m))
+    usable = _usable_cameras(cameras, np.asarray(leg_of_camera), s.spacing_m)
     ref = np.full(len(cells), -1, np.int32)
     found = np.full((len(cells), 3), -1.0)
-    if len(keys.camera) and len(cells):
+    if len(usable.camera) and len(cells):
         wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
         partner = np.full((len(cells), len(wished)), -1, np.int32)
         kernels.choose(
-            cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, keys.camera, keys.leg, keys.along,
-            cells, plane, s.half * s.step_m, wished, 0.4 * min(s.baselines_m), ref, partner,
+            cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, usable.camera, usable.leg, usable.along,
+            cells, plane, s.half * s.step_m, wished, c.sweep_least_baseline_share * min(s.baselines_m),
+            c.sweep_partners, ref, partner,
         )  # fmt: skip
-        _sweep_in_windows(cameras, gray, keys.order, cells, plane, ref, partner, sweeps, slots, found)
+        _sweep_in_windows(
+            cameras, gray, usable.order, cells, plane, ref=ref, partner=partner, sweeps=sweeps,
+            slots=slots or c.sweep_pictures, found=found,
+        )  # fmt: skip
     good = np.flatnonzero(found[:, 1] >= 0.0)
     points = np.empty((len(good), 3))
     kernels.raise_points(cameras.position, ref[good], cells[good], plane[good], found[good, 0], points)
@@ -147,12 +163,12 @@ def dense_ground(
 def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
     """Median height of cameras above the terrain, metres, at least 1."""
     if len(cameras) == 0:
-        return 150.0
+        return active().surface.reference_height_m
     return max(1.0, float(np.median(cameras.position[:, 2] - terrain.height(cameras.position[:, :2]))))
 
 
 @dataclass(frozen=True, slots=True)
-class _Keys:
+class _UsableCameras:
     """Cameras used as reference or partner, sorted by leg and way along it; order: rank of every camera, -1 unused."""
 
     camera: NDArray[np.int32]
@@ -185,11 +201,11 @@ def spaced_cameras(
     return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
 
 
-def _key_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing: float) -> _Keys:
+def _usable_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing: float) -> _UsableCameras:
     leg, camera, along = spaced_cameras(cameras, leg_of_camera, spacing)
     order = np.full(len(cameras), -1, np.int64)
     order[camera] = np.arange(len(camera))
-    return _Keys(camera, leg, along, order)
+    return _UsableCameras(camera, leg, along, order)
 
 
 def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
@@ -198,7 +214,8 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
     z = terrain.height(cells)
     ge = (terrain.height(cells + e) - terrain.height(cells - e)) / (2 * reach)
     gn = (terrain.height(cells + n) - terrain.height(cells - n)) / (2 * reach)
-    return np.stack([z, np.clip(ge, -STEEPEST, STEEPEST), np.clip(gn, -STEEPEST, STEEPEST)], 1)
+    steepest = active().surface.sweep_steepest
+    return np.stack([z, np.clip(ge, -steepest, steepest), np.clip(gn, -steepest, steepest)], 1)
 
 
 def _sweep_in_windows(
@@ -207,6 +224,7 @@ def _sweep_in_windows(
     order: NDArray[np.int64],
     cells: Array,
     plane: Array,
+    *,
     ref: NDArray[np.int32],
     partner: NDArray[np.int32],
     sweeps: Sequence[Sweep],
@@ -228,6 +246,7 @@ def _sweep_in_windows(
     slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
     window = _Window(cameras, gray, _reduction(cameras, plane, ref, min(s.step_m for s in sweeps)), slots)
     factor = window.factor.astype(np.float64)
+    least_variance = active().surface.sweep_least_variance
 
     def search(block: NDArray[np.int64], needed: set[int]) -> None:
         window.hold(sorted(needed, key=lambda camera: int(order[camera])))
@@ -235,7 +254,8 @@ def _sweep_in_windows(
             curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
             kernels.correlate(
                 cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, window.stack, window.slot, factor,
-                cells[block], plane[block], ref[block], partner[block], s.heights, s.half, s.step_m, curve,
+                cells[block], plane[block], ref[block], partner[block], s.heights, s.half, s.step_m,
+                least_variance, curve,
             )  # fmt: skip
             kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
             good = peak[:, 1] >= s.min_score

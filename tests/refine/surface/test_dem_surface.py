@@ -9,10 +9,9 @@ import rasterio
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.height_model import HeightModel
-from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.surface.dem_surface import DemFit, LocalDem, fit_over_dem
 from orthoswarm.refine.surface.terrain import fit_terrain
-from orthoswarm.refine.surface.vehicle_ground import GroundModel
+from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_ground
 
 EPSG = 32632
 ORIGIN = (500_000.0, 5_400_000.0)
@@ -138,20 +137,9 @@ def test_a_model_that_was_contradicted_is_left_out_for_good(tmp_path):
     p, sigma = points()
     before = GroundModel(dem=dem)
     np.testing.assert_allclose(before.height(p[:, :2]), dem.height(p[:, :2]))
-    after = fit_points(before, p, sigma)
+    after = fit_ground(p, sigma, cameras() - (*ORIGIN, 0.0), before)
     assert after.dem is None and after.contradicted_m > 2.0
     assert np.percentile(np.abs(off(after.terrain(), hills)), 90) < 1.2
-
-
-def fit_points(before, p, sigma):
-    """fit_surface with points as if they were adjusted."""
-    from orthoswarm.refine.surface import vehicle_ground as ground
-
-    adjustment = object.__new__(Adjustment)
-    adjustment.cameras = type("CameraBlock", (), {"position": cameras() - (*ORIGIN, 0.0)})()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ground, "ground_points", lambda _: (p, sigma))
-        return ground.fit_surface(adjustment, before)
 
 
 def test_what_travels_between_processes_is_small_and_gives_the_same_ground(tmp_path):

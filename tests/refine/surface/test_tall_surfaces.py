@@ -1,11 +1,12 @@
-"""Tops of what is broad: drawn where they stand, while houses and trees leave the ground as it is."""
+"""Tops of halls and stands: drawn where they stand, while houses and trees leave the ground as it is."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.surface.tall_surfaces import NODE_M, RISE_M, with_tall_surfaces
+from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 
 CELL_M = 14.0
 MANY = 4_000_000
@@ -39,7 +40,7 @@ def test_hall_is_drawn_on_its_roof_and_the_street_beside_it_on_the_ground() -> N
     beside = (np.abs(x - 300.0) > 60.0) | (np.abs(y - 200.0) > 50.0)
     there = np.column_stack([x, y])[beside]
     assert np.abs(drawn.height(there) - ground.height(there)).max() < 0.05
-    assert drawn.step_m == NODE_M
+    assert drawn.step_m == active().surface.tall_node_spacing_m
     middle = np.array([300.0, 200.0])
     assert abs(float(drawn.bare_ground().height(middle) - ground.height(middle))) < 0.01
 
@@ -94,5 +95,5 @@ def test_ground_that_is_only_rough_is_given_back(seed: int, rough: float, count:
     ground = slope()
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0.0, 600.0, (count, 2))
-    z = ground.height(xy) + rng.uniform(-RISE_M * rough, RISE_M * rough, count)
+    z = ground.height(xy) + rng.uniform(-rough, rough, count) * active().surface.tall_from_m
     assert with_tall_surfaces(ground, np.column_stack([xy, z]), CELL_M, MANY) is ground

@@ -74,7 +74,8 @@ def test_relief_is_followed_through_a_town(seed):
 def test_more_tolerance_of_the_hold_out_gives_a_smoother_surface():
     points, sigma = town(relief)
     kappa = [
-        fit_terrain(points, sigma, BOUNDS, settings=FitSettings(held_out_se=k)).kappa for k in (0.0, 0.5, 1.0, 8.0)
+        fit_terrain(points, sigma, BOUNDS, settings=FitSettings.configured(held_out_se=k)).kappa
+        for k in (0.0, 0.5, 1.0, 8.0)
     ]
     assert kappa == sorted(kappa, reverse=True)
     assert kappa[-1] < kappa[0]
@@ -170,7 +171,7 @@ def test_the_lower_flank_stays_down_where_rubble_smears_the_mode():
 
 
 def test_finer_nodes_can_be_asked_for():
-    fit = fit_terrain(*town(relief), BOUNDS, settings=FitSettings(step_m=20.0))
+    fit = fit_terrain(*town(relief), BOUNDS, settings=FitSettings.configured(step_m=20.0))
     assert fit.terrain.step_m == 20.0
     error = fit.terrain.height(probe()) - relief(probe())
     assert np.percentile(np.abs(error), 95) < 0.4
@@ -181,8 +182,8 @@ def test_large_areas_are_solved_in_tiles_without_seams():
     xy = rng.uniform((20, 20), (2180, 880), (9000, 2))
     points = np.c_[xy, relief(xy) + rng.normal(0, 0.2, len(xy))]
     sigma, bounds = np.full(len(xy), 0.2), BoundingBox(0.0, 0.0, 2200.0, 900.0)
-    tiled = fit_nodes(points, sigma, bounds, 0.8, FitSettings())
-    whole = fit_nodes(points, sigma, bounds, 0.8, FitSettings(), core=1000)
+    tiled = fit_nodes(points, sigma, bounds, 0.8, FitSettings.configured())
+    whole = fit_nodes(points, sigma, bounds, 0.8, FitSettings.configured(), tile_nodes=1000)
     assert tiled is not None and whole is not None
     assert np.abs(tiled.z - whole.z).max() < 0.1
     np.testing.assert_array_equal(tiled.support, whole.support)

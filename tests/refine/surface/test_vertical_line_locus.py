@@ -10,7 +10,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.surface.ground_offset import draw_positions, kernel_mode, measure_ground_offset
 from orthoswarm.refine.surface.vertical_line_kernels import _leaves
-from orthoswarm.refine.surface.vertical_line_locus import LARGE, dense_ground
+from orthoswarm.refine.surface.vertical_line_locus import Sweep, dense_ground
 from tests.kit.draped import HEIGHT, WIDTH, Pictures, rig_of
 
 
@@ -29,7 +29,7 @@ def cells(step=9.0, pad=40.0):
     return np.c_[east.ravel(), north.ravel()]
 
 
-SWEEP = (LARGE.at_height(100.0),)
+SWEEP = (Sweep.large().at_height(100.0),)
 
 
 def test_the_sweep_finds_the_surface_to_decimetres(hilly):
@@ -140,27 +140,27 @@ def test_large_pictures_are_shrunk_to_what_the_sweep_needs():
     assert np.median(np.abs(error)) < 0.2
 
 
-def test_the_lift_tells_the_level_of_the_ground(hilly):
+def test_the_offset_is_that_of_the_open_ground(hilly):
     cameras, leg, gray = hilly
-    positions = draw_positions(cameras.position[:, :2], count=500, spread_m=30.0)
+    positions = draw_positions(cameras.position[:, :2], 45.0)
     high = Terrain(-300.0, -300.0, 5.0, np.zeros((160, 120), np.float32))
     east, north = np.meshgrid(-300 + 5.0 * np.arange(120), -300 + 5.0 * np.arange(160))
     for offset in (0.0, 0.4):
         surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
-        lift = measure_ground_offset(cameras, gray, positions, surface, leg)
-        assert lift.count > 200
-        assert lift.ground_offset_m == pytest.approx(-offset, abs=0.08)
+        found = measure_ground_offset(cameras, gray, positions, surface, leg)
+        assert found.count > 200
+        assert found.ground_offset_m == pytest.approx(-offset, abs=0.08)
 
 
-def test_too_few_heights_give_no_lift(hilly):
+def test_too_few_heights_give_no_offset(hilly):
     cameras, leg, gray = hilly
-    lift = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
-    assert lift.ground_offset_m == 0.0
+    found = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
+    assert found.ground_offset_m == 0.0
 
 
 def test_positions_are_drawn_alike_every_time():
     xy = np.c_[np.arange(50.0), np.arange(50.0)]
-    a, b = draw_positions(xy, spread_m=45.0), draw_positions(xy, spread_m=45.0)
+    a, b = draw_positions(xy, 67.5), draw_positions(xy, 67.5)
     np.testing.assert_array_equal(a, b)
     assert a.shape == (900, 2)
     assert (a.min(0) > -46).all() and (a.max(0) < 96).all()
