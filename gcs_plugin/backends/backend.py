@@ -1,16 +1,24 @@
 """What a ground station can do with vehicles, whichever library talks to them."""
 
 import abc
+import time
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from gcs_plugin.fleet.commands import Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.exchange import Outcome
+from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
 
-Verb = Literal["start", "pause", "resume", "rtl"]
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.commands import Order
+    from gcs_plugin.fleet.preflight import Check
+    from gcs_plugin.mission.track import Airspace
+
 Report = Callable[[str, int, int], None]
+Say = Callable[[str], None]
 
 
 class Backend(abc.ABC):
@@ -67,14 +75,39 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
-    def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
-        """Start, pause, resume or bring home vehicles.
+    def check(
+        self,
+        systems: Collection[int],
+        missions: Mapping[int, Mission],
+        stored: Mapping[int, Mission],
+        starts: Mapping[int, float],
+        legal_height_m: float,
+    ) -> "list[Check]":
+        """Check vehicles before their start, with what they say at this moment.
+
+        Args:
+            systems: the vehicles. missions: the plan's. stored: what was read from them.
+            starts: takeoffs in seconds after the first. legal_height_m: height that may be flown without asking.
+        """
+
+    @abc.abstractmethod
+    def command(
+        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
+    ) -> "dict[int, Order]":
+        """Give a command to vehicles, and wait for the outcome of each.
+
+        A start that fails holds those that still wait on the ground; one that comes late moves them.
 
         Args:
             verb: what to do.
             delays: seconds from now for each system id.
-            report: as for `upload`.
+            say: called with each outcome, and with what follows from it, at once.
+            airspace: the missions that are started, so that later ones can be moved.
         """
+
+    @abc.abstractmethod
+    def pump(self, seconds: float) -> None:
+        """Take what vehicles say, for so long at most."""
 
     @abc.abstractmethod
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
@@ -91,12 +124,37 @@ class Backend(abc.ABC):
 
 ENDED = ("complete", "aborted")
 
-_LATE_S = 5.0
 
-
-def late_start(outcome: Outcome, late_s: float) -> Outcome:
-    """A start that came too late for a plan that keeps vehicles apart by time says so."""
-    if late_s <= _LATE_S:
-        return outcome
-    warning = f"it took off {late_s:.0f} s later than planned, so the plan's distances do not hold: watch it"
-    return Outcome(True, f"{outcome.text}, but {warning}")
+def command_all(
+    delays: Mapping[int, float],
+    begin: "Callable[[int], Order]",
+    pump: Callable[[float], None],
+    say: Say,
+    airspace: "Airspace | None",
+) -> "dict[int, Order]":
+    """Give one command to each vehicle at its time and wait for all outcomes; see `Backend.command`."""
+    schedule = TakeoffSchedule.of(delays, time.monotonic(), airspace)
+    orders: dict[int, Order] = {}
+    ended: set[int] = set()
+    while len(ended) < len(delays):
+        for system in schedule.due(time.monotonic()):
+            orders[system] = begin(system)
+        pump(0.05 if schedule.waiting else 0.2)
+        for system, order in list(orders.items()):
+            outcome = order.outcome
+            if outcome is None or system in ended:
+                continue
+            ended.add(system)
+            say(outcome.text)
+            if order.verb != "start":
+                continue
+            if outcome.ok:
+                for text in schedule.started(system, time.monotonic()):
+                    say(text)
+                continue
+            for held in schedule.failed(system):
+                ended.add(held)
+                text = f"vehicle {held} stays on the ground, because vehicle {system} did not take off"
+                orders[held] = type(order)("start", held, time.monotonic(), order.id).end(text, Verdict.NOT_SENT)
+                say(text)
+    return orders

@@ -3,12 +3,14 @@
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Verb, late_start
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, command_all
+from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.message_rates import default_rates
+from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
@@ -16,6 +18,9 @@ from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.items import Mission
 from orthoswarm.model.errors import OrthoSwarmError
+
+if TYPE_CHECKING:
+    from gcs_plugin.mission.track import Airspace
 
 _QUIET_S = 2.2  # two heartbeats: whoever has not been heard by then is not there
 
@@ -46,7 +51,7 @@ class DirectBackend(Backend):
             fleet.poll(0.1)
             if len(fleet.vehicles) != found:
                 found, since = len(fleet.vehicles), time.monotonic()
-            known = all(v.lat_deg is not None and v.landed for v in fleet.vehicles.values())
+            known = all(v.reported and v.landed for v in fleet.vehicles.values())
             if wanted and all(system in fleet.vehicles for system in wanted) and known:
                 break
             if not wanted and found and known and time.monotonic() - since > _QUIET_S:
@@ -68,12 +73,18 @@ class DirectBackend(Backend):
         problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
         if hub.rejected:
             problems.append(f"{hub.rejected} packets had no good signature; check the signing key")
+        signing = [v for v in self.fleet.vehicles.values() if v.signs and not self.fleet.signed]
+        problems += [
+            f"{v.id} signs its messages; it listens only to a station with its key: --signing-key" for v in signing
+        ]
+        shared = [v for v in self.fleet.vehicles.values() if v.claimants]
+        problems += [f"several vehicles use the system id of {v.id}: {', '.join(v.claimants)}" for v in shared]
         return problems
 
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
         """All uploads at once."""
         begin = {s: (lambda s=s, m=m: self.fleet.upload(s, m)) for s, m in missions.items()}
-        return self._run(begin, dict.fromkeys(missions, 0.0), "upload", report)
+        return self._run(begin, "upload", report)
 
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
         """All downloads at once."""
@@ -84,18 +95,36 @@ class DirectBackend(Backend):
             return jobs[system]
 
         reads = {system: (lambda system=system: begin(system)) for system in systems}
-        self._run(reads, dict.fromkeys(systems, 0.0), "read", report)
+        self._run(reads, "read", report)
         found: dict[int, Mission | None] = dict.fromkeys(systems)
         for system, job in jobs.items():
             if job.items is not None:
                 found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
         return found
 
-    def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
+    def check(
+        self,
+        systems: Collection[int],
+        missions: Mapping[int, Mission],
+        stored: Mapping[int, Mission],
+        starts: Mapping[int, float],
+        legal_height_m: float,
+    ) -> list[Check]:
+        """Check with what the fleet knows."""
+        vehicles = {s: self.fleet.vehicles[s] for s in systems}
+        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
+
+    def command(
+        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
+    ) -> dict[int, Order]:
         """All commands at their times."""
-        act = {"start": self.fleet.start, "pause": self.fleet.pause, "resume": self.fleet.resume, "rtl": self.fleet.rtl}
-        begin = {system: (lambda system=system: act[verb](system)) for system in delays}
-        return self._run(begin, delays, verb, report)
+        return command_all(
+            delays, lambda s: self.fleet.order(Order(verb, s, time.monotonic())), self.pump, say, airspace
+        )
+
+    def pump(self, seconds: float) -> None:
+        """Poll the fleet."""
+        self.fleet.poll(seconds)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
         """Poll and tell until all missions have ended."""
@@ -132,28 +161,22 @@ class DirectBackend(Backend):
     def _run(
         self,
         begin: Mapping[int, Callable[[], Exchange]],
-        delays: Mapping[int, float],
         what: str,
         report: Report,
     ) -> dict[int, Outcome]:
-        """Begin each at its time and poll until all have ended."""
+        """Begin all and poll until each has ended."""
         outcomes: dict[int, Outcome] = {}
         jobs: dict[int, Exchange] = {}
-        started = time.monotonic()
-        waiting = sorted(begin, key=lambda system: delays[system])
+        for system, start in begin.items():
+            try:
+                jobs[system] = start()
+            except OrthoSwarmError as error:
+                outcomes[system] = Outcome(False, str(error))
         while len(outcomes) < len(begin):
-            while waiting and time.monotonic() - started >= delays[waiting[0]]:
-                system = waiting.pop(0)
-                try:
-                    jobs[system] = begin[system]()
-                except OrthoSwarmError as error:
-                    outcomes[system] = Outcome(False, str(error))
-            self.fleet.poll(0.05 if waiting else 0.2)
-            late = time.monotonic() - started
+            self.fleet.poll(0.2)
             for system, job in jobs.items():
                 if job.outcome is not None and system not in outcomes:
-                    timed = what == "start" and any(delays.values()) and job.outcome.ok
-                    outcomes[system] = late_start(job.outcome, late - delays[system]) if timed else job.outcome
+                    outcomes[system] = job.outcome
             report(what, len(outcomes), len(begin))
         return outcomes
 

@@ -12,27 +12,33 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Verb, late_start
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, command_all
+from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.message_rates import Rates, Streams
+from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.transports import parse_address
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.control import unflyable
-from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import Mission, MissionItem
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
+if TYPE_CHECKING:
+    from gcs_plugin.mission.track import Airspace
+
 _HEARD: Final = (
     "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
     "GLOBAL_POSITION_INT", "SYS_STATUS", "GPS_RAW_INT", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED",
+    "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION",
 )  # fmt: skip
-_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0})
+_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 242: 0.2})
 _ATTEMPTS: Final = 4
 _LOST_S: Final = 5.0
 _QUIET_S: Final = 2.2
@@ -102,7 +108,7 @@ class MavsdkBackend(Backend):
         end, found, since = time.monotonic() + wait_s, -1, 0.0
         while time.monotonic() < end:
             self._meet()
-            self._pump(0.1)
+            self.pump(0.1)
             if len(self._crafts) != found:
                 found, since = len(self._crafts), time.monotonic()
             known = all(c.vehicle.lat_deg is not None and c.vehicle.landed for c in self._crafts.values())
@@ -130,11 +136,12 @@ class MavsdkBackend(Backend):
         with ThreadPoolExecutor(max_workers=min(16, max(1, len(missions)))) as pool:
             futures = {s: pool.submit(self._upload, s, mission) for s, mission in missions.items()}
             while not all(future.done() for future in futures.values()):
-                self._pump(0.1)
+                self.pump(0.1)
                 report("upload", sum(future.done() for future in futures.values()), len(futures))
         outcomes = {s: future.result() for s, future in futures.items()}
         for s, outcome in outcomes.items():
             if outcome.ok:
+                self._crafts[s].vehicle.mission = missions[s]
                 self._crafts[s].vehicle.detector.uploaded(missions[s])
         return outcomes
 
@@ -142,30 +149,36 @@ class MavsdkBackend(Backend):
         """Downloads one after the other, for MAVSDK's calls wait."""
         found: dict[int, Mission | None] = {}
         for system in systems:
-            found[system] = self._read(system)
+            found[system] = self._crafts[system].vehicle.mission = self._read(system)
             report("read", len(found), len(systems))
         return found
 
-    def command(self, verb: Verb, delays: Mapping[int, float], report: Report) -> dict[int, Outcome]:
+    def check(
+        self,
+        systems: Collection[int],
+        missions: Mapping[int, Mission],
+        stored: Mapping[int, Mission],
+        starts: Mapping[int, float],
+        legal_height_m: float,
+    ) -> list[Check]:
+        """Check with what was heard."""
+        vehicles = {s: self._craft(s).vehicle for s in systems}
+        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
+
+    def command(
+        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
+    ) -> dict[int, Order]:
         """All commands at their times."""
-        outcomes: dict[int, Outcome] = {}
-        jobs: dict[int, Exchange] = {}
-        began, waiting = time.monotonic(), sorted(delays, key=lambda system: delays[system])
-        while len(outcomes) < len(delays):
-            while waiting and time.monotonic() - began >= delays[waiting[0]]:
-                system = waiting.pop(0)
-                try:
-                    jobs[system] = self._begin(system, verb)
-                except OrthoSwarmError as error:
-                    outcomes[system] = Outcome(False, str(error))
-            self._pump(0.05)
-            late = time.monotonic() - began
-            for system, job in jobs.items():
-                if job.outcome is not None and system not in outcomes:
-                    timed = verb == "start" and any(delays.values()) and job.outcome.ok
-                    outcomes[system] = late_start(job.outcome, late - delays[system]) if timed else job.outcome
-            report(verb, len(outcomes), len(delays))
-        return outcomes
+
+        def begin(system: int) -> Order:
+            order = Order(verb, system, time.monotonic())
+            try:
+                order.exchange = self._begin(system, verb, order.expires_s)
+            except OrthoSwarmError as error:
+                return order.end(str(error), Verdict.REFUSED)
+            return order
+
+        return command_all(delays, begin, self.pump, say, airspace)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
         """Follow until all missions have ended."""
@@ -185,7 +198,7 @@ class MavsdkBackend(Backend):
             if time.monotonic() >= end:
                 return False
             self._meet()
-            self._pump(0.2)
+            self.pump(0.2)
 
     # --- vehicles ---
 
@@ -230,9 +243,9 @@ class MavsdkBackend(Backend):
         number_of_autopilot = Address(number).component
         return take
 
-    def _pump(self, wait_s: float) -> None:
+    def pump(self, seconds: float) -> None:
         """Take what has come, and let time pass for what is under way."""
-        end = time.monotonic() + wait_s
+        end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             try:
                 number, message = self._queue.get(timeout=left)
@@ -244,7 +257,7 @@ class MavsdkBackend(Backend):
             self._send(craft, craft.vehicle.streams.tick(now))
             for job in list(craft.jobs):
                 if now >= job.deadline:
-                    self._send(craft, job.tick(now))
+                    self._drive(craft, job, job.tick(now))
             craft.jobs = [job for job in craft.jobs if job.outcome is None]
             vehicle = craft.vehicle
             if not vehicle.lost and now - vehicle.heard > _LOST_S:
@@ -266,7 +279,7 @@ class MavsdkBackend(Backend):
             self._event(kind, vehicle.system, text)
         for job in list(craft.jobs):
             if job.outcome is None:
-                self._send(craft, job.feed(message, now))
+                self._drive(craft, job, job.feed(message, now))
 
     def _send(self, craft: _Craft, messages: Sequence[Message]) -> None:
         from mavsdk.plugins.mavlink_direct import MavlinkMessage
@@ -337,29 +350,39 @@ class MavsdkBackend(Backend):
         items = [MissionItem(i.command, i.frame, (i.param1, i.param2, i.param3, i.param4), i.x, i.y, i.z) for i in raw]
         return Mission(craft.vehicle.autopilot, tuple(items))
 
-    def _begin(self, system: int, verb: Verb) -> Exchange:
+    def _begin(self, system: int, verb: Verb, expires: float) -> Exchange:
         craft = self._craft(system)
         vehicle = craft.vehicle
-        if vehicle.lost:
+        if vehicle.lost and verb not in URGENT:
             raise OrthoSwarmError(f"vehicle {system} is lost; wait until it is heard again")
         for job in craft.jobs:
             job.cancel("another command came in between")
         job = self._dialogue(craft, verb)
+        job.expires = expires
         craft.jobs.append(job)
-        self._send(craft, job.start(time.monotonic()))
+        self._drive(craft, job, job.start(time.monotonic()))
         return job
+
+    def _drive(self, craft: _Craft, job: Exchange, messages: Sequence[Message]) -> None:
+        self._send(craft, messages)
+        for _ in messages:
+            job.took()
 
     def _dialogue(self, craft: _Craft, verb: Verb) -> Exchange:
         vehicle = craft.vehicle
         if verb == "pause":
+            if not vehicle.armed and not vehicle.lost:
+                raise OrthoSwarmError(f"vehicle {vehicle.system} is not armed, so there is nothing to pause")
             return vehicle.pilot.pause()
         if verb == "resume":
             return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
         if verb == "rtl":
             return vehicle.pilot.rtl()
+        if verb == "land":
+            return vehicle.pilot.land()
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {vehicle.system} is flying its mission already")
-        mission = self._read(vehicle.system)
+        mission = vehicle.mission or self._read(vehicle.system)
         in_air = vehicle.in_air and vehicle.armed
         wrong = unflyable(mission.items if mission else (), vehicle.autopilot, in_air=in_air)
         if mission is None or wrong:

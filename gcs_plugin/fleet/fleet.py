@@ -13,19 +13,20 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
+from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams, default_rates
 from gcs_plugin.fleet.routes import Route
+from gcs_plugin.fleet.separation_watch import SeparationWatch, near_text
 from gcs_plugin.fleet.telemetry_check import has_place, possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link, Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
-from gcs_plugin.mission.control import CheckMission, InOrder
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, NEVER, Address, Exchange, Verdict
+from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.upload import MissionUpload
@@ -63,7 +64,8 @@ class Fleet:
     Attributes:
         vehicles: by system id, lost ones included.
         own: our address.
-        hub: the links.
+        hub: the links. signed: whether it has a key.
+        separation: watches how near vehicles in the air come.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class Fleet:
         Raises:
             InputError: a link cannot be opened.
         """
-        self.own, self.vehicles = own, dict[int, Vehicle]()
+        self.own, self.vehicles, self.signed = own, dict[int, Vehicle](), key is not None
         self.hub = Hub(links, own, self._packet, key=key, tlog=tlog, clock=clock, wall=wall)
         self._clock, self._wall = clock, wall
         self._rates = rates or default_rates()
@@ -102,7 +104,8 @@ class Fleet:
         self._taps: list[Callable[[Packet, float], None]] = []
         self._counters: dict[tuple[Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
-        self._jobs: list[Exchange] = []
+        self._dialogues = Dialogues(self.vehicles, self.hub, clock, signed=self.signed)
+        self.separation = SeparationWatch()
         self._remembered = dict(remembered or {})
         self._tick_at = 0.0
         self._thread: int | None = None
@@ -139,9 +142,7 @@ class Fleet:
 
     def begin(self, dialogue: Dialogue) -> Dialogue:
         """Start a dialogue; its outcome is set some time later while the fleet is polled."""
-        self._jobs.append(dialogue)
-        self._drive(dialogue, dialogue.start(self._clock()))
-        self._reap()
+        self._dialogues.begin(dialogue)
         return dialogue
 
     def order(self, order: Order) -> Order:
@@ -226,7 +227,7 @@ class Fleet:
 
     def busy(self, system: int) -> bool:
         """True while a dialogue with a vehicle is under way."""
-        return any(job.vehicle.system == system for job in self._jobs)
+        return self._dialogues.busy(system)
 
     def _free(self, system: int) -> Vehicle:
         vehicle = self.vehicle(system)
@@ -260,7 +261,7 @@ class Fleet:
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
         if verb == "pause" and sure and not vehicle.armed:
             raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
-        self._make_way(system)
+        self._dialogues.make_way(system)
         if verb == "resume":
             return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
         return {"pause": vehicle.pilot.pause, "rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
@@ -272,24 +273,13 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
         return vehicle
 
-    def _make_way(self, system: int) -> None:
-        """End a command under way for one that comes after it (an upload may go on)."""
-        for job in self._jobs:
-            if job.vehicle.system == system and not isinstance(job, (MissionUpload, MissionDownload)):
-                job.cancel("another command came in between")
-        self._reap()
-
     # --- the loop ---
 
     def poll(self, timeout_s: float = 0.1) -> None:
         """Wait at most so long for input, handle all there is, and do what time asks for."""
-        jobs = min((job.deadline for job in self._jobs), default=NEVER)
-        self.hub.poll(min(timeout_s, min(self._tick_at, jobs) - self._clock()))
+        self.hub.poll(min(timeout_s, min(self._tick_at, self._dialogues.deadline) - self._clock()))
         now = self._clock()
-        for job in list(self._jobs):
-            if now >= job.deadline:
-                self._drive(job, job.tick(now))
-        self._reap()
+        self._dialogues.tick(now)
         if now >= self._tick_at:
             self._tick_at = now + _TICK_S
             self._tick(now)
@@ -299,7 +289,7 @@ class Fleet:
         self._thread = threading.get_ident()
         while not stop.is_set():
             self.poll(0.5)
-            if not self._jobs:
+            if not self._dialogues.jobs:
                 time.sleep(_BATCH_S)
         self._thread = None
 
@@ -386,7 +376,7 @@ class Fleet:
     def _taken_over(self, vehicle: Vehicle, now: float) -> None:
         if vehicle.route is not None:
             self._event("link", vehicle, f"is commanded over {vehicle.route.address} from now on")
-        self._send(vehicle.system, vehicle.streams.start(now))
+        self._dialogues.send(vehicle.system, vehicle.streams.start(now))
 
     def _autopilot_says(
         self, vehicle: Vehicle, route: Route, kind: int, message: Message, now: float, stale: bool
@@ -395,7 +385,7 @@ class Fleet:
             if vehicle.lost:
                 vehicle.lost = False
                 self._event("regained", vehicle, "is heard again")
-            self._send(vehicle.system, vehicle.streams.start(now))
+            self._dialogues.send(vehicle.system, vehicle.streams.start(now))
         if kind in _BOOT_CLOCKS:
             self._watch_clock(vehicle, route, message.time_boot_ms / 1e3, now)
         if stale:
@@ -403,16 +393,12 @@ class Fleet:
         vehicle.streams.seen(kind, now)
         vehicle.update(message)
         if kind == _ACK:
-            self._send(vehicle.system, vehicle.streams.acknowledged(message, now))
+            self._dialogues.send(vehicle.system, vehicle.streams.acknowledged(message, now))
         elif kind == _TEXT:
             self._text(vehicle, route, str(message.text).strip("\x00\t "), now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self.own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
-        if self._jobs:
-            for job in list(self._jobs):
-                if job.vehicle == vehicle.address and job.outcome is None:
-                    self._drive(job, job.feed(message, now))
-            self._reap()
+        self._dialogues.feed(vehicle, message, now)
 
     def _text(self, vehicle: Vehicle, route: Route, text: str, now: float) -> None:
         """Pass a text on once, though it comes on two links."""
@@ -451,33 +437,40 @@ class Fleet:
             self._event("rebooted", vehicle, "has restarted")
             vehicle.mission = None
             self._mission_events(vehicle, vehicle.detector.rebooted())
-            self._send(vehicle.system, vehicle.streams.start(now))
-            for job in list(self._jobs):
-                if job.vehicle == vehicle.address and job.outcome is None:
-                    self._drive(job, job.rebooted(now))
+            self._dialogues.send(vehicle.system, vehicle.streams.start(now))
+            self._dialogues.rebooted(vehicle, now)
 
     def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
         for event in events:
             kind, text = mission_event(event)
             self._event(kind, vehicle, text)
 
-    def _event(self, kind: str, vehicle: Vehicle, text: str) -> None:
-        event = FleetEvent(kind, vehicle.system, self._wall(), f"vehicle {vehicle.system} {text}")
+    def _event(self, kind: str, vehicle: Vehicle, text: str, *, named: bool = False) -> None:
+        words = text if named else f"vehicle {vehicle.system} {text}"
+        event = FleetEvent(kind, vehicle.system, self._wall(), words)
         for listener in self._listeners:
             listener(event)
 
     # --- time ---
 
     def _tick(self, now: float) -> None:
+        self._watch_separation(now)
         for vehicle in self.vehicles.values():
             if vehicle.lost:
                 continue
-            self._send(vehicle.system, vehicle.streams.tick(now))
+            self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
             if now - vehicle.heard > _LOST_S:
                 vehicle.lost = True
                 self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
             if len(vehicle.routes.known) > 1 or vehicle.claimants:
                 self._compare_routes(vehicle, now)
+
+    def _watch_separation(self, now: float) -> None:
+        new, ended = self.separation.look(self.vehicles.values(), now)
+        for near in new:
+            self._event("near", self.vehicles[near.other], near_text(near, self.separation), named=True)
+        for one, other in ended:
+            self._event("apart", self.vehicles[other], f"v{one} and v{other} are apart again", named=True)
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Is it one vehicle on two links, or several vehicles with one system id? Their clocks tell."""
@@ -491,52 +484,3 @@ class Fleet:
             self._event("single", vehicle, "is one vehicle again")
         for route in vehicle.routes.unasked(now):
             self.hub.send(route.side, route.peer, vehicle.streams.ask_clock())
-
-    def _reap(self) -> None:
-        """Take out the dialogues that have ended, and remember what they have shown."""
-        for job in self._jobs:
-            self._note_mission(job)
-        if any(job.outcome is not None for job in self._jobs):
-            self._jobs = [job for job in self._jobs if job.outcome is None]
-
-    def _note_mission(self, job: Exchange) -> None:
-        vehicle = self.vehicles.get(job.vehicle.system)
-        if vehicle is None:
-            return
-        if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
-            vehicle.mission = job.mission
-            vehicle.detector.uploaded(job.mission)
-            return
-        mission = None
-        if isinstance(job, MissionDownload) and job.items is not None:
-            mission = Mission(vehicle.autopilot, tuple(job.items))
-        elif isinstance(job, InOrder) and isinstance(job.steps[0], CheckMission):
-            mission = job.steps[0].mission
-        if mission is not None and (vehicle.mission != mission or not vehicle.detector.knows):
-            vehicle.mission = mission
-            vehicle.detector.knows_mission(mission)
-
-    def _drive(self, job: Exchange, messages: Sequence[Message]) -> None:
-        """Send what a dialogue wants sent, and let it know what a link took.
-
-        A command that is repeated, and any to a vehicle that is lost or has several claimants, goes on every way.
-        """
-        for message in messages:
-            vehicle = self.vehicles[job.vehicle.system]
-            again = bool(getattr(message, "confirmation", 0))
-            everywhere = again or vehicle.lost or bool(vehicle.claimants)
-            if self._send(vehicle.system, [message], everywhere=everywhere, expires=job.expires):
-                job.took()
-
-    def _send(
-        self, system: int, messages: Sequence[Message], *, everywhere: bool = False, expires: float = NEVER
-    ) -> bool:
-        """Send to a vehicle; whether a link took it."""
-        vehicle = self.vehicles.get(system)
-        if vehicle is None or not messages:
-            return False
-        taken = False
-        for route in vehicle.routes.towards(self._clock(), everywhere=everywhere):
-            for message in messages:
-                taken |= self.hub.send(route.side, route.peer, message, expires)
-        return taken

@@ -19,8 +19,9 @@ class FleetEvent:
     """Something that happened to a vehicle.
 
     Attributes:
-        kind: `found`, `lost`, `regained`, `rebooted`, `conflict`, `text`, or a mission's `started`, `suspended`,
-            `resumed`, `complete`, `aborted`.
+        kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
+            with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `text`,
+            or a mission's `started`, `suspended`, `resumed`, `complete`, `aborted`.
         system: system id.
         time_s: UTC epoch seconds.
         text: one sentence.

@@ -39,6 +39,7 @@ class Vehicle:
         signs: True once it was heard to sign its messages.
         heard: when it was heard last (the fleet's clock).
         lat_deg: latitude, None before the first position; lon_deg: longitude.
+        reported: True once it has sent a position message, if only to say that it has no position.
         alt_m: above sea level; height_m: above takeoff.
         velocity_m_s: north, east, down. heading_rad: clockwise from north, None if it does not know.
         roll_rad: attitude of the airframe, with pitch_rad and yaw_rad.
@@ -51,6 +52,7 @@ class Vehicle:
         ekf_ok: whether its filter has an absolute position; None where it does not say.
         prearm_ok: whether its own checks before arming have passed; None where it does not say.
         home: latitude and longitude of its home in degrees, None before it is set.
+        launch: where it armed last, latitude and longitude in degrees.
     """
 
     address: Address
@@ -67,6 +69,7 @@ class Vehicle:
     kind: int = 0
     lat_deg: float | None = None
     lon_deg: float | None = None
+    reported: bool = False
     alt_m: float = 0.0
     height_m: float = 0.0
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -91,6 +94,7 @@ class Vehicle:
     ekf_ok: bool | None = None
     prearm_ok: bool | None = None
     home: tuple[float, float] | None = None
+    launch: tuple[float, float] | None = None
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None
@@ -194,13 +198,16 @@ class Vehicle:
     # --- one method for each message ---
 
     def _heartbeat(self, m: Message) -> None:
-        self.armed = bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        was, self.armed = self.armed, bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+        if self.armed and not was and self.lat_deg is not None and self.lon_deg is not None and not self.in_air:
+            self.launch = self.lat_deg, self.lon_deg
         self.custom_mode = int(m.custom_mode)
         if m.type != self.kind:
             self.kind = int(m.type)
             self.modes = modes_of(self.autopilot, self.kind)
 
     def _position(self, m: Message) -> None:
+        self.reported = True
         self.lat_deg, self.lon_deg = (m.lat / 1e7, m.lon / 1e7) if has_place(m) else (None, None)
         self.alt_m, self.height_m = m.alt / 1e3, m.relative_alt / 1e3
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)

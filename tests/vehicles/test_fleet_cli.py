@@ -7,13 +7,12 @@ import time
 
 import pytest
 
-from gcs_plugin.backends.backend import late_start
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.fleet import parse_systems, read_plan_folder
+from gcs_plugin.cli.verbs.fleet import parse_systems
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission import mission_files
-from gcs_plugin.mission.exchange import Outcome
+from gcs_plugin.mission.plan_folder import read_plan_folder
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError
 from tests.vehicles.test_mission_builder import make_plan
@@ -90,7 +89,10 @@ def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plan
     assert fleet(capsys, "upload", other, "--vehicle", "2", "--link", swarm)[0] == 0
     code, said = fleet(capsys, "start", "--plan", folder, "--link", swarm, "--json")
     assert code == 1 and not any(v["ok"] for v in said["vehicles"])
-    assert "does not hold v2.plan" in said["vehicles"][1]["text"] and "its height is 61" in said["vehicles"][1]["text"]
+    assert (
+        "does not hold this plan's mission" in said["vehicles"][1]["text"]
+        and "its height is 61" in said["vehicles"][1]["text"]
+    )
     code, listed = fleet(capsys, "list", "--link", swarm, "--json")
     assert not any(v["armed"] for v in listed["vehicles"])
 
@@ -123,7 +125,9 @@ def test_mavsdk_flies_them_too(swarm, folder, capsys):
     both = ("--vehicle", "1,2", "--link", swarm, "--backend", "mavsdk", "--json")
     code, uploaded = fleet(capsys, "upload", folder, *both)
     assert code == 0 and all(v["ok"] for v in uploaded["vehicles"]), uploaded
-    code, flown = fleet(capsys, "start", "--watch", "--seconds", 60, *both)
+    code, refused = fleet(capsys, "start", *both)
+    assert code == 1 and "separation: comes within" in refused["vehicles"][0]["text"]  # one path, at one time
+    code, flown = fleet(capsys, "start", "--watch", "--seconds", 60, "--override", "separation", *both)
     assert code == 0, flown
     assert sorted(e["vehicle"] for e in flown["events"] if e["kind"] == "complete") == ["v1", "v2"]
 
@@ -224,9 +228,3 @@ def test_simulated_vehicles_end_by_themselves(capsys):
 def test_impossible_simulations_are_refused(words, capsys):
     assert main(["sim", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_start_that_came_too_late_for_its_plan_says_so():
-    flies = Outcome(True, "vehicle 2 flies its mission")
-    assert late_start(flies, 4.0) == flies
-    assert "12 s later than planned" in late_start(flies, 12.0).text and late_start(flies, 12.0).ok

@@ -7,10 +7,13 @@ takes off, flies two legs of 40 m near where it stands, and ends as the scenario
 import math
 import os
 import time
+from pathlib import Path
 
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.flight_state import flight_state
+from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import Link, parse_link
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, LOITER_UNLIM, RTL, TAKEOFF, TRIGGER_DISTANCE, WAYPOINT
@@ -50,10 +53,11 @@ class LossyLink(Link):
     def polled(self):
         return self  # late packets are due without new ones coming
 
-    def send(self, peer, data):
+    def send(self, peer, data, expires=math.inf):
         now = time.monotonic()
         self.up.put((peer, data), now)
         self.up.drain(now, lambda cargo: self.link.send(*cargo))
+        return True
 
     def receive(self, source, events, now):
         if source is not self:
@@ -99,7 +103,8 @@ class Real:
         if not ADDRESSES:
             pytest.skip("ORTHOSWARM_SITL names no autopilot")
         link = parse_link(address)
-        self.fleet = Fleet([LossyLink(link, *faults) if faults else link])
+        log = os.environ.get("ORTHOSWARM_SITL_TLOG")  # a file that keeps what the autopilots said
+        self.fleet = Fleet([LossyLink(link, *faults) if faults else link], tlog=Path(log) if log else None)
         self.events = []
         self.fleet.on_event(self.events.append)
         self.close = self.fleet.close
@@ -117,9 +122,30 @@ class Site:
         self.system = min(self.fleet.vehicles)
         self.vehicle = self.fleet.vehicles[self.system]
         assert place.until(lambda: self.vehicle.lat_deg and self.vehicle.landed and self.vehicle.gps_fix >= 3, 120.0)
+        assert place.until(self.ready, 240.0), [item for item in self.check().items if item.level is Level.RED]
         self.home()
         self.chart = Chart(self.vehicle.lat_deg, self.vehicle.lon_deg)
         self.begun = len(place.events)
+
+    def check(self):
+        return preflight(self.vehicle, Wanted(), self.fleet._clock())
+
+    def ready(self):
+        """The autopilot itself has nothing against arming."""
+        return self.vehicle.armed or not {item.name for item in self.check().red()} & {"gps", "ekf", "pre-arm", "link"}
+
+    def follow(self, done, limit_s):
+        """Wait, and note what the vehicle was seen to do meanwhile."""
+        words = []
+
+        def look():
+            word = flight_state(self.vehicle).word.value
+            if words[-1:] != [word]:
+                words.append(word)
+            return done()
+
+        assert self.place.until(look, limit_s), words
+        return words
 
     def home(self):
         """On the ground, disarmed; what an earlier scenario left in the air is brought home."""
@@ -200,11 +226,21 @@ def last_items(site, ending):
 def test_a_flown_mission_completes_exactly_once(make_site, ending):
     site = make_site()
     site.fly(*last_items(site, ending))
-    assert site.place.until(lambda: "complete" in site.kinds(), 300.0)
+    words = site.follow(lambda: "complete" in site.kinds(), 300.0)
     if ending in ("waypoint", "do"):
+        words += site.follow(lambda: site.vehicle.still_s > 3.0, 60.0)
+        assert words[-1] == "holding"
         site.home()
-    assert site.place.until(lambda: not site.vehicle.armed, 300.0)
+    words += site.follow(lambda: not site.vehicle.armed, 300.0)
+    words += site.follow(lambda: site.vehicle.landed == "on ground", 60.0)
     site.place.until(lambda: False, 5.0)
+    assert flight_state(site.vehicle).word.value == "complete"
+    assert "taking off" in words and words.index("taking off") < words.index("on mission"), words
+    expected = {"rtl": ["returning", "landing"], "land": ["landing"]}.get(ending, [])
+    assert [word for word in dict.fromkeys(words) if word in ("returning", "landing")][: len(expected)] == expected, (
+        words
+    )
+    assert "paused" not in words and "lost" not in words, words
     assert site.kinds().count("complete") == 1
     assert "aborted" not in site.kinds()
     assert site.kinds()[0] == "started"
@@ -236,6 +272,7 @@ def test_pause_and_resume(make_site):
     site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 100.0)
     assert site.finish(site.fleet.pause(site.system)).ok
     site.place.until(lambda: False, 12.0)
+    assert flight_state(site.vehicle).word.value == "paused"
     assert math.hypot(*site.vehicle.velocity_m_s[:2]) < 0.5
     assert site.finish(site.fleet.resume(site.system)).ok
     assert site.place.until(lambda: "complete" in site.kinds(), 300.0)
@@ -279,7 +316,7 @@ def test_a_mission_that_is_refused_names_the_item_and_leaves_no_success(make_sit
 
 def test_a_vehicle_without_a_mission_is_not_armed_by_start(make_site):
     site = make_site()
-    site.fleet._send(site.system, [dialect.MAVLink_mission_clear_all_message(site.system, 1, 0)])
+    site.fleet._dialogues.send(site.system, [dialect.MAVLink_mission_clear_all_message(site.system, 1, 0)])
     site.place.until(lambda: False, 3.0)
     site.vehicle.mission = None
     outcome = site.finish(site.fleet.start(site.system))

@@ -125,7 +125,7 @@ def test_the_stale_state_after_clear_and_upload_is_no_completion(autopilot):
     world = airborne(autopilot, *ENDINGS["rtl"], legs=1)
     completed(world)
     world.until(lambda: not world.fleet.vehicles[1].armed)
-    world.fleet._send(1, [dialect.MAVLink_mission_clear_all_message(1, 1, 0)])
+    world.fleet._dialogues.send(1, [dialect.MAVLink_mission_clear_all_message(1, 1, 0)])
     world.wait(2.0)
     assert world.finish(world.fleet.upload(1, mission(autopilot, *ENDINGS["rtl"])))[0].ok
     world.wait(5.0)

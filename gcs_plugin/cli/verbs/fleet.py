@@ -1,21 +1,27 @@
-"""`orthoswarm fleet`: the vehicles on the links - list them, upload missions, start, pause, resume, RTL, watch."""
+"""`orthoswarm fleet`: the vehicles on the links: list, upload missions, check, start, pause, resume, RTL, land."""
 
 import argparse
 import json
 import re
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gcs_plugin.mission.plan_folder import number_in, read_plan_folder
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
     from gcs_plugin.backends import Backend
     from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.mission.exchange import Outcome
+    from gcs_plugin.mission.items import Mission
+    from gcs_plugin.mission.track import Airspace
 
 _WAIT_S = 8.0
+_LEGAL_HEIGHT_M = 120.0
+_PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that pass with time
 _DEFAULT_LINK = "udpin:0.0.0.0:14550"
 _VERBS = {
     "list": "show the vehicles",
@@ -24,6 +30,8 @@ _VERBS = {
     "pause": "let vehicles stay where they are",
     "resume": "let vehicles go on with their missions",
     "rtl": "let vehicles fly home and land",
+    "land": "let vehicles land where they are",
+    "check": "check vehicles before their start",
     "watch": "follow missions until each has ended",
 }
 _EXAMPLES = {
@@ -39,6 +47,8 @@ _EXAMPLES = {
     "pause": "orthoswarm fleet pause --vehicle 3 --link udpin:0.0.0.0:14550",
     "resume": "orthoswarm fleet resume --vehicle 3 --link udpin:0.0.0.0:14550",
     "rtl": "orthoswarm fleet rtl --link udpin:0.0.0.0:14550",
+    "land": "orthoswarm fleet land --vehicle 3 --link udpin:0.0.0.0:14550",
+    "check": "orthoswarm fleet check --plan missions --link udpin:0.0.0.0:14550",
     "watch": "orthoswarm fleet watch --link udpin:0.0.0.0:14550 --seconds 1800",
 }
 
@@ -47,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
         "A link is udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, or serial:DEVICE:BAUD; give --link\n"
-        f"again for more; without one, {_DEFAULT_LINK}. Nothing moves a vehicle but start, resume and rtl.\n\n"
+        f"again for more; without one, {_DEFAULT_LINK}. Nothing moves a vehicle but start, resume, rtl\nand land.\n\n"
         f"example:\n  {_EXAMPLES['list']}"
     )
     verbs = parser.add_subparsers(dest="action", required=True, metavar="VERB")
@@ -69,14 +79,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
                 help="folder of a plan, or .plan or .waypoints files",
             )
             verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of a plan (default 1)")
+        if name in ("start", "check"):
+            _start_arguments(verb)
         if name == "start":
-            verb.add_argument("--plan", type=Path, metavar="DIR", help="folder of a plan: its vehicles, at its times")
-            verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of the plan (default 1)")
             verb.add_argument("--watch", action="store_true", help="follow the missions until each has ended")
+            verb.add_argument(
+                "--ready", type=float, default=60.0, metavar="S",
+                help="wait at most so long until all vehicles' own checks pass (default 60)",
+            )  # fmt: skip
+            verb.add_argument(
+                "--override", action="append", default=[], metavar="ITEM",
+                help="start in spite of a red item of the check: battery, or v3:battery for one vehicle",
+            )  # fmt: skip
         if name in ("start", "watch"):
             verb.add_argument(
                 "--seconds", type=float, default=7200.0, metavar="S", help="follow at most so long (default 7200)"
             )
+
+
+def _start_arguments(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--plan", type=Path, metavar="DIR", help="folder of a plan: its vehicles, at its times")
+    verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of the plan (default 1)")
+    verb.add_argument(
+        "--max-height", type=float, default=_LEGAL_HEIGHT_M, metavar="M",
+        help=f"height above takeoff that may be flown (default {_LEGAL_HEIGHT_M:g}, the usual legal limit)",
+    )  # fmt: skip
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
@@ -110,7 +137,11 @@ def run(args: argparse.Namespace) -> int:
 
     if not 1 <= args.gcs_system <= 255:
         raise InputError(f"our system id cannot be {args.gcs_system}; give 1 to 255")
-    for name, value in (("--wait", args.wait), ("--seconds", getattr(args, "seconds", 0.0))):
+    for name, value in (
+        ("--wait", args.wait),
+        ("--seconds", getattr(args, "seconds", 0.0)),
+        ("--ready", getattr(args, "ready", 0.0)),
+    ):
         if not value >= 0.0:
             raise InputError(f"{name} {value:g} is no time; give seconds, 0 or more")
     systems = parse_systems(args.vehicle)
@@ -126,7 +157,7 @@ def run(args: argparse.Namespace) -> int:
         found = backend.discover(args.wait, prepared.systems)
         if not found or (prepared.systems and not set(prepared.systems) & set(found)):
             return _nobody(backend, args, prepared.systems, found)
-        actions = {"list": _list, "upload": _upload, "watch": _watch}
+        actions = {"list": _list, "upload": _upload, "watch": _watch, "check": _check}
         return actions.get(args.action, _command)(backend, args, prepared, found)
     finally:
         backend.close()
@@ -148,7 +179,7 @@ class _Prepared:
         self.delays: dict[int, float] = {}
         if args.action == "upload":
             self._missions(args.missions, args.sortie)
-        if args.action == "start" and args.plan is not None:
+        if args.action in ("start", "check") and args.plan is not None:
             self._times(args.plan, args.sortie)
 
     def _missions(self, paths: Sequence[Path], sortie: int) -> None:
@@ -159,7 +190,7 @@ class _Prepared:
                 named |= {system: file for system, (file, _) in read_plan_folder(path, sortie).items()}
             elif not path.exists():
                 raise InputError(f"{path} does not exist; give a folder made by 'orthoswarm plan', or a mission file")
-            elif (number := _number_in(path)) is not None and not (self.systems and len(paths) == 1):
+            elif (number := number_in(path)) is not None and not (self.systems and len(paths) == 1):
                 named[number] = path
             else:
                 loose.append(path)
@@ -210,53 +241,6 @@ def parse_systems(texts: Sequence[str]) -> list[int]:
     return sorted(set(systems))
 
 
-def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]:
-    """Mission file and takeoff time (seconds after the swarm's start) for each vehicle of a plan's folder.
-
-    Args:
-        folder: as `orthoswarm plan` writes it; without its report, files named v1.plan or v1.waypoints and so on.
-        sortie: which flight, from 1; vehicles with fewer flights stay away.
-
-    Raises:
-        InputError: there is no such plan or flight.
-    """
-    report = folder / "plan.json"
-    flights: dict[int, tuple[Path, float]] = {}
-    most = 1
-    try:
-        document = json.loads(report.read_text(encoding="utf-8")) if report.exists() else None
-        for vehicle in document["vehicles"] if document else []:
-            most = max(most, len(vehicle["flights"]))
-            if sortie <= len(vehicle["flights"]):
-                flight = vehicle["flights"][sortie - 1]
-                flights[int(str(vehicle["id"]).removeprefix("v"))] = (
-                    folder / flight["files"][0],
-                    float(flight["start_s"]),
-                )
-    except (OSError, ValueError, KeyError, TypeError, IndexError):
-        raise InputError(
-            f"{report} is no report of a plan; plan again with: orthoswarm plan ... --out {folder}"
-        ) from None
-    if document is None:
-        for path in sorted(folder.glob("*")):
-            number = _number_in(path)
-            if number is not None and (number not in flights or path.suffix == ".plan"):
-                flights[number] = (path, 0.0)
-    if sortie < 1 or not flights:
-        why = (
-            f"has no sortie {sortie} (there are {most})"
-            if document
-            else "holds no missions named v1.plan, v2.plan, ..."
-        )
-        raise InputError(f"{folder} {why}; plan with: orthoswarm plan ... --out {folder}")
-    return flights
-
-
-def _number_in(path: Path) -> int | None:
-    match = re.fullmatch(r"v(\d{1,3})(?:-sortie1)?", path.stem)
-    return int(match[1]) if match and path.suffix in (".plan", ".waypoints") else None
-
-
 # --- actions ---
 
 
@@ -269,19 +253,20 @@ def _list(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fou
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
-    several = len({v["link"] for v in vehicles}) > 1
-    columns = ["vehicle", "autopilot", "state", "mode", "armed", "height", "battery", "GPS", "mission"]
-    for column in [*columns, *(["link"] if several else [])]:
+    for column in ("vehicle", "autopilot", "doing", "mode", "height", "batt.", "GPS", "mission"):
         table.add_column(column, no_wrap=True)
     for v in vehicles:
-        mission = v["mission"]
+        items = v["mission"]["items"]
         battery = "" if v["battery"] is None else f"{100 * v['battery']:.0f} %"
-        progress = f"{mission['phase']} {mission['item']}/{mission['items']}" if mission["items"] else "none"
+        armed = ", armed" if v["armed"] and v["flight"]["state"] == "on ground" else ""
         table.add_row(
-            v["id"], v["autopilot"], v["state"], v["mode"], "armed" if v["armed"] else "", f"{v['height_m']:.1f} m",
-            battery, str(v["satellites"] or ""), progress, *([v["link"]] if several else []),
+            v["id"], v["autopilot"], v["flight"]["text"] + armed, v["mode"], f"{v['height_m']:.1f} m", battery,
+            str(v["satellites"] or ""), f"{items} items" if items else "none",
         )  # fmt: skip
     Console().print(table)
+    if len({link for v in vehicles for link in v["links"]}) > 1:
+        for v in vehicles:
+            print(f"{v['id']} on {', '.join(v['links']) or v['link']}")
     for problem in backend.problems():
         print(f"orthoswarm: {problem}", file=sys.stderr)
     return 0
@@ -308,7 +293,8 @@ def _upload(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, f
 
 
 def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
-    from gcs_plugin.mission.exchange import Outcome
+    from gcs_plugin.fleet.commands import Order
+    from gcs_plugin.mission.exchange import Verdict
 
     systems = prepared.systems or found
     missing = [s for s in systems if s not in found]
@@ -318,47 +304,100 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
             f"vehicle {names} was not heard, so nobody was started; check its link, or leave it out with --vehicle"
         )
     heard = [s for s in systems if s in found]
-    if args.action == "start" and prepared.files:
-        if unlike := _unlike_plan(backend, {s: prepared.files[s] for s in heard}):
-            return _report(args, unlike, {})
-    elif args.action == "start" and len(heard) > 1:
-        print(
-            f"starting {len(heard)} vehicles at once; missions of one plan keep apart only at the plan's times: "
-            "start those with --plan DIR",
-            file=sys.stderr,
-        )
+    airspace = None
+    if args.action == "start":
+        checked = _ready(backend, args, prepared, heard)
+        if isinstance(checked, dict):
+            return _report(args, checked, {})
+        airspace = checked
+    given = time.monotonic()
+    text = "was not heard; check its link and system id"
+    orders = {s: Order(args.action, s, given).end(f"vehicle {s} {text}", Verdict.NOT_SENT) for s in missing}
+    for order in orders.values():
+        _say(args, order.outcome.text if order.outcome else "")
     delays = {s: prepared.delays.get(s, 0.0) for s in heard}
-    outcomes = {s: Outcome(False, f"vehicle {s} was not heard; check its link and system id") for s in missing}
-    outcomes |= _with_bar(lambda report: backend.command(args.action, delays, report))
+    orders |= backend.command(args.action, delays, lambda line: _say(args, line), airspace)
+    outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
     followed = [s for s, outcome in outcomes.items() if outcome.ok]
     if args.action == "start" and args.watch and followed:
-        for text in (outcome.text for outcome in outcomes.values()):
-            print(text, file=sys.stderr)
         return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()))
-    return _report(args, outcomes, {})
+    ids = {s: {"command": order.verb, "command_id": order.id} for s, order in orders.items()}
+    return _report(args, outcomes, ids, said=True)
 
 
-def _unlike_plan(backend: "Backend", files: dict[int, Path]) -> "dict[int, Outcome]":
-    """Does each vehicle hold its mission of the plan? Empty if all do; else how it stands with each of them.
+def _say(args: argparse.Namespace, text: str) -> None:
+    """A line of progress, as it happens; stdout is for results where it is to be JSON."""
+    print(text, file=sys.stderr if args.json else sys.stdout, flush=True)
 
-    A broken upload leaves a mixture in ArduPilot, and an earlier plan's mission has other times and heights.
-    """
-    from gcs_plugin.mission.comparison import difference
-    from gcs_plugin.mission.exchange import Outcome
+
+def _ready(
+    backend: "Backend", args: argparse.Namespace, prepared: _Prepared, systems: list[int]
+) -> "Airspace | dict[int, Outcome]":
+    """Wait until all vehicles have passed their check; what they will fly, or why nobody was started."""
+    from gcs_plugin.fleet.preflight import ITEMS, red_text
+    from gcs_plugin.mission.exchange import Outcome, Verdict
+    from gcs_plugin.mission.track import Airspace
+
+    allowed = _overrides(args.override, systems, ITEMS)
+    missions, stored, starts = _missions(backend, prepared, systems)
+    end, said = time.monotonic() + args.ready, ""
+    while True:
+        checks = backend.check(systems, missions, stored, starts, args.max_height)
+        red = red_text(checks, allowed)
+        waits = all(item.name in _PASSING for check in checks for item in check.red(allowed.get(check.system, ())))
+        if not red or not waits or time.monotonic() >= end:
+            break
+        text = "; ".join(f"v{system} {why}" for system, why in sorted(red.items()))
+        if text != said:
+            said = text
+            _say(args, f"waiting: {text}")
+        backend.pump(0.5)
+    if red:
+        others = "was not started, because others are not ready"
+        return {
+            s: Outcome(False, f"vehicle {s} {'was not started: ' + red[s] if s in red else others}", failure=failure)
+            for s in systems
+            for failure in (Verdict.REFUSED if s in red else Verdict.NOT_SENT,)
+        }
+    return Airspace.of({s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None})
+
+
+def _missions(
+    backend: "Backend", prepared: _Prepared, systems: list[int]
+) -> "tuple[dict[int, Mission], dict[int, Mission], dict[int, float]]":
+    """The plan's missions, what the vehicles hold, and the plan's takeoffs."""
     from gcs_plugin.mission.mission_builder import read_mission
 
-    missions = {s: read_mission(path, backend.autopilot(s)) for s, path in files.items()}
-    stored = _with_bar(lambda report: backend.stored(list(missions), report))
-    wrong: dict[int, str] = {}
-    for system, mission in missions.items():
-        held = stored[system]
-        found = difference(mission, held.items) if held is not None else None
-        if held is None:
-            wrong[system] = "does not hand out its mission; check the link"
-        elif found is not None:
-            wrong[system] = f"does not hold {mission.name} ({found.text}); upload the plan first"
-    others = "was not started, because others do not hold this plan"
-    return {s: Outcome(False, f"vehicle {s} {wrong.get(s, others)}") for s in missions} if wrong else {}
+    missions = {s: read_mission(prepared.files[s], backend.autopilot(s)) for s in systems if s in prepared.files}
+    stored = _with_bar(lambda report: backend.stored(systems, report))
+    held = {s: mission for s, mission in stored.items() if mission is not None}
+    return missions, held, {s: prepared.delays.get(s, 0.0) for s in systems}
+
+
+def _overrides(texts: Sequence[str], systems: Sequence[int], items: Sequence[str]) -> dict[int, set[str]]:
+    """The items that do not stop a start, by vehicle."""
+    allowed: dict[int, set[str]] = {system: set() for system in systems}
+    for text in texts:
+        who, _, item = text.rpartition(":")
+        if item not in items:
+            raise InputError(f"'{text}' names no item of the check; choose from {', '.join(items)}")
+        for system in parse_systems([who]) if who else systems:
+            allowed.setdefault(system, set()).add(item)
+    return allowed
+
+
+def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
+    """Show the check of each vehicle; 0 if none has a red item."""
+    systems = [s for s in prepared.systems or found if s in found]
+    missions, stored, starts = _missions(backend, prepared, systems)
+    checks = backend.check(systems, missions, stored, starts, args.max_height)
+    if args.json:
+        print(json.dumps({"vehicles": [check.document(f"v{check.system}") for check in checks]}))
+    else:
+        for check in checks:
+            for item in check.items:
+                print(f"v{check.system}  {item.level.value:<8} {item.name:<11} {item.reason}")
+    return 0 if not any(check.red() for check in checks) else 1
 
 
 def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
@@ -384,15 +423,20 @@ def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], go
     return 0 if good and ended and complete >= set(systems) else 1
 
 
-def _report(args: argparse.Namespace, outcomes: "dict[int, Outcome]", more: dict[int, dict[str, Any]]) -> int:
-    """Say how it went for each vehicle; 0 if well for all."""
+def _report(
+    args: argparse.Namespace, outcomes: "dict[int, Outcome]", more: dict[int, dict[str, Any]], *, said: bool = False
+) -> int:
+    """Say how it went for each vehicle, unless that was said as it happened; 0 if well for all."""
     if args.json:
         rows = [
-            {"id": f"v{s}", "system": s, "ok": outcome.ok, "text": outcome.text, **_refusal(outcome), **more.get(s, {})}
+            {
+                "id": f"v{s}", "system": s, "ok": outcome.ok, "outcome": outcome.verdict.value, "text": outcome.text,
+                **_refusal(outcome), **more.get(s, {}),
+            }
             for s, outcome in sorted(outcomes.items())
-        ]
+        ]  # fmt: skip
         print(json.dumps({"vehicles": rows}))
-    else:
+    elif not said:
         for _, outcome in sorted(outcomes.items()):
             print(outcome.text, file=sys.stdout if outcome.ok else sys.stderr)
     return 0 if outcomes and all(outcome.ok for outcome in outcomes.values()) else 1

@@ -1,0 +1,146 @@
+"""The dialogues with vehicles that are under way: they are driven here, and what they show is remembered."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from gcs_plugin.mission.control import CheckMission, InOrder
+from gcs_plugin.mission.download import MissionDownload
+from gcs_plugin.mission.exchange import NEVER, Verdict
+from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.upload import MissionUpload
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.link_hub import Hub
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.links.mavlink import Message
+    from gcs_plugin.mission.exchange import Exchange
+
+_ON_THE_WAY_S = 1.0
+
+
+class Dialogues:
+    """All dialogues of a fleet.
+
+    Args:
+        vehicles: by system id. hub: the links. clock: monotonic seconds. signed: whether this station has a key.
+
+    Attributes:
+        jobs: those under way.
+    """
+
+    def __init__(
+        self, vehicles: "Mapping[int, Vehicle]", hub: "Hub", clock: Callable[[], float], *, signed: bool
+    ) -> None:
+        self._vehicles, self._hub, self._clock, self._signed = vehicles, hub, clock, signed
+        self.jobs: list[Exchange] = []
+
+    @property
+    def deadline(self) -> float:
+        """When the next of them wants to be driven."""
+        return min((job.deadline for job in self.jobs), default=NEVER)
+
+    def begin(self, job: "Exchange") -> None:
+        """Start one."""
+        self.jobs.append(job)
+        self._drive(job, job.start(self._clock()))
+        self._reap()
+
+    def busy(self, system: int) -> bool:
+        """True while one with this vehicle is under way."""
+        return any(job.vehicle.system == system for job in self.jobs)
+
+    def make_way(self, system: int) -> None:
+        """End a command under way for one that comes after it (an upload may go on)."""
+        for job in self.jobs:
+            if job.vehicle.system == system and not isinstance(job, (MissionUpload, MissionDownload)):
+                job.cancel("another command came in between")
+        self._reap()
+
+    def tick(self, now: float) -> None:
+        """Let time pass."""
+        for job in list(self.jobs):
+            if now >= job.deadline:
+                self._drive(job, job.tick(now))
+        self._reap()
+
+    def feed(self, vehicle: "Vehicle", message: "Message", now: float) -> None:
+        """Hand a message of a vehicle's autopilot to the dialogues with it."""
+        if not self.jobs:
+            return
+        for job in list(self.jobs):
+            if job.vehicle == vehicle.address and job.outcome is None:
+                self._drive(job, job.feed(message, now))
+        self._reap()
+
+    def rebooted(self, vehicle: "Vehicle", now: float) -> None:
+        """A vehicle has started anew."""
+        for job in list(self.jobs):
+            if job.vehicle == vehicle.address and job.outcome is None:
+                self._drive(job, job.rebooted(now))
+
+    def send(
+        self, system: int, messages: "Sequence[Message]", *, everywhere: bool = False, expires: float = NEVER
+    ) -> bool:
+        """Send to a vehicle; whether a link took it.
+
+        Args:
+            system: the vehicle. messages: what to send.
+            everywhere: on every way on which it was heard lately, not only on the best.
+            expires: when a message that still waits for its line is thrown away.
+        """
+        vehicle = self._vehicles.get(system)
+        if vehicle is None or not messages:
+            return False
+        taken = False
+        for route in vehicle.routes.towards(self._clock(), everywhere=everywhere):
+            for message in messages:
+                taken |= self._hub.send(route.side, route.peer, message, expires)
+        return taken
+
+    def _drive(self, job: "Exchange", messages: "Sequence[Message]") -> None:
+        """Send what a dialogue wants sent, and let it know what a link took.
+
+        A command that is repeated, and any to a vehicle that is lost or has several claimants, goes on every way.
+        """
+        for message in messages:
+            vehicle = self._vehicles[job.vehicle.system]
+            again = bool(getattr(message, "confirmation", 0))
+            everywhere = again or vehicle.lost or bool(vehicle.claimants)
+            expires = max(job.expires, self._clock() + _ON_THE_WAY_S)
+            if self.send(vehicle.system, [message], everywhere=everywhere, expires=expires):
+                job.took()
+
+    def _reap(self) -> None:
+        """Take out the dialogues that have ended, and remember what they have shown."""
+        for job in self.jobs:
+            self._note_mission(job)
+            self._explain(job)
+        if any(job.outcome is not None for job in self.jobs):
+            self.jobs = [job for job in self.jobs if job.outcome is None]
+
+    def _explain(self, job: "Exchange") -> None:
+        """A vehicle that signs does not hear a station without its key."""
+        outcome, vehicle = job.outcome, self._vehicles.get(job.vehicle.system)
+        if outcome is None or outcome.verdict is not Verdict.UNKNOWN or vehicle is None:
+            return
+        if vehicle.signs and not self._signed:
+            why = f"vehicle {vehicle.system} signs its messages and does not listen to a station without its key"
+            job.outcome = replace(outcome, text=f"{why}; give it with --signing-key")
+
+    def _note_mission(self, job: "Exchange") -> None:
+        vehicle = self._vehicles.get(job.vehicle.system)
+        if vehicle is None:
+            return
+        if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
+            vehicle.mission = job.mission
+            vehicle.detector.uploaded(job.mission)
+            return
+        mission = None
+        if isinstance(job, MissionDownload) and job.items is not None:
+            mission = Mission(vehicle.autopilot, tuple(job.items))
+        elif isinstance(job, InOrder) and isinstance(job.steps[0], CheckMission):
+            mission = job.steps[0].mission
+        if mission is not None and (vehicle.mission != mission or not vehicle.detector.knows):
+            vehicle.mission = mission
+            vehicle.detector.knows_mission(mission)

@@ -1,0 +1,104 @@
+"""Vehicles in the air that come nearer than they should: an alarm with a proposal."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+
+_EARTH_M: Final = 6_378_137.0
+_FRESH_S: Final = 2.0
+_OVER: Final = 1.2
+_PAD: Final = 1.5
+"""Radius about a start that vehicles share, in separation distances: there the plan keeps them apart by time alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """Two vehicles that are too near each other.
+
+    Attributes:
+        one: system id. other: system id of the one that should be paused.
+        metres: horizontal distance. height_m: difference in height.
+    """
+
+    one: int
+    other: int
+    metres: float
+    height_m: float
+
+
+@dataclass(slots=True)
+class SeparationWatch:
+    """Compares the places of vehicles in the air.
+
+    Attributes:
+        distance_m: horizontally, or height_m: vertically, they keep at least so far apart.
+        alarms: pairs that are too near now, by their system ids in order.
+    """
+
+    distance_m: float = 10.0
+    height_m: float = 5.0
+    alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
+
+    def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
+        """Compare all pairs; gives the alarms that are new, and the pairs whose alarm is over."""
+        flying = [v for v in vehicles if v.flying and v.lat_deg is not None and now - v.heard < _FRESH_S]
+        found: dict[tuple[int, int], Near] = {}
+        if len(flying) > 1:
+            shrink = math.cos(math.radians(flying[0].lat_deg or 0.0))
+            places = sorted((v.system, *_metres(v, shrink), v) for v in flying)
+            for index, (one, north, east, first) in enumerate(places):
+                for other, north2, east2, second in places[index + 1 :]:
+                    apart = math.hypot(north - north2, east - east2)
+                    over = _OVER if (one, other) in self.alarms else 1.0
+                    height = abs(first.height_m - second.height_m)
+                    if apart >= over * self.distance_m or height >= over * self.height_m:
+                        continue
+                    if not self._at_start(first, second):
+                        found[one, other] = Near(*_proposal(first, second), apart, height)
+        new = [near for pair, near in found.items() if pair not in self.alarms]
+        ended = [pair for pair in self.alarms if pair not in found]
+        self.alarms = found
+        return new, ended
+
+    def text(self, system: int) -> str:
+        """The alarm of a vehicle in words, empty if there is none."""
+        for near in self.alarms.values():
+            if system in (near.one, near.other):
+                return near_text(near, self)
+        return ""
+
+    def _at_start(self, one: "Vehicle", other: "Vehicle") -> bool:
+        """Both are above a start that they share."""
+        reach = _PAD * self.distance_m
+        if one.launch is None or other.launch is None or _apart(one.launch, other.launch) > reach:
+            return False
+        here = [((v.lat_deg or 0.0, v.lon_deg or 0.0), v.launch) for v in (one, other)]
+        return all(launch is not None and _apart(place, launch) < reach for place, launch in here)
+
+
+def near_text(near: Near, watch: SeparationWatch) -> str:
+    """An alarm in words."""
+    return (
+        f"v{near.one} and v{near.other} are {near.metres:.0f} m apart and {near.height_m:.0f} m in height "
+        f"(they should keep {watch.distance_m:.0f} m, or {watch.height_m:.0f} m in height): pause v{near.other}"
+    )
+
+
+def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
+    """Who goes on, and who should be paused: the faster of the two is the one that comes near."""
+    fast, slow = sorted((one, other), key=lambda v: -math.hypot(*v.velocity_m_s[:2]))
+    return slow.system, fast.system
+
+
+def _metres(vehicle: "Vehicle", shrink: float) -> tuple[float, float]:
+    north = math.radians(vehicle.lat_deg or 0.0) * _EARTH_M
+    return north, math.radians(vehicle.lon_deg or 0.0) * _EARTH_M * shrink
+
+
+def _apart(a: tuple[float, float], b: tuple[float, float]) -> float:
+    east = math.radians(b[1] - a[1]) * math.cos(math.radians(a[0]))
+    return math.hypot(math.radians(b[0] - a[0]), east) * _EARTH_M

@@ -1,0 +1,80 @@
+"""Who takes off when: a plan's times, and what follows where a vehicle cannot keep its own.
+
+Vehicles of one plan share airspace and keep apart by their times. One that does not take off holds those that still
+wait on the ground; one that took off late moves them to the next times that keep every pair apart by the plan's own
+measure (`Airspace`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from gcs_plugin.mission.track import Airspace
+
+LATE_S: Final = 5.0
+"""A takeoff later than this is late: arming and the start take up to three seconds of themselves."""
+_MOVED_S: Final = 0.5
+
+
+@dataclass(slots=True)
+class TakeoffSchedule:
+    """Takeoffs under way.
+
+    Attributes:
+        waiting: when each that waits is to start, on the clock of whoever drives it.
+        flown: when each that flies was started.
+        airspace: their missions; None where they are not known, then times are only kept, not moved.
+    """
+
+    waiting: dict[int, float]
+    airspace: Airspace | None = None
+    flown: dict[int, float] = field(default_factory=dict)
+    _planned: dict[int, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, delays: Mapping[int, float], now: float, airspace: Airspace | None = None) -> "TakeoffSchedule":
+        """Starts so many seconds from now, by system id."""
+        waiting = {system: now + delay for system, delay in delays.items()}
+        return cls(waiting, airspace, {}, dict(waiting))
+
+    def due(self, now: float) -> list[int]:
+        """Those whose time has come; they wait no longer."""
+        ready = sorted((s for s, at in self.waiting.items() if at <= now), key=lambda s: self.waiting[s])
+        for system in ready:
+            del self.waiting[system]
+        return ready
+
+    def next_s(self) -> float | None:
+        """When the next one starts."""
+        return min(self.waiting.values(), default=None)
+
+    def started(self, system: int, now: float) -> list[str]:
+        """One flies its mission; gives what that changes for others, in words."""
+        planned = self._planned.get(system, now)
+        late = now - planned
+        self.flown[system] = now if late > LATE_S else planned
+        if late <= LATE_S:
+            return []
+        said = [f"v{system} took off {late:.0f} s late"]
+        if self.airspace is None:
+            return said
+        for other, _, at, metres in self._met():
+            said.append(f"v{system} will come within {metres:.0f} m of v{other} in {at - now:.0f} s: pause one of them")
+        for waiter in sorted(self.waiting, key=lambda s: self.waiting[s]):
+            others = {**self.flown, **{s: at for s, at in self.waiting.items() if at < self.waiting[waiter]}}
+            start = self.airspace.next_start(waiter, self.waiting[waiter], others)
+            if start > self.waiting[waiter] + _MOVED_S:
+                said.append(
+                    f"v{waiter} takes off {start - self.waiting[waiter]:.0f} s later, to keep apart from others"
+                )
+                self.waiting[waiter] = start
+        return said
+
+    def failed(self, system: int) -> list[int]:
+        """One did not take off; gives those that waited and now stay on the ground."""
+        held = sorted(self.waiting)
+        self.waiting.clear()
+        return held
+
+    def _met(self) -> list[tuple[int, int, float, float]]:
+        return [] if self.airspace is None else self.airspace.conflicts(self.flown)
