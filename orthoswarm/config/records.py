@@ -11,3 +11,26 @@ class RecordsConfig:
     """Horizontal field of view where nothing is known: below that of most drones' cameras (paper III.B)."""
     far_m: float = 20_000.0
     """A position this far from the median of its set cannot be true: no small drone flies farther."""
+    far_spreads: float = 10.0
+    """... and so many times the median distance: a set may be larger than that (chosen; not measured)."""
+    default_height_m: float = 80.0
+    """Height above ground of photos that record none, metres, where nothing else gives it."""
+    usual_heights_m: tuple[float, float] = (50.0, 150.0)
+    """Heights between which mapping flights are flown, metres: where the photos' spacing gives a height (chosen)."""
+    usual_overlap: float = 0.75
+    """Forward overlap of mapping flights as flight planners propose it, share: it makes spacing a height (chosen)."""
+    moved_m: float = 1.0
+    """Steps that are shorter have no direction and no spacing, metres: receivers scatter by about that (chosen)."""
+    corner_deg: float = 50.0
+    """A change of course above this is a corner between two legs and no bend, degrees (chosen; not measured)."""
+    position_sigma_m: float = 1.5
+    """Sigma of a horizontal position whose source states none, metres."""
+    lag_sigma_s: float = 0.5
+    """Sigma of the delay of recorded positions behind the shutter, seconds (chosen; lags of up to 0.4 s are found)."""
+    tagged_tilt_sigma: float = 0.03
+    """Error of the ground point at a photo's centre through its recorded attitude, as a share of the height: 1.7
+    degrees (chosen; not measured)."""
+    untagged_tilt_sigma: float = 0.1
+    """The same without a recorded attitude: 6 degrees of sway about straight down (chosen; not measured)."""
+    pause_s: float = 60.0
+    """Photos farther apart in time do not follow each other: the vehicle did something else between (chosen)."""

@@ -1,4 +1,4 @@
-"""Many cameras as plain arrays, for the compiled kernels of the refiner, and the tracks that they observe."""
+"""Exterior and interior orientation of many cameras as plain arrays for compiled kernels, and their observations."""
 
 from dataclasses import dataclass, replace
 
@@ -13,6 +13,9 @@ Ints = NDArray[np.int32]
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
+LEAST_RADIAL_SLOPE = 0.2
+"""The lens model holds while d r_distorted / d r = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 stays above this: a polynomial
+that was fitted within the picture folds back somewhere outside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,10 @@ class CameraBlock:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def copy(self) -> "CameraBlock":
+        """The same with positions, rotations and lenses of its own."""
+        return replace(self, position=self.position.copy(), rotation=self.rotation.copy(), lens=self.lens.copy())
 
     def take(self, index: NDArray[np.integer] | slice) -> "CameraBlock":
         """Some of the cameras (lenses are shared)."""
@@ -103,7 +110,7 @@ class Tracks:
 def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a ground point in one camera (position (3,), rotation (3, 3), lens (8,)); NaN if behind it.
 
-    Beyond the radius where the distortion folds (1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 < 0.2) the point is not visible.
+    Beyond the radius where the distortion folds (see LEAST_RADIAL_SLOPE) the point is not visible.
     """
     dx, dy, dz = x - position[0], y - position[1], z - position[2]
     cz = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
@@ -112,7 +119,7 @@ def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped
     cx = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / cz
     cy = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / cz
     r2 = cx * cx + cy * cy
-    if 1.0 + r2 * (3.0 * lens[1] + r2 * (5.0 * lens[2] + r2 * 7.0 * lens[3])) < 0.2:
+    if 1.0 + r2 * (3.0 * lens[1] + r2 * (5.0 * lens[2] + r2 * 7.0 * lens[3])) < LEAST_RADIAL_SLOPE:
         return np.nan, np.nan
     s = lens[0] * (1.0 + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3])))
     return s * cx + 0.5 * (lens[6] - 1.0) + lens[4], s * cy + 0.5 * (lens[7] - 1.0) + lens[5]
@@ -131,7 +138,7 @@ def pixel_ray(rotation, lens, u, v):  # type: ignore[no-untyped-def]
             r2 = r * r
             g = r * (1.0 + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3]))) - rd
             dg = 1.0 + r2 * (3.0 * lens[1] + r2 * (5.0 * lens[2] + r2 * 7.0 * lens[3]))
-            r = min(max(r - g / max(dg, 0.2), 0.0), 4.0)
+            r = min(max(r - g / max(dg, LEAST_RADIAL_SLOPE), 0.0), 4.0)
             if abs(g) < 1e-10:
                 break
         s = r / rd

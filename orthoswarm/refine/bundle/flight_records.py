@@ -1,4 +1,4 @@
-"""What one vehicle's frames recorded, as arrays in the local frame, with what is missing filled and marked."""
+"""What one vehicle's frames recorded, as arrays in the local frame; gaps are filled and marked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import Frame
@@ -43,14 +44,16 @@ class FlightRecords:
         """Recorded attitudes, camera to ground, float64 (N, 3, 3)."""
         return rotation_from_angles(self.yaw, self.pitch, self.roll)
 
-    def steps(self, reach: int = 3) -> Array:
+    def steps(self) -> Array:
         """Flown step to each frame from the one before, median over neighbours on the same course: (N, 3)."""
+        config = active().bundle
+        reach, turn_rad = config.course_reach_photos, np.radians(config.course_turn_deg)
         n = len(self.position)
         raw = np.diff(self.position, axis=0, prepend=self.position[:1])
         out = raw.copy()
         for i in range(1, n):
             near = np.arange(max(1, i - reach), min(n, i + reach + 1))
-            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < np.radians(12.0)
+            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < turn_rad
             chosen = near[same]
             if len(chosen) >= 3:
                 out[i] = np.median(raw[chosen], axis=0)
@@ -58,23 +61,22 @@ class FlightRecords:
 
     def velocity(self) -> Array:
         """Smoothed horizontal velocity (N, 2) in m/s (metres per picture where times are unknown)."""
-        n = len(self.position)
-        a, b = np.maximum(np.arange(n) - 2, 0), np.minimum(np.arange(n) + 2, n - 1)
+        n, config = len(self.position), active().bundle
+        reach = config.velocity_reach_photos
+        a, b = np.maximum(np.arange(n) - reach, 0), np.minimum(np.arange(n) + reach, n - 1)
         dt = np.maximum(self.time_s[b] - self.time_s[a], 1e-3)[:, None]
         v = (self.position[b, :2] - self.position[a, :2]) / dt
         speed = np.hypot(*v.T)
         usual = float(np.median(speed)) if n else 0.0
-        return np.asarray(np.where((speed > 3 * usual + 1)[:, None], 0.0, v))
+        return np.asarray(np.where((speed > config.velocity_leap * usual + 1)[:, None], 0.0, v))
 
     def with_yaw(self, yaw: Array) -> "FlightRecords":
         """The same with other headings."""
         return replace(self, yaw=yaw)
 
 
-def read_records(
-    frames: Sequence[Frame], grid: LocalGrid, origin: Array, usual_height_m: float = 100.0
-) -> FlightRecords:
-    """Records of frames (in order); heights are `usual_height_m` where unknown."""
+def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> FlightRecords:
+    """Records of frames (in order); where no frame has a height, all get the default of the configuration."""
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
     xy = grid.to_grid(lat, lon) - origin[:2]
@@ -82,7 +84,7 @@ def read_records(
     yaw = _column([f.fix.yaw_rad for f in frames]) - grid.convergence_rad(lat, lon)
     pitch, roll = _column([f.fix.pitch_rad for f in frames]), _column([f.fix.roll_rad for f in frames])
     has_height, has_yaw, has_tilt = np.isfinite(height), np.isfinite(yaw), np.isfinite(pitch)
-    filled = float(np.median(height[has_height])) if has_height.any() else usual_height_m
+    filled = float(np.median(height[has_height])) if has_height.any() else active().records.default_height_m
     position = np.column_stack([xy, np.where(has_height, height, filled)])
     time, timed = _times(frames)
     course = _course(xy)

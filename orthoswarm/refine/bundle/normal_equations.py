@@ -1,4 +1,4 @@
-"""Compiled pieces of the adjustment: linearised observations, elimination of the points, back substitution.
+"""Compiled parts of the bundle adjustment: linearised observations, elimination of the points, back substitution.
 
 Unknowns of a camera are 3 of position and 3 of rotation (R <- R Exp(omega), camera frame); of a lens 6:
 log f, k1, k2, k3, cx, cy. Points are eliminated one by one (Schur complement); cameras whose slot is -1 are held.
@@ -8,16 +8,8 @@ The camera system is kept as LAPACK's lower band (row = distance from the diagon
 import numpy as np
 
 from orthoswarm.compute.jit import kernel
-
-CAMERA = 6
-LENS = 6
-
-
-@kernel
-def robust_weight(e2, c):  # type: ignore[no-untyped-def]
-    """Geman-McClure weight of a squared normalised residual: 1 / (1 + e2 / c)^2."""
-    q = 1.0 + e2 / c
-    return 1.0 / (q * q)
+from orthoswarm.refine.bundle.block_arrays import LEAST_RADIAL_SLOPE
+from orthoswarm.refine.bundle.robust_kernel import robust_weight
 
 
 @kernel
@@ -35,7 +27,7 @@ def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: 
     f, k1, k2, k3 = lens[0], lens[1], lens[2], lens[3]
     px, py = dx / dz, dy / dz
     r2 = px * px + py * py
-    if 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) < 0.2:
+    if 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) < LEAST_RADIAL_SLOPE:
         return False
     s = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     ds = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
@@ -118,7 +110,8 @@ def build(  # type: ignore[no-untyped-def]
     """Accumulate the reduced normal equations of all points.
 
     Args (P points, M observations sorted by point, N cameras, n free ones, L lenses):
-        position, rotation, lens_id, lens: the cameras. points: (P, 3). start: (P + 1,), first observation of a point.
+        position, rotation, lens_id, lens: as in CameraBlock. points: (P, 3). start: (P + 1,), each one's first
+            observation.
         camera, uv, weight: (M,), (M, 2), (M,) 1 / sigma^2. slot: (N,) place of a free camera in the band, -1 if held.
         c: robust scale of reprojection. height, height_weight: (P,) prior on Z, robust with height_c, plus a
             constant weight height_soft that is not robust.
@@ -227,7 +220,7 @@ def build(  # type: ignore[no-untyped-def]
                             value = wv[a, 0] * w_obs[n, q, 0] + wv[a, 1] * w_obs[n, q, 1] + wv[a, 2] * w_obs[n, q, 2]
                             band[row - column, column] -= value
                         if o == s and n != m:
-                            # two sights of one camera: the transposed product belongs to the same block
+                            # two observations by one camera: the transposed product belongs to the same block
                             row2, column2 = 6 * o + q, 6 * s + a
                             if row2 >= column2:
                                 band[row2 - column2, column2] -= (

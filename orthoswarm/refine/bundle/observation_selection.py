@@ -1,10 +1,11 @@
-"""Which picture shows a point best, and which points to take: one in each cell of ground and leg."""
+"""Which picture observes a tie point best, and which points to choose: one in each cell of ground and leg."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 
 Array = NDArray[np.float64]
@@ -13,10 +14,12 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class BestViews:
-    """For each point the observation nearest its camera's nadir, and how well the point is known.
+    """For each point the inlier observation nearest its camera's nadir, and how well the point is observed.
 
-    Attributes (P points): camera: int32, -1 where there is none. count: observations with weight > 0.5.
-        mean_weight: mean robust weight. off_nadir: horizontal distance camera to point, metres.
+    Attributes (P points):
+        camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
+        mean_weight: float64 (P,), mean robust weight. off_nadir: float64 (P,), horizontal distance of that camera and
+            the point, metres.
     """
 
     camera: Ints
@@ -28,10 +31,10 @@ class BestViews:
 def best_views(
     cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None
 ) -> BestViews:
-    """Summaries of the points' observations; `own` (N,) limits the choice of camera."""
-    n = len(points)
+    """Best view of each point; `own` bool (N,) limits the choice of camera."""
+    n, inlier_weight = len(points), active().bundle.inlier_weight
     distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
-    usable = obs_weight > 0.5
+    usable = obs_weight > inlier_weight
     if own is not None:
         usable &= own[tracks.camera]
     order = np.lexsort((np.where(usable, distance, np.inf), tracks.point))
@@ -41,7 +44,7 @@ def best_views(
     ok = has & usable[best]
     total = np.bincount(tracks.point, minlength=n)
     weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
-    count = np.bincount(tracks.point[obs_weight > 0.5], minlength=n)
+    count = np.bincount(tracks.point[obs_weight > inlier_weight], minlength=n)
     return BestViews(
         np.where(ok, tracks.camera[best], -1).astype(np.int32),
         count.astype(np.int32),

@@ -1,9 +1,11 @@
-"""What is believed of the cameras before the pictures are asked: records with sigmas, biases, drift, lens."""
+"""Priors of the bundle adjustment: recorded positions and attitudes with sigmas, biases, lag, drift, lens."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from orthoswarm.config import active
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -11,21 +13,24 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class GroupPriors:
-    """Sigmas of what the frames of one group (a vehicle's sortie) have in common; SI and radians.
+    """Sigmas of the errors that the frames of one group (a vehicle's sortie) have in common; SI and radians.
 
     Attributes:
-        bias_sigma: attitude bias about the camera's x, y, z axes. height_sigma: common offset of recorded heights.
+        bias_sigma: attitude bias about the camera's x, y, z axes, radians.
+        height_sigma: common offset of recorded heights, metres.
         lag_sigma: delay of the recorded position, seconds (0 switches it off).
         drift_sigma: size of the receiver's drift, metres (0 switches it off); drift_bend: second difference of its
-            knots; knot_every: frames between knots.
+            knots, metres; knot_every: frames between knots.
     """
 
-    bias_sigma: tuple[float, float, float] = (np.radians(1.0), np.radians(1.0), np.radians(3.0))
-    height_sigma: float = 1.0
-    lag_sigma: float = 0.5
-    drift_sigma: float = 15.0
-    drift_bend: float = 0.5
-    knot_every: int = 60
+    bias_sigma: tuple[float, float, float] = field(
+        default_factory=lambda: tuple(np.radians(active().bundle.attitude_bias_sigma_deg))
+    )
+    height_sigma: float = field(default_factory=lambda: active().bundle.height_offset_sigma_m)
+    lag_sigma: float = field(default_factory=lambda: active().records.lag_sigma_s)
+    drift_sigma: float = field(default_factory=lambda: active().bundle.drift_sigma_m)
+    drift_bend: float = field(default_factory=lambda: active().bundle.drift_bend_sigma_m)
+    knot_every: int = field(default_factory=lambda: active().bundle.drift_knot_photos)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +56,12 @@ class Priors:
     models: tuple[GroupPriors, ...]
     lens: Array
     lens_sigma: Array
-    position_c: float = 9.0
+    position_c: float = field(default_factory=lambda: active().bundle.position_robust_c)
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the common unknowns stand: lens columns first, then for each group bias, height, lag, knots (east, north).
+    """Columns of the common unknowns: lenses, then for each group bias (3), height, lag, drift knots (east, north).
 
     Attributes:
         lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns.

@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way, split_legs
-from orthoswarm.refine.bundle.adjustment import Adjustment, log_rotation
+from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
-from orthoswarm.refine.bundle.height_consistency import FREE_SIGMA_M
 from orthoswarm.refine.bundle.observation_selection import BestViews, best_views
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
+from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.features.tracks import CELL_PX, follow, predicted_homography
@@ -181,7 +182,7 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
     model = GroupPriors(
-        height_sigma=1.0 if calibration.trusted_height else FREE_SIGMA_M,
+        height_sigma=1.0 if calibration.trusted_height else active().bundle.unknown_height_sigma_m,
         lag_sigma=0.5 if records.timed else 0.3,
         drift_sigma=15.0 if not np.isfinite(records.position_sigma).all() else 0.0,
     )

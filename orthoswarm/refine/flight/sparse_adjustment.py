@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, log_rotation
+from orthoswarm.config import active
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
-from orthoswarm.refine.bundle.height_consistency import FREE_SIGMA_M, release_heights
+from orthoswarm.refine.bundle.height_consistency import release_heights
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
+from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.flight.relative_block import first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
 from orthoswarm.refine.initial.planar_similarity import Array
@@ -88,7 +90,7 @@ def trusted_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bo
     """Photos whose recorded heights were believed to the end, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])
-    return np.asarray(start.height_known & (sigma < FREE_SIGMA_M)[p.group])
+    return np.asarray(start.height_known & (sigma < active().bundle.unknown_height_sigma_m)[p.group])
 
 
 def _converged_m(adjustment: Adjustment) -> float:
@@ -139,7 +141,9 @@ def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
         models.append(
             GroupPriors(
                 bias_sigma=_BIAS_SIGMA,
-                height_sigma=(0.1 if stated else 1.0) if start.height_known[rows].mean() > 0.5 else FREE_SIGMA_M,
+                height_sigma=(0.1 if stated else 1.0)
+                if start.height_known[rows].mean() > 0.5
+                else active().bundle.unknown_height_sigma_m,
                 lag_sigma=0.2 if stated else 0.5,
                 drift_sigma=0.0 if stated else _DRIFT_SIGMA_M,
                 drift_bend=_DRIFT_BEND_M,

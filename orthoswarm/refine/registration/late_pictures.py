@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
-from orthoswarm.refine.bundle.covariance import RADIAL
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
 
 Array = NDArray[np.float64]
@@ -174,7 +174,11 @@ def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Seque
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     beside = float(np.median([p.sigma_m for p in near]))
     leaning = CORNERS_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
-    own = RADIAL * float(np.sqrt(len(near))) * centre_sigma(camera, uv[agree], ground[agree], scale)
+    own = (
+        active().bundle.stated_sigma_factor
+        * float(np.sqrt(len(near)))
+        * centre_sigma(camera, uv[agree], ground[agree], scale)
+    )
     return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([beside, leaning, own])))
 
 

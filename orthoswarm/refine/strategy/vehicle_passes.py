@@ -18,7 +18,6 @@ from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import frame_sigmas
 from orthoswarm.refine.bundle.height_consistency import contradicted_heights, height_disagreement, release_heights
-from orthoswarm.refine.bundle.snapshot import Snapshot
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
     FEW,
@@ -187,14 +186,14 @@ def from_flight(
 def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
     """The adjustment without a map, its ground fitted as soon as the points allow (surface: what is known of it)."""
     surface = surface or GroundModel()
-    begun = Snapshot.of(flight.adjustment)
+    begun = flight.adjustment.copy()
     found = _relative(flight, surface, SCHEDULE)
     if ran_away(flight):
         # A few wrong tracks, far off, threw it out of the valley before it could tell that they are wrong.
-        flight.adjustment = begun.restored()
+        flight.adjustment = begun.copy()
         found = _relative(flight, surface, WARY)
     if ran_away(flight):
-        flight.adjustment = begun.restored()
+        flight.adjustment = begun.copy()
         p = flight.adjustment.priors
         sigma = p.lens_sigma.copy()
         sigma[:, 0] = flight.calibration.focal_sigma
@@ -237,7 +236,7 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
     surface, _ = _steps(flight, surface, REST_STEPS)
-    believed, calibration, was = Snapshot.of(flight.adjustment), flight.calibration, surface
+    believed, calibration, was = flight.adjustment.copy(), flight.calibration, surface
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
@@ -249,9 +248,7 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     said = float(np.median(flight.records.position[flight.records.has_height, 2]))
     seen = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
     if not at_rest or abs(seen - said) < AGREES * said:
-        flight.adjustment, flight.calibration = believed.restored(), calibration
-        # what is asked of a step is not restored
-        flight.adjustment.step(9.0, was.height_prior(flight.adjustment.points))
+        flight.adjustment, flight.calibration = believed, calibration
         return was
     flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
     return surface
@@ -299,7 +296,7 @@ def placed_again(
 def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
     """Settle a flight where it was found; it stays as it was where that would need another field of view."""
     flight = state.flight
-    before, alone, sigma = Snapshot.of(flight.adjustment), state.surface, state.fov_sigma_deg
+    before, alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
     shift_cameras(flight, fit.correction)
     settled = settle(flight, basemap, origin, state.surface)
     told, now = (
@@ -307,7 +304,7 @@ def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: A
         for a in (before, flight.adjustment)
     )
     if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
-        flight.adjustment = before.restored()
+        flight.adjustment = before
         flight.warnings.append(
             f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
             "found on the map is not believed"

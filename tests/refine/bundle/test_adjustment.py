@@ -8,8 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lapack
 
+from orthoswarm.config import override
 from orthoswarm.refine.bundle import normal_equations
-from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies, _back, exp_rotation, log_rotation
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
+from orthoswarm.refine.bundle.banded_solver import factorise, solve_factored
+from orthoswarm.refine.bundle.rotation_vectors import exp_rotation, log_rotation
 from orthoswarm.refine.flight.relative_block import first_points
 from tests.kit.swarm_block import make_block
 
@@ -69,6 +72,35 @@ def test_held_cameras_stay_where_they_are():
         adj.step(c, level(len(adj.points)))
     np.testing.assert_array_equal(adj.cameras.position[~free], block.true.position[~free])
     assert np.abs(adj.cameras.position[free] - block.true.position[free]).max() > 0
+
+
+def test_a_copy_is_as_it_was_whatever_becomes_of_the_other():
+    block = make_block(per_leg=15, legs=2)
+    adj = solved(block, schedule=(1e4, 100.0))
+    before = adj.copy()
+    position, information = adj.cameras.position.copy(), adj.information.copy()
+    adj.step(9.0, level(len(adj.points)))
+    assert np.abs(adj.cameras.position - position).max() > 1e-3
+    np.testing.assert_array_equal(before.cameras.position, position)
+    np.testing.assert_array_equal(before.information, information)
+    before.step(9.0, level(len(before.points)))
+    for name in ("points", "common", "obs_weight", "point_inverse", "information"):
+        np.testing.assert_array_equal(getattr(before, name), getattr(adj, name))
+    np.testing.assert_array_equal(before.cameras.rotation, adj.cameras.rotation)
+
+
+def test_points_without_parallax_are_not_thrown_farther_than_the_limit():
+    block = make_block(per_leg=15, legs=1)
+    adj = Adjustment.begin(block.start, block.tracks, block.priors, first_points(block.start, block.tracks))
+    before = adj.points.copy()
+    adj.points[:, 2] = -400.0
+    before = adj.points.copy()
+    override({"bundle": {"point_step_limit_m": 7.0}})
+    try:
+        adj.step(1e4, level(len(adj.points)))
+    finally:
+        override({})
+    assert np.linalg.norm(adj.points - before, axis=1).max() == pytest.approx(7.0)
 
 
 def test_a_wild_observation_does_not_bend_the_block():
@@ -152,7 +184,6 @@ def test_a_wide_band_is_solved_in_blocks_as_lapack_solves_it(size, width):
     band[0] = 3.0 * np.sqrt(width)
     for k in range(1, width):
         band[k, : max(size - k, 0)] = rng.normal(size=max(size - k, 0))
-    factor, info = lapack.dpbtrf(band, lower=1)
+    factor = factorise(band)
     right = rng.normal(size=(size, 7))
-    assert info == 0
-    assert np.allclose(_back(factor, right), lapack.dpbtrs(factor, right, lower=1)[0], rtol=1e-9, atol=1e-12)
+    assert np.allclose(solve_factored(factor, right), lapack.dpbtrs(factor, right, lower=1)[0], rtol=1e-9, atol=1e-12)

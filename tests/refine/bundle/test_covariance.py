@@ -3,23 +3,26 @@
 import numpy as np
 import pytest
 
-from orthoswarm.refine.bundle.covariance import MAP_FLOOR_PX, RADIAL, TIE_SHARE, common_map_sigma, systematic_tie_offset
+from orthoswarm.config import active
+from orthoswarm.refine.bundle.covariance import common_map_sigma, systematic_tie_offset
+
+BUNDLE = active().bundle
 
 
 def test_one_and_two_stated_sigmas_are_honest_by_axis_and_by_length():
     error = np.random.default_rng(0).normal(0.0, 1.0, (20000, 2))
     length = np.hypot(*error.T)
     for k, low, high in ((1, 0.50, 0.85), (2, 0.85, 0.99)):
-        assert low < (np.abs(error) < k * RADIAL).mean() < high
-        assert low < (length < k * RADIAL).mean() < high
+        assert low < (np.abs(error) < k * BUNDLE.stated_sigma_factor).mean() < high
+        assert low < (length < k * BUNDLE.stated_sigma_factor).mean() < high
 
 
 def test_a_map_that_scatters_its_ties_is_doubted_more():
     residual = np.random.default_rng(1).normal(0.0, 1.0, (400, 2))
     given = np.full(400, 0.1)
     good, bad = common_map_sigma(0.03 * residual, given, 0.5), common_map_sigma(0.5 * residual, given, 0.5)
-    assert good == pytest.approx(np.hypot(MAP_FLOOR_PX * 0.5, TIE_SHARE * 0.03), rel=0.1)
-    assert bad == pytest.approx(TIE_SHARE * 0.5, rel=0.1)
+    assert good == pytest.approx(np.hypot(BUNDLE.map_floor_px * 0.5, BUNDLE.tie_scatter_share * 0.03), rel=0.1)
+    assert bad == pytest.approx(BUNDLE.tie_scatter_share * 0.5, rel=0.1)
 
 
 def test_wrong_ties_make_no_doubt_of_the_others():
@@ -31,9 +34,9 @@ def test_wrong_ties_make_no_doubt_of_the_others():
 
 
 def test_few_ties_that_were_followed_are_not_believed_to_be_exact():
-    doubt = np.hypot(MAP_FLOOR_PX * 0.5, TIE_SHARE * 0.35)
+    doubt = np.hypot(BUNDLE.map_floor_px * 0.5, BUNDLE.tie_scatter_share * 0.35)
     assert common_map_sigma(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(doubt, rel=0.02)
-    assert common_map_sigma(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(MAP_FLOOR_PX * 2.0)
+    assert common_map_sigma(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(BUNDLE.map_floor_px * 2.0)
 
 
 def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not():

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
@@ -105,9 +106,9 @@ def test_units_of_a_vehicle_are_joined_with_their_legs_in_place():
 
 def test_records_fill_what_is_missing_and_mark_it():
     frames = [frame(i, height_m=None, yaw_rad=None, pitch_rad=None) for i in range(5)]
-    records = read_records(frames, LocalGrid(32632), np.zeros(2), usual_height_m=77.0)
+    records = read_records(frames, LocalGrid(32632), np.zeros(2))
     assert not records.has_height.any() and not records.has_yaw.any() and not records.has_tilt.any()
-    np.testing.assert_allclose(records.position[:, 2], 77.0)
+    np.testing.assert_allclose(records.position[:, 2], active().records.default_height_m)
     np.testing.assert_allclose(records.pitch, -np.pi / 2)
     grid_north = -LocalGrid(32632).convergence_rad(48.0, 11.0)
     np.testing.assert_allclose(records.yaw, grid_north, atol=0.01)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.jobs import kernel_warmup
+from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle import height_consistency
 from orthoswarm.refine.bundle.covariance import systematic_tie_offset
 from orthoswarm.refine.bundle.height_consistency import height_disagreement
-from orthoswarm.refine.bundle.snapshot import Snapshot
 from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
@@ -62,7 +62,7 @@ def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_
     frames, _ = made_up  # straight down over flat ground: without heights no focal length is better than another
 
     def doubted(adjustment):
-        return np.array([m.height_sigma < height_consistency.FREE_SIGMA_M for m in adjustment.priors.models])
+        return np.array([m.height_sigma < active().bundle.unknown_height_sigma_m for m in adjustment.priors.models])
 
     steps = vehicle_passes._steps
 
@@ -101,18 +101,6 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
     monkeypatch.setattr(vehicle_passes, "settle", settle)
     state = solo(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
     assert state.on_map and not any("not believed" in warning for warning in state.flight.warnings)
-
-
-def test_a_snapshot_goes_back_and_stays(made_up):
-    flight = opened(made_up[0])
-    before = Snapshot.of(flight.adjustment)
-    position = flight.adjustment.cameras.position.copy()
-    for _ in range(2):
-        relative(flight)
-        assert np.abs(flight.adjustment.cameras.position - position).max() > 1e-3
-        flight.adjustment = before.restored()
-        np.testing.assert_array_equal(flight.adjustment.cameras.position, position)
-        assert not flight.adjustment.common.any()
 
 
 def legs_and_matches(seed=0):

@@ -1,0 +1,136 @@
+"""What the records add to the normal equations: priors of lenses, attitudes, positions, biases, lag and drift."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.refine.bundle.banded_solver import BandedSystem
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Ints
+from orthoswarm.refine.bundle.priors import Layout, Priors
+from orthoswarm.refine.bundle.robust_kernel import robust_weights
+from orthoswarm.refine.bundle.rotation_vectors import log_rotation
+
+Array = NDArray[np.float64]
+
+_HELD = 1e18
+"""Weight of an unknown that is held."""
+
+
+def add_priors(
+    system: BandedSystem,
+    cameras: CameraBlock,
+    priors: Priors,
+    layout: Layout,
+    *,
+    common: Array,
+    free: NDArray[np.bool_],
+    slot: Ints,
+) -> None:
+    """Add all priors to the normal equations, in place.
+
+    Args:
+        system: of the free cameras. cameras, priors, layout: of all N.
+        common: float64 (layout.size,), values of the common unknowns. free: bool (N,). slot: int32 (N,).
+    """
+    weight = np.where(priors.lens_sigma > 0, 1.0 / np.maximum(priors.lens_sigma, 1e-12) ** 2, _HELD).ravel()
+    diagonal = np.arange(layout.lens_columns)
+    system.corner[diagonal, diagonal] += weight
+    system.rhs_common[: layout.lens_columns] -= weight * common[: layout.lens_columns]
+    index = np.flatnonzero(free)
+    _add_attitudes(system, cameras, priors, layout, common, index, 6 * slot[index])
+    residual = position_residuals(cameras, priors, layout, common)[index]
+    _add_positions(system, priors, layout, residual, index, 6 * slot[index])
+    for g, model in enumerate(priors.models):
+        o, k = layout.offset[g], layout.knots[g]
+        sigma = np.array([*model.bias_sigma, model.height_sigma, model.lag_sigma])
+        weight = np.where(sigma > 0, 1.0 / np.maximum(sigma, 1e-9) ** 2, _HELD)
+        d = np.arange(o, o + 5)
+        system.corner[d, d] += weight
+        system.rhs_common[d] -= weight * common[d]
+        if k:
+            _add_drift(system, common, o + 5, k, model.drift_sigma, model.drift_bend)
+
+
+def position_residuals(cameras: CameraBlock, priors: Priors, layout: Layout, common: Array) -> Array:
+    """Positions minus records, with drift, lag and height offset taken off, metres (N, 3)."""
+    base = np.asarray(layout.offset)[priors.group]
+    out = cameras.position - priors.position
+    out[:, :2] -= layout.drift(common, priors.group) + common[base + 4][:, None] * priors.velocity
+    out[:, 2] -= common[base + 3]
+    return np.asarray(out)
+
+
+def _add_attitudes(
+    system: BandedSystem,
+    cameras: CameraBlock,
+    priors: Priors,
+    layout: Layout,
+    common: Array,
+    index: NDArray[np.intp],
+    at: Ints,
+) -> None:
+    """Rotation vector of recorded to solved attitude, minus the bias; `at`: first row of each free camera."""
+    base = np.asarray(layout.offset)[priors.group[index]]
+    bias = common[base[:, None] + np.arange(3)]
+    r = log_rotation(np.swapaxes(priors.rotation[index], 1, 2) @ cameras.rotation[index]) - bias
+    w = _weights(priors.rotation_sigma[index])
+    e2 = (r * r * w).sum(1)
+    w = w * robust_weights(e2, active().bundle.attitude_robust_c)[:, None]
+    for a in range(3):
+        system.band[0, at + 3 + a] += w[:, a]
+        system.rhs[at + 3 + a] -= w[:, a] * r[:, a]
+        system.side[at + 3 + a, base + a] -= w[:, a]
+        np.add.at(system.corner, (base + a, base + a), w[:, a])
+        np.add.at(system.rhs_common, base + a, w[:, a] * r[:, a])
+
+
+def _add_positions(
+    system: BandedSystem, priors: Priors, layout: Layout, residual: Array, index: NDArray[np.intp], at: Ints
+) -> None:
+    """Recorded positions with lag and drift, heights with their offset."""
+    base = np.asarray(layout.offset)[priors.group[index]]
+    knots = np.asarray(layout.knots)[priors.group[index]]
+    xy, rz = residual[:, :2], residual[:, 2]
+    w = _weights(priors.position_sigma[index])
+    e2 = (xy * xy * w[:, :2]).sum(1)
+    robust = robust_weights(e2, priors.position_c)
+    w[:, :2] *= robust[:, None]
+    left = layout.knot_left[index]
+    fraction = layout.knot_fraction[index]
+    for a in range(2):
+        wa, ra = w[:, a], xy[:, a]
+        columns = [base + 4]
+        factors = [-priors.velocity[index, a]]
+        has = knots > 0
+        columns += [base + 5 + 2 * left + a, base + 5 + 2 * (left + 1) + a]
+        factors += [np.where(has, fraction - 1.0, 0.0), np.where(has, -fraction, 0.0)]
+        columns = [np.where(has, c, base + 4) if n else c for n, c in enumerate(columns)]
+        system.band[0, at + a] += wa
+        system.rhs[at + a] -= wa * ra
+        for c, f in zip(columns, factors):
+            system.side[at + a, c] += wa * f
+            np.add.at(system.rhs_common, c, -wa * f * ra)
+            for c2, f2 in zip(columns, factors):
+                np.add.at(system.corner, (c, c2), wa * f * f2)
+    wz = w[:, 2]
+    system.band[0, at + 2] += wz
+    system.rhs[at + 2] -= wz * rz
+    system.side[at + 2, base + 3] -= wz
+    np.add.at(system.corner, (base + 3, base + 3), wz)
+    np.add.at(system.rhs_common, base + 3, wz * rz)
+
+
+def _weights(sigma: Array) -> Array:
+    return np.where(np.isfinite(sigma), 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
+
+
+def _add_drift(system: BandedSystem, common: Array, at: int, knots: int, sigma: float, bend: float) -> None:
+    """Knots are small (sigma) and bend little (second differences, sigma `bend`)."""
+    precision = np.eye(knots) / sigma**2
+    if knots > 2:
+        second = np.diff(np.eye(knots), 2, axis=0)
+        precision += second.T @ second / bend**2
+    for a in range(2):
+        c = at + 2 * np.arange(knots) + a
+        system.corner[np.ix_(c, c)] += precision
+        system.rhs_common[c] -= precision @ common[c]
