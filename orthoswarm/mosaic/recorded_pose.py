@@ -1,7 +1,7 @@
-"""Cameras straight from what was recorded: the real-time stage's placements (paper III.B), with defaults for gaps.
+"""Cameras by their records alone: the real-time stage's exterior orientation (paper III.B), with defaults for gaps.
 
-Positions as recorded, an assumed field of view (theta-hat) where the pictures do not hint at one, straight down where
-no angles are known, yaw from the course flown where there is none. What was assumed is said in a warning.
+Positions as recorded, an assumed field of view (theta-hat) where no tag gives one, straight down where no attitude is
+recorded, yaw from the course flown where none is recorded. A warning names what was assumed.
 """
 
 from collections import Counter
@@ -20,22 +20,15 @@ from orthoswarm.model.placement import PlacedFrame
 
 Array = NDArray[np.float64]
 
-DEFAULT_HEIGHT_M = 80.0
-_HEIGHTS_M = (50.0, 150.0)
-_USUAL_OVERLAP = 0.75
-_GPS_SIGMA_M = 3.0
-_TILT_SIGMA = {True: 0.03, False: 0.1}
-_TURN_RAD = np.radians(50.0)
-
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What became of frames in the real-time stage.
+    """Frames after the real-time stage.
 
     Attributes:
         placed: in the order of the frames.
         rejected: frames whose position cannot be true.
-        warnings: what was assumed, in plain words.
+        warnings: sentences that name what was assumed.
     """
 
     placed: list[PlacedFrame]
@@ -58,8 +51,8 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
     Args:
         frames: sorted by vehicle, then time.
         grid: the area's grid.
-        fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' own hints, else
-            the default of the configuration.
+        fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' tags, else the
+            default of the configuration.
     """
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
@@ -74,8 +67,8 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
         members.setdefault(frames[i].vehicle, []).append(i)
     for vehicle, index in members.items():
         own = [frames[i] for i in index]
-        cameras, said = _vehicle(vehicle, own, ground[index], convergence[index], fov_rad)
-        warnings += said
+        cameras, assumed = _vehicle(vehicle, own, ground[index], convergence[index], fov_rad)
+        warnings += assumed
         placed += [
             PlacedFrame(frame, camera, "realtime", _sigma(frame, camera))
             for frame, camera in zip(own, cameras, strict=True)
@@ -84,9 +77,9 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
 
 
 def hint_lone_photos(placed: Sequence[PlacedFrame]) -> list[Frame]:
-    """Frames of recorded cameras; that of a vehicle with a single one has the assumed field of view as its hint.
+    """Frames of recorded cameras; a vehicle's only photo gets the assumed field of view as its hint.
 
-    A flight tells its field of view by its own pictures, one photo cannot.
+    The field of view of a flight is estimated from its own pictures; that of a single photo cannot be.
     """
     count = Counter(p.frame.vehicle for p in placed)
     return [
@@ -136,44 +129,52 @@ def _lens(frame: Frame, fov_rad: float | None) -> Lens:
 
 
 def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
-    """A height at which consecutive pictures would overlap as they usually do, for photos that do not tell it."""
+    """The height at which consecutive photos would overlap as usual, for a vehicle without recorded heights, metres."""
+    config = active().records
     if len(ground) < 3:
-        return DEFAULT_HEIGHT_M
+        return config.default_height_m
     step = float(np.median(np.hypot(*np.diff(ground, axis=0).T)))
     short = float(np.median([min(lens.width, lens.height) / lens.focal_px for lens in lenses]))
-    return float(np.clip(step / (1.0 - _USUAL_OVERLAP) / short, *_HEIGHTS_M)) if step > 1.0 else DEFAULT_HEIGHT_M
+    if step <= config.moved_m:
+        return config.default_height_m
+    return float(np.clip(step / (1.0 - config.usual_overlap) / short, *config.usual_heights_m))
 
 
 def course(ground: Array) -> Array:
     """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
 
-    Steps under a metre have no direction and take that of the nearest step that has; 0 where nothing moved.
+    Steps under `moved_m` have no direction and take that of the nearest step that has; 0 where nothing moved.
     """
+    config = active().records
+    corner_rad = np.radians(config.corner_deg)
     n = len(ground)
     steps = np.diff(ground, axis=0)
-    moved = np.nonzero(np.hypot(*steps.T) > 1.0)[0] if n > 1 else np.empty(0, np.intp)
+    moved = np.nonzero(np.hypot(*steps.T) > config.moved_m)[0] if n > 1 else np.empty(0, np.intp)
     if len(moved) == 0:
         return np.zeros(n)
     azimuth = np.arctan2(steps[moved, 0], steps[moved, 1])
     after = np.searchsorted(moved, np.arange(n))  # the first step that begins here or later
     into, out = azimuth[np.maximum(after - 1, 0)], azimuth[np.minimum(after, len(moved) - 1)]
     before = azimuth[np.maximum(after - 2, 0)]
-    corner = np.abs(wrap_rad(out - into)) > _TURN_RAD
-    straight_in = np.abs(wrap_rad(into - before)) < _TURN_RAD
+    corner = np.abs(wrap_rad(out - into)) > corner_rad
+    straight_in = np.abs(wrap_rad(into - before)) < corner_rad
     middle = into + 0.5 * wrap_rad(out - into)
     return np.asarray(np.where(corner, np.where(straight_in, into, out), middle))
 
 
 def _sigma(frame: Frame, camera: Camera) -> float:
-    gps = frame.fix.position_sigma_m or _GPS_SIGMA_M
-    tilt = _TILT_SIGMA[frame.fix.pitch_rad is not None] * float(camera.position[2])
-    return float(np.hypot(gps, tilt))
+    """One sigma of the ground point at the photo's centre, metres."""
+    config = active().records
+    position = frame.fix.position_sigma_m or config.position_sigma_m
+    share = config.untagged_tilt_sigma if frame.fix.pitch_rad is None else config.tagged_tilt_sigma
+    return float(np.hypot(position, share * float(camera.position[2])))
 
 
 def _near(ground: Array) -> NDArray[np.bool_]:
-    """Which positions belong to the flight: within 20 km, or ten times the usual distance, of the middle."""
+    """Which positions belong to the set: near their median, bool (N,)."""
+    config = active().records
     away = np.hypot(*(ground - np.median(ground, axis=0)).T)
-    return np.asarray(np.isfinite(away) & (away <= max(active().records.far_m, 10.0 * float(np.median(away)))))
+    return np.asarray(np.isfinite(away) & (away <= max(config.far_m, config.far_spreads * float(np.median(away)))))
 
 
 def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
@@ -185,7 +186,7 @@ def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
 
 
 def nothing_to_map(ingest: Ingest) -> str:
-    """Why inputs without a single frame are of no use, one sentence."""
+    """Why inputs without a single frame cannot be mapped, one sentence."""
     if not ingest.rejected:
         return "no picture was found in the input; name a folder of photos or a video"
     reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]

@@ -89,16 +89,16 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Fli
     time, timed = _times(frames)
     course = _course(xy)
     return FlightRecords(
-        position,
-        wrap_rad(np.where(has_yaw, yaw, course)),
-        np.where(has_tilt, pitch, -np.pi / 2),
-        np.where(np.isfinite(roll), roll, 0.0),
-        time,
-        has_height,
-        has_yaw,
-        has_tilt,
-        _column([f.fix.position_sigma_m for f in frames]),
-        timed,
+        position=position,
+        yaw=wrap_rad(np.where(has_yaw, yaw, course)),
+        pitch=np.where(has_tilt, pitch, -np.pi / 2),
+        roll=np.where(np.isfinite(roll), roll, 0.0),
+        time_s=time,
+        has_height=has_height,
+        has_yaw=has_yaw,
+        has_tilt=has_tilt,
+        position_sigma=_column([f.fix.position_sigma_m for f in frames]),
+        timed=timed,
     )
 
 

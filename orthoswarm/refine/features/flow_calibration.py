@@ -1,7 +1,7 @@
-"""First guess of scale and heading from the pictures: flow of whole pictures against the distance flown.
+"""First focal length and headings: the flow of whole pictures against the distance flown.
 
-Metres per pixel come from the distance flown, never from an altitude that may be nonsense; headings that contradict
-the flow (a yaw tag that flips) are turned.
+Metres per pixel come from the distance flown, never from an altitude that may be wrong; headings that contradict the
+flow (a yaw tag that flips) are corrected.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.refine.bundle.flight_records import FlightRecords
@@ -18,19 +19,17 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-FLOW_SIGMA = 0.03
-
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What whole-picture flow says of one vehicle.
+    """Interior orientation and headings of one vehicle by the flow of whole pictures.
 
     Attributes:
         focal_px: focal length in working pixels. height_m: height above ground that goes with it.
         yaw_offset: float64 (N,), to be added to the recorded yaw (radians): flips, and headings taken from the course.
         trusted_height: False where the recorded height had to be replaced.
         pairs: pairs of pictures that gave an answer.
-        warnings: findings in plain words.
+        warnings: sentences for the report.
         spread: robust relative sigma of the pairs' answers, infinite where there are too few.
     """
 
@@ -44,8 +43,8 @@ class Calibration:
 
     @property
     def focal_sigma(self) -> float:
-        """How well the flow tells the focal length, one relative sigma (receivers drift and lag by some percent)."""
-        return float(np.hypot(FLOW_SIGMA, self.spread / np.sqrt(max(self.pairs, 1))))
+        """Relative sigma of the focal length."""
+        return float(np.hypot(active().features.calibration_sigma, self.spread / np.sqrt(max(self.pairs, 1))))
 
 
 def calibrate(
@@ -58,18 +57,20 @@ def calibrate(
         gray: picture at working scale. size: its (width, height).
         fov_start: assumed horizontal field of view, radians.
     """
+    config = active().features
     width = size[0]
     f0 = 0.5 * width / np.tan(0.5 * fov_start)
     h0 = float(np.median(records.position[:, 2]))
-    usable = h0 > 3.0 and bool(records.has_height.any())
+    usable = h0 > config.calibration_least_height_m and bool(records.has_height.any())
     if not usable:
-        h0 = 100.0
+        h0 = active().records.default_height_m
     rotation = records.rotation()
     legs = [np.flatnonzero(leg == k) for k in range(int(leg.max()) + 1)] if len(leg) else []
+    per_leg = max(config.calibration_pairs_per_leg, config.calibration_pairs // max(len(legs), 1))
     ratios: list[complex] = []
     owners: list[int] = []
     for k, members in enumerate(legs):
-        for a, b in _pairs(records, members, f0 / h0, size[1], max(3, 24 // max(len(legs), 1))):
+        for a, b in _pairs(records, members, f0 / h0, size[1], per_leg):
             ratio = _flow_ratio(
                 gray(a), gray(b), rotation[a], rotation[b], records.position[b] - records.position[a], f0, h0
             )
@@ -89,9 +90,10 @@ def calibrate(
 def _with_scale(
     f0: float, h0: float, scale: float, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
 ) -> Calibration:
-    """Attribute the scale to the lens where that is plausible, else to the height."""
+    """Attribute the scale to the lens where that gives a possible one, else to the height."""
     focal = f0 * scale
-    if usable and np.radians(35.0) < fov_rad(focal, width) < np.radians(135.0):
+    narrowest, widest = np.radians(active().features.calibration_fov_deg)
+    if usable and narrowest < fov_rad(focal, width) < widest:
         return Calibration(focal, h0, offset, True, pairs, warnings)
     height = h0 / scale
     if usable:
@@ -105,21 +107,27 @@ def _heading(
     records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
 ) -> tuple[Array, list[str]]:
     """Offset of the recorded yaw for each frame: whole legs that are turned round, or headings from the course."""
+    config = active().features
     offset = np.zeros(len(leg))
     warnings: list[str] = []
     angle = -np.angle(ratio)  # picture flow turned against prediction = camera turned the other way
     usual = float(np.median(np.abs(ratio)))
+    wrong = np.radians(config.heading_wrong_deg)
     for k in range(int(leg.max()) + 1):
-        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < 0.25)]
+        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < config.heading_ratio)]
         last = 0.0
-        if len(mine) >= 3:
+        if len(mine) >= config.heading_least_pairs:
             turn = float(np.angle(np.median(np.cos(mine)) + 1j * np.median(np.sin(mine))))
             spread = float(np.median(np.abs(wrap_rad(mine - turn))))
-            if not records.has_yaw.any() and spread < np.radians(20.0):
+            if not records.has_yaw.any() and spread < np.radians(config.heading_spread_deg):
                 last = turn
-            elif abs(turn) > np.radians(40.0) and spread < np.radians(8.0):
+            elif abs(turn) > wrong and spread < np.radians(config.heading_wrong_spread_deg):
                 last = turn
-                what = "turned by 180 deg" if abs(turn) > np.radians(150.0) else f"off by {np.degrees(turn):.0f} deg"
+                what = (
+                    "turned by 180 deg"
+                    if abs(turn) > np.radians(config.heading_flip_deg)
+                    else f"off by {np.degrees(turn):.0f} deg"
+                )
                 first = int(np.flatnonzero(leg == k)[0])
                 warnings.append(
                     f"the yaw tags of the leg from frame {first} on are {what}; corrected from the pictures"
@@ -141,13 +149,20 @@ def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
 def _pairs(
     records: FlightRecords, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
 ) -> list[tuple[int, int]]:
-    """Pairs along a leg whose expected flow is a fifth of the picture."""
+    """At most so many pairs along a leg whose expected flow is the configured share of the picture."""
+    config = active().features
     if len(members) < 2:
         return []
     step = float(np.median(np.hypot(*np.diff(records.position[members, :2], axis=0).T)))
     if step <= 1e-3:
         return []
-    span = int(np.clip(round(0.2 * rows / (px_per_m * step)), 1, max(1, min(8, len(members) - 1))))
+    span = int(
+        np.clip(
+            round(config.calibration_flow_share * rows / (px_per_m * step)),
+            1,
+            max(1, min(config.calibration_span_photos, len(members) - 1)),
+        )
+    )
     starts = np.unique(np.linspace(0, len(members) - 1 - span, most).astype(int))
     return [(int(members[s]), int(members[s + span])) for s in starts if s >= 0]
 
@@ -156,6 +171,7 @@ def _flow_ratio(
     first: Gray, second: Gray, ra: Array, rb: Array, move: Array, focal: float, height: float
 ) -> complex | None:
     """Measured over predicted flow as a complex number (scale and turn); None where the pictures do not agree."""
+    config = active().features
     shape = first.shape
     if second.shape != shape or not np.isfinite(move).all():
         return None
@@ -163,18 +179,18 @@ def _flow_ratio(
     turned = rb.T @ ra @ centre
     spin = focal * turned[:2] / max(turned[2], 0.2)  # flow by rotation alone
     shift = -focal / height * (rb.T @ move)[:2]
-    factor = 0.5 if shape[1] > 400 else 1.0
+    factor = 0.5 if shape[1] > config.calibration_reduced_from_px else 1.0
     small = [
         cv2.resize(g, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
         for g in (first, second)
     ]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    if response < 0.03:
+    if response < config.calibration_response:
         return None
     flow = complex(dx / factor - spin[0], dy / factor - spin[1])
     expected = complex(shift[0], shift[1])
-    if abs(expected) < 2.0 or abs(flow) < 1.0:
+    if abs(expected) < config.calibration_least_predicted_px or abs(flow) < config.calibration_least_flow_px:
         return None
     ratio = flow / expected
-    return ratio if 0.1 < abs(ratio) < 10.0 else None
+    return ratio if 1.0 / config.calibration_ratio < abs(ratio) < config.calibration_ratio else None

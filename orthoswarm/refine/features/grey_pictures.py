@@ -1,4 +1,4 @@
-"""The grey pictures of one vehicle at working scale, read when needed and kept within a memory bound."""
+"""The grey pictures of one vehicle at working scale, read when needed and cached within a memory bound."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -8,13 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 
 Gray = NDArray[np.uint8]
-
-WORK_WIDTH = 960
-SMALL_WIDTH = 160
 
 
 class Pictures:
@@ -22,16 +20,19 @@ class Pictures:
 
     Attributes:
         scale: full-resolution pixels per working pixel. size: (width, height) at working scale.
-        damaged: index -> sentence, pictures that could not be decoded.
+        damaged: index -> sentence why that picture cannot be used.
     """
 
     def __init__(
         self,
         frames: Sequence[Frame],
         read: Callable[[Frame], Gray],
-        work_width: int = WORK_WIDTH,
-        cache_mb: float = 160.0,
+        work_width: int | None = None,
+        cache_mb: float | None = None,
     ) -> None:
+        config = active().features
+        cache_mb = config.cache_mb if cache_mb is None else cache_mb
+        work_width = config.work_width_px if work_width is None else work_width
         self._frames, self._read = frames, read
         width, height = frames[0].width, frames[0].height
         self.scale = max(1.0, max(width, height) / work_width)
@@ -43,28 +44,28 @@ class Pictures:
 
     def gray(self, i: int) -> Gray:
         """Picture i, uint8 (rows, columns); a grey card where it cannot be decoded (see `damaged`)."""
-        held = self._cache.get(i)
-        if held is not None:
+        cached = self._cache.get(i)
+        if cached is not None:
             self._cache.move_to_end(i)
-            return held
+            return cached
         picture = self._load(i)
         self._cache[i] = picture
         if len(self._cache) > self._limit:
             self._cache.popitem(last=False)
         if i not in self._small:
-            width = min(SMALL_WIDTH, self.size[0])
+            width = min(active().features.small_width_px, self.size[0])
             size = (width, max(1, round(width * self.size[1] / self.size[0])))
             self._small[i] = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
         return picture
 
     def small(self, i: int) -> Gray:
-        """Picture i reduced to SMALL_WIDTH columns."""
+        """Picture i reduced to `small_width_px` columns."""
         if i not in self._small:
             self.gray(i)
         return self._small[i]
 
     def drop(self) -> None:
-        """Let go of the working-scale pictures (the reduced ones stay)."""
+        """Free the memory of working-scale pictures (the reduced ones stay)."""
         self._cache.clear()
 
     def __getstate__(self) -> dict[str, Any]:

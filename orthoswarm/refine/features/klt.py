@@ -9,6 +9,7 @@ import numpy as np
 from orthoswarm.compute.jit import kernel
 
 HALF = 7
+"""Half the window, pixels: a layout of the compiled code (windows of 15 x 15, Lucas and Kanade 1981)."""
 _SIZE = 2 * HALF + 1
 
 
@@ -38,8 +39,11 @@ def _template(gray, u, v, affine, wide):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _refine(gray, wide, q, rounds):  # type: ignore[no-untyped-def]
-    """Move q (2,) to where the template lies in a picture; returns the final mean square error, negative if lost."""
+def _refine(gray, wide, q, rounds, texture, step):  # type: ignore[no-untyped-def]
+    """Move q (2,) to where the template lies in a picture; returns the final mean square error, negative if lost.
+
+    rounds: most iterations. texture: least eigenvalue of the gradient matrix a pixel. step: a smaller one ends, px.
+    """
     rows, cols = gray.shape
     gx, gy = np.empty((_SIZE, _SIZE), np.float32), np.empty((_SIZE, _SIZE), np.float32)
     hxx = hxy = hyy = np.float32(0.0)
@@ -62,7 +66,7 @@ def _refine(gray, wide, q, rounds):  # type: ignore[no-untyped-def]
     hyy -= my * my / n
     det = hxx * hyy - hxy * hxy
     smallest = 0.5 * (hxx + hyy - np.sqrt((hxx - hyy) ** 2 + 4 * hxy * hxy))
-    if smallest < 2.0 * n or det <= 0:
+    if smallest < texture * n or det <= 0:
         return -1.0
     error = np.float32(-1.0)
     for _ in range(rounds):
@@ -92,7 +96,7 @@ def _refine(gray, wide, q, rounds):  # type: ignore[no-untyped-def]
         du, dv = (hyy * bx - hxy * by) / det, (hxx * by - hxy * bx) / det
         q[0] -= du
         q[1] -= dv
-        if du * du + dv * dv < 1e-4:
+        if du * du + dv * dv < step * step:
             break
     return error
 
@@ -110,13 +114,30 @@ def variance(wide):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def track(before, before_half, after, after_half, points, guess, affine, found, ok):  # type: ignore[no-untyped-def]
+def track(  # type: ignore[no-untyped-def]
+    before,
+    before_half,
+    after,
+    after_half,
+    points,
+    guess,
+    affine,
+    rounds,
+    texture,
+    step,
+    mismatch,
+    noise,
+    found,
+    ok,
+):
     """Track K windows from one picture into the next.
 
     Args:
         before, after: uint8 pictures; before_half, after_half: the same at half size.
         points: float32 (K, 2) in `before`. guess: float32 (K, 2) start in `after`.
         affine: float64 (K, 2, 2), derivative of the map from `after` back to `before` at each point.
+        rounds: most iterations at half and at full size. texture, step: see the configuration (klt_least_texture,
+            klt_step_px). mismatch, noise: largest mean square error as a share of the window's variance, plus noise.
         found: float32 (K, 2) out. ok: bool (K,) out.
     """
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
@@ -126,29 +147,47 @@ def track(before, before_half, after, after_half, points, guess, affine, found, 
         found[k, 0], found[k, 1] = guess[k, 0], guess[k, 1]
         q[0], q[1] = (guess[k, 0] + 0.5) * 0.5 - 0.5, (guess[k, 1] + 0.5) * 0.5 - 0.5
         u, v = (points[k, 0] + 0.5) * 0.5 - 0.5, (points[k, 1] + 0.5) * 0.5 - 0.5
-        if _template(before_half, u, v, affine[k], wide) and _refine(after_half, wide, q, 8) >= 0:
+        if (
+            _template(before_half, u, v, affine[k], wide)
+            and _refine(after_half, wide, q, rounds[0], texture, step) >= 0
+        ):
             q[0], q[1] = (q[0] + 0.5) * 2 - 0.5, (q[1] + 0.5) * 2 - 0.5
         else:
             q[0], q[1] = guess[k, 0], guess[k, 1]
         if not _template(before, points[k, 0], points[k, 1], affine[k], wide):
             continue
-        error = _refine(after, wide, q, 10)
-        if error < 0 or error > 0.75 * variance(wide) + 4.0:
+        error = _refine(after, wide, q, rounds[1], texture, step)
+        if error < 0 or error > mismatch * variance(wide) + noise:
             continue
         found[k, 0], found[k, 1] = q[0], q[1]
         ok[k] = True
 
 
 @kernel
-def anchor(stack, slot, points, after, affine, limit, found, ok):  # type: ignore[no-untyped-def]
-    """Compare K windows with their first sight, so that errors from picture to picture do not add up.
+def anchor(  # type: ignore[no-untyped-def]
+    stack,
+    slot,
+    points,
+    after,
+    affine,
+    limit,
+    rounds,
+    texture,
+    step,
+    mismatch,
+    noise,
+    found,
+    ok,
+):
+    """Compare K windows with their first observation, so that errors from picture to picture do not add up.
 
     Args:
-        stack: uint8 (R, rows, columns), pictures held. slot: int64 (K,), the picture of each first sight.
-        points: float32 (K, 2), where it was seen there. after: the picture now.
-        affine: float64 (K, 2, 2), derivative of the map from `after` back to the first sight.
-        limit: farthest move in pixels. found: float32 (K, 2), in: from picture to picture, out: improved.
-        ok: bool (K,) out, False where the first sight is no longer recognised.
+        stack: uint8 (R, rows, columns), pictures held. slot: int64 (K,), the picture of each first observation.
+        points: float32 (K, 2), its place there. after: the picture now.
+        affine: float64 (K, 2, 2), derivative of the map from `after` back to that picture.
+        limit: farthest move in pixels. rounds (one number), texture, step, mismatch, noise: as for `track`.
+        found: float32 (K, 2), in: from picture to picture, out: improved.
+        ok: bool (K,) out, False where the first observation is not recognised.
     """
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
     q = np.empty(2)
@@ -157,8 +196,8 @@ def anchor(stack, slot, points, after, affine, limit, found, ok):  # type: ignor
         if not _template(stack[slot[k]], points[k, 0], points[k, 1], affine[k], wide):
             continue
         q[0], q[1] = found[k, 0], found[k, 1]
-        error = _refine(after, wide, q, 8)
-        if error < 0 or error > 0.4 * variance(wide) + 4.0:
+        error = _refine(after, wide, q, rounds, texture, step)
+        if error < 0 or error > mismatch * variance(wide) + noise:
             continue
         if (q[0] - found[k, 0]) ** 2 + (q[1] - found[k, 1]) ** 2 > limit * limit:
             continue

@@ -1,8 +1,4 @@
-"""How much consecutive photos overlap: what decides between following points and matching features.
-
-Of 150 followed corners 106 to 127 survive at an overlap of 0.90, 76 to 109 at 0.81, 51 at 0.72 (measured); from 0.8 on
-points are followed, below that features are matched.
-"""
+"""Forward overlap of consecutive photos: it decides between following corners and matching features."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,15 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import match_features
 from orthoswarm.refine.features.sift_features import Features, detect
-
-DENSE_OVERLAP = 0.8
-_PIXELS = 240 * 180
-_SAMPLES = 12
-_GAP_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +28,13 @@ class Overlap:
 
     @property
     def dense(self) -> bool:
-        """Whether points can be followed from photo to photo."""
-        return self.share >= DENSE_OVERLAP and self.matched >= 0.6
+        """Whether corners can be followed from photo to photo."""
+        config = active().features
+        return self.share >= config.dense_overlap and self.matched >= config.dense_matched
 
 
 def forward_overlap(
-    frames: Sequence[Frame], read_gray: Callable[[Frame], NDArray[np.uint8]], samples: int = _SAMPLES
+    frames: Sequence[Frame], read_gray: Callable[[Frame], NDArray[np.uint8]], samples: int | None = None
 ) -> Overlap:
     """Measure the overlap of consecutive photos of one vehicle from the pictures, about 15 ms a photo.
 
@@ -50,16 +43,16 @@ def forward_overlap(
     Args:
         frames: of one vehicle in order of time.
         read_gray: gives a photo's grey values, uint8 (rows, columns), at any size.
-        samples: how many pairs, spread over the flight.
+        samples: how many pairs, spread over the flight (None: as configured).
     """
     shares: list[float] = []
-    chosen = _sample_pairs(frames, samples)
-    seen: dict[int, Features | None] = {}
+    chosen = _sample_pairs(frames, active().features.overlap_samples if samples is None else samples)
+    features: dict[int, Features | None] = {}
     for a, b in chosen:
         for k in (a, b):
-            if k not in seen:
-                seen[k] = _features(frames[k], read_gray)
-        one, two = seen[a], seen[b]
+            if k not in features:
+                features[k] = _features(frames[k], read_gray)
+        one, two = features[a], features[b]
         shares.append(_shared_area(one, two) if one is not None and two is not None else 0.0)
     found = [s for s in shares if s > 0.0]
     if not found:
@@ -69,11 +62,11 @@ def forward_overlap(
 
 def _sample_pairs(frames: Sequence[Frame], samples: int) -> list[tuple[int, int]]:
     """Consecutive pairs of equal pictures without a pause between, evenly over the flight."""
-    pairs = []
+    pairs, longest = [], active().records.pause_s
     for k in range(len(frames) - 1):
         a, b = frames[k], frames[k + 1]
         pause = 0.0 if a.time_s is None or b.time_s is None else b.time_s - a.time_s
-        if (a.width, a.height) == (b.width, b.height) and 0.0 <= pause <= _GAP_S:
+        if (a.width, a.height) == (b.width, b.height) and 0.0 <= pause <= longest:
             pairs.append((k, k + 1))
     if len(pairs) <= samples:
         return pairs
@@ -82,7 +75,7 @@ def _sample_pairs(frames: Sequence[Frame], samples: int) -> list[tuple[int, int]
 
 def _features(frame: Frame, read_gray: Callable[[Frame], NDArray[np.uint8]]) -> Features | None:
     try:
-        return detect(read_gray(frame), frame.width, frame.height, _PIXELS)
+        return detect(read_gray(frame), frame.width, frame.height, active().features.overlap_pixels)
     except PictureError:
         return None
 

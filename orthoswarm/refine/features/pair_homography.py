@@ -1,44 +1,49 @@
-"""Homographies that two pictures show by themselves, whatever was recorded of them."""
+"""The homography between two pictures, measured in the pictures, whatever was recorded of them."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
+
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-SEEN_PX, SEEN_SHARE, SEEN_LEAST = 3.0, 0.4, 12
-"""How near to a homography flow must lie, the share of it that must, and the fewest."""
-
-TURNED_CORNERS, TURNED_LEAST, TURNED_SHARE = 1000, 30, 0.25
-"""Corners that are described, the fewest pairs that must agree, and the share of them."""
-
 
 def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
-    """The homography that flow over several octaves shows, whatever was recorded; None where it shows none.
+    """The homography that flow over several octaves supports; None where it supports none.
 
-    For angles that are wrong by degrees, or that nobody recorded of a camera that sways. Begun from the prediction
-    and, where that leads nowhere (a heading that is wrong by more than ten degrees), from no motion at all.
+    For a camera that sways and whose angles are wrong by degrees or were not recorded. Begun from the prediction and,
+    where that finds no consensus (a heading that is wrong by more than ten degrees), from no motion at all; then by
+    ORB corners.
+
+    Args:
+        previous, gray: uint8 (rows, columns). uv: float32 (K, 2), corners of the previous one.
+        predicted: 3x3 homography from the previous one's pixels.
     """
-    if previous is None or len(uv) < SEEN_LEAST:
+    if previous is None or len(uv) < active().features.homography_least:
         return None
     for start in (predicted, np.eye(3)):
         aligned = shifted_prediction(previous, gray, start)
-        seen = _flow_homography(previous, gray, uv, start if aligned is None else aligned)
-        if seen is not None:
-            return seen
+        measured = _flow_homography(previous, gray, uv, start if aligned is None else aligned)
+        if measured is not None:
+            return measured
     return _turned_homography(previous, gray)
 
 
 def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
     """The homography from one picture to the next that most flow from a start agrees on, None without agreement."""
+    config = active().features
     guess = apply_homography(start, uv)
     warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=(21, 21), maxLevel=4)
+    window = (config.pyramid_window_px, config.pyramid_window_px)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        warped, gray, guess, None, winSize=window, maxLevel=config.pyramid_octaves
+    )
     ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
-    if ok.sum() < SEEN_LEAST:
+    if ok.sum() < config.homography_least:
         return None
-    return _agreed(uv[ok], found[ok], max(SEEN_LEAST, SEEN_SHARE * ok.sum()))
+    return _agreed(uv[ok], found[ok], max(config.homography_least, config.homography_share * ok.sum()))
 
 
 def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
@@ -46,39 +51,43 @@ def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
 
     For a turn of the flight whose headings nobody recorded.
     """
-    orb = cv2.ORB.create(nfeatures=TURNED_CORNERS)
+    config = active().features
+    orb = cv2.ORB.create(nfeatures=config.orb_corners)
     (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
     if ours is None or theirs is None:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
-    if len(pairs) < TURNED_LEAST:
+    if len(pairs) < config.orb_least:
         return None
     a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
     b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
-    return _agreed(a, b, max(TURNED_LEAST, TURNED_SHARE * len(pairs)))
+    return _agreed(a, b, max(config.orb_least, config.orb_share * len(pairs)))
 
 
 def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Array | None:
     """The homography that so many pairs of pixels (K, 2) agree on, None where fewer do."""
-    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, SEEN_PX)
+    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, active().features.homography_px)
     if homography is None or inlier.sum() < fewest:
         return None
     return np.asarray(homography, np.float64)
 
 
 def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
-    """The prediction with the shift that it lacks, by phase correlation of quarter pictures; None where unclear."""
+    """The prediction with the shift that it lacks, by phase correlation of reduced pictures; None where unclear."""
     if previous is None:
         return None
+    config = active().features
+    reduction = config.phase_reduction
     warped = cv2.warpPerspective(previous, predicted, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
     small = [
-        cv2.resize(g, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32) for g in (warped, gray)
+        cv2.resize(g, None, fx=1.0 / reduction, fy=1.0 / reduction, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for g in (warped, gray)
     ]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    if response <= 0.05:
+    if response <= config.phase_response:
         return None
-    return np.array([[1.0, 0, 4.0 * dx], [0, 1.0, 4.0 * dy], [0, 0, 1.0]]) @ predicted
+    return np.array([[1.0, 0, reduction * dx], [0, 1.0, reduction * dy], [0, 0, 1.0]]) @ predicted
 
 
 def apply_homography(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:

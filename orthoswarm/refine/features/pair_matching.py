@@ -1,8 +1,8 @@
-"""Pairs of overlapping photos: which to try, how features are matched, and what a trustworthy match is.
+"""Pairs of overlapping photos: candidates, matching of their features, geometric verification.
 
 Candidates come from the recorded positions, not only from the order in time: legs, vehicles and sorties overlap, too.
-A pair is kept when mutual nearest neighbours agree on one similarity of the plane (loosely, because cameras tilt and
-the ground is not flat) and on one epipolar geometry (tightly).
+A pair is accepted when mutual nearest neighbours agree on one similarity of the plane (loosely, because cameras tilt
+and the ground is not flat) and on one epipolar geometry (tightly).
 """
 
 from dataclasses import dataclass
@@ -11,24 +11,17 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.features.sift_features import Features, root_sift
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int32]
 
-MIN_INLIERS = 15
-_RATIO = 0.85
-_PLANE_SHARE = 0.03
-_EPIPOLAR_STEPS = 1.5
-_SCALES = (0.5, 2.0)
-_SECTORS = 6
-_BEST_DISTANCE = 0.4
-
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two photos that see the same ground.
+    """Two photos that show the same ground.
 
     Attributes:
         first: index of one photo; second: of the other, larger.
@@ -46,22 +39,22 @@ class Pair:
 def match_features(one: Features, two: Features) -> Ints:
     """Rows of features of one and of another photo that are the same points, int32 (n, 2); none: (0, 2).
 
-    Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC (3 % of the width: tilt and relief
-    are no similarity), then the fundamental matrix by MAGSAC (1.5 pixels of the reduced picture). Fewer than
-    15 survivors are none.
+    Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
+    MAGSAC (Barath et al. 2020). Fewer than `match_least` inliers are none.
     """
+    config = active().features
     none = np.zeros((0, 2), np.int32)
     candidates = mutual_nearest(_unit(one), _unit(two))
-    if len(candidates) < MIN_INLIERS:
+    if len(candidates) < config.match_least:
         return none
     p = one.uv[candidates[:, 0]] / np.float32(one.step_px)
     q = two.uv[candidates[:, 1]] / np.float32(two.step_px)
-    plane = _similarity_inliers(p, q, _PLANE_SHARE * two.width / two.step_px)
-    if plane.sum() < MIN_INLIERS:
+    plane = _similarity_inliers(p, q, config.plane_share * two.width / two.step_px)
+    if plane.sum() < config.match_least:
         return none
     candidates, p, q = candidates[plane], p[plane], q[plane]
     epipolar = _epipolar_inliers(p, q)
-    return candidates[epipolar] if epipolar.sum() >= MIN_INLIERS else none
+    return candidates[epipolar] if epipolar.sum() >= config.match_least else none
 
 
 def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
@@ -75,7 +68,7 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
     top = dot[rows, best]
     dot[rows, best] = -1.0
     second = dot.max(axis=1)
-    clear = (1.0 - top) < _RATIO**2 * (1.0 - second)
+    clear = (1.0 - top) < active().features.match_ratio ** 2 * (1.0 - second)
     keep = mutual & clear
     return np.stack([rows[keep], best[keep]], axis=1).astype(np.int32)
 
@@ -83,13 +76,20 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
 def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
     import cv2
 
+    config = active().features
     matrix, inliers = cv2.estimateAffinePartial2D(
-        p, q, method=cv2.RANSAC, ransacReprojThreshold=threshold, maxIters=1000, confidence=0.999, refineIters=2
+        p,
+        q,
+        method=cv2.RANSAC,
+        ransacReprojThreshold=threshold,
+        maxIters=config.ransac_rounds,
+        confidence=config.ransac_confidence,
+        refineIters=2,
     )
     if matrix is None:
         return np.zeros(len(p), bool)
     scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-    if not _SCALES[0] <= scale <= _SCALES[1]:
+    if not config.plane_scales[0] <= scale <= config.plane_scales[1]:
         return np.zeros(len(p), bool)
     return np.asarray(inliers[:, 0] > 0)
 
@@ -97,8 +97,11 @@ def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshol
 def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.bool_]:
     import cv2
 
+    config = active().features
     try:
-        _, inliers = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, _EPIPOLAR_STEPS, 0.999, 1000)
+        _, inliers = cv2.findFundamentalMat(
+            p, q, cv2.USAC_MAGSAC, config.epipolar_px, config.ransac_confidence, config.ransac_rounds
+        )
     except cv2.error:  # OpenCV 5.0 asserts where it finds no model
         return np.zeros(len(p), bool)
     return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
@@ -128,19 +131,19 @@ def _unit(features: Features) -> NDArray[np.float32]:
     return _unit_of(_Identity(features))
 
 
-def consecutive(group: NDArray[np.integer], time_s: Array, max_gap_s: float = 60.0) -> Ints:
-    """Pairs of photos that follow each other in one group (a vehicle), int32 (n, 2).
+def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
+    """Pairs of photos that follow each other in one group (a vehicle) without a pause, int32 (n, 2).
 
     Args:
         group: integers (N,), photos of a group in order of time.
         time_s: float64 (N,), NaN where unknown (then order alone counts).
-        max_gap_s: a longer pause does not link.
     """
+    pause_s = active().records.pause_s
     last: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
     for k, g in enumerate(group.tolist()):
         before = last.get(g)
-        if before is not None and not abs(time_s[k] - time_s[before]) > max_gap_s:
+        if before is not None and not abs(time_s[k] - time_s[before]) > pause_s:
             pairs.append((before, k))
         last[g] = k
     return np.array(pairs, np.int32).reshape(-1, 2)
@@ -149,17 +152,18 @@ def consecutive(group: NDArray[np.integer], time_s: Array, max_gap_s: float = 60
 def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
     """Pairs whose footprints may overlap, spread over all directions, int32 (n, 2), sorted, first < second.
 
-    Each photo chooses from six directions, in each from photos of its own group and of others, those first whose
-    distance is near 0.4 of the reach: nearer ones tell little about relief and tilt, farther ones share little ground.
+    Each photo chooses by direction, in each from photos of its own group and of others, those first whose distance is
+    near the best one.
 
     Args:
-        centre: complex (N,), east + i north of the ground that each photo shows in its middle.
+        centre: complex (N,), east + i north of the ground at each photo's centre.
         reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
         group: integers (N,), leg or segment.
         count: how many neighbours each photo may choose.
     """
     from scipy.spatial import cKDTree
 
+    best, sectors = active().features.pair_best_distance, active().features.pair_sectors
     points = np.stack([centre.real, centre.imag], axis=1)
     tree = cKDTree(points)
     chosen: set[tuple[int, int]] = set()
@@ -169,10 +173,10 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
         distance = np.abs(centre[near] - centre[i])
         mean = 0.5 * (reach[near] + reach[i])
         near, distance = near[distance <= mean], (distance / mean)[distance <= mean]
-        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - _BEST_DISTANCE), 3)))
+        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - best), 3)))
         near = near[order]
-        sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * _SECTORS + 0.5).astype(np.int64) % _SECTORS
-        for j in _round_robin(near, sector + _SECTORS * (group[near] != group[i]), count):
+        sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * sectors + 0.5).astype(np.int64) % sectors
+        for j in _round_robin(near, sector + sectors * (group[near] != group[i]), count):
             chosen.add((min(i, j), max(i, j)))
     return np.array(sorted(chosen), np.int32).reshape(-1, 2)
 

@@ -1,4 +1,4 @@
-"""Features of single photos: SIFT, spread evenly over the picture, for photos that overlap too little to be followed.
+"""SIFT features, spread evenly over the picture, for photos that overlap too little for corners to be followed.
 
 Lowe 2004 (SIFT) as in OpenCV; RootSIFT after Arandjelovic and Zisserman 2012. The globally strongest features sit
 on a few glints and roofs; a cap per cell of the picture keeps the geometry well conditioned.
@@ -9,23 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
+
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
-
-WORKING_PIXELS = 480 * 360
-"""Size of the reduced picture on which features are found, in pixels; the same whatever the picture's shape."""
-FINE_PIXELS = 640 * 480
-"""The same for photos that matched too few others."""
-_CONTRAST = 0.02
-_DETECTED = 1500
-_CELLS = (8, 6)
-_PER_CELL = 16
-_KEPT = 600
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """What was found in one photo.
+    """Features of one photo.
 
     Attributes:
         uv: float32 (n, 2), column and row in the FULL picture, pixel centres at integers.
@@ -67,23 +59,26 @@ def root_sift(descriptor: Bytes) -> Floats:
     return np.asarray(np.sqrt(d, out=d))
 
 
-def detect(gray: Bytes, width: int, height: int, working_pixels: int = WORKING_PIXELS) -> Features:
+def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = None) -> Features:
     """Features of one photo.
 
     Args:
         gray: uint8 (rows, columns), the photo at any size (a reduced decode is welcome).
         width: columns of the full picture, in whose pixels positions are given.
         height: its rows.
-        working_pixels: size of the reduced picture on which to work.
+        working_pixels: of the reduced picture on which to work (None: as configured).
 
     Returns:
-        At most 600 features, the strongest of each cell first.
+        At most `sift_kept` features, the strongest of each cell first.
     """
     import cv2
 
-    reduced, step = reduce_picture(gray, width, height, working_pixels)
+    config = active().features
+    reduced, step = reduce_picture(
+        gray, width, height, config.sift_pixels if working_pixels is None else working_pixels
+    )
     sift = cv2.SIFT_create(  # type: ignore[attr-defined,unused-ignore]
-        nfeatures=_DETECTED, contrastThreshold=_CONTRAST, enable_precise_upscale=True
+        nfeatures=config.sift_detected, contrastThreshold=config.sift_contrast, enable_precise_upscale=True
     )
     keypoints, descriptors = sift.detectAndCompute(reduced, None)
     if len(keypoints) == 0:
@@ -98,12 +93,10 @@ def detect(gray: Bytes, width: int, height: int, working_pixels: int = WORKING_P
 
 
 def localisation_sigma(size: Floats) -> Floats:
-    """One sigma in reduced pixels of a SIFT point of a diameter, float32 (n,).
-
-    Measured on the adjusted flights of four cameras: residuals are level up to a diameter of 3 pixels (0.15 px), then
-    grow with it (0.04 of the diameter).
-    """
-    return np.asarray(np.hypot(np.float32(0.15), np.float32(0.04) * size), dtype=np.float32)
+    """One sigma in reduced pixels of SIFT features of diameters (n,), float32 (n,)."""
+    config = active().features
+    floor, share = np.float32(config.sift_sigma_px), np.float32(config.sift_sigma_share)
+    return np.asarray(np.hypot(floor, share * size), dtype=np.float32)
 
 
 def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) -> tuple[Bytes, float]:
@@ -118,7 +111,7 @@ def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) ->
 
 
 def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.intp]:
-    """Indices of the features to keep: every cell's best first, then its second best, until enough.
+    """Indices of the features to keep: every cell's strongest first, then its second, until there are enough.
 
     Args:
         xy: float32 (n, 2), positions in a picture of `columns` by `rows`.
@@ -126,7 +119,8 @@ def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.
         columns: of the picture.
         rows: of the picture.
     """
-    nx, ny = _CELLS if columns >= rows else _CELLS[::-1]
+    config = active().features
+    nx, ny = config.sift_cells if columns >= rows else config.sift_cells[::-1]
     cx = np.clip((xy[:, 0] * nx / columns).astype(np.int64), 0, nx - 1)
     cy = np.clip((xy[:, 1] * ny / rows).astype(np.int64), 0, ny - 1)
     cell = cy * nx + cx
@@ -134,5 +128,5 @@ def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.
     sorted_cell = cell[order]
     start = np.flatnonzero(np.r_[True, sorted_cell[1:] != sorted_cell[:-1]])
     rank = np.arange(len(order)) - np.repeat(start, np.diff(np.r_[start, len(order)]))
-    order, rank = order[rank < _PER_CELL], rank[rank < _PER_CELL]
-    return np.asarray(order[np.lexsort((-response[order], rank))][:_KEPT])
+    order, rank = order[rank < config.sift_per_cell], rank[rank < config.sift_per_cell]
+    return np.asarray(order[np.lexsort((-response[order], rank))][: config.sift_kept])

@@ -6,25 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 
 Ints = NDArray[np.int32]
 
-MAX_LENGTH = 20
 
-
-def build_tracks(features: Sequence[Features], pairs: Sequence[Pair], max_length: int = MAX_LENGTH) -> Tracks:
-    """Tracks of length 2 to `max_length` through all photos.
+def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
+    """Tie points through all photos, each observed 2 to `track_longest` times.
 
     The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
     one wrong match cannot glue two places together.
 
     Args:
         features: of each photo; the camera of an observation is the index here.
-        pairs: trusted matches.
-        max_length: longest track; longer ones stay in pieces.
+        pairs: verified matches.
 
     Returns:
         Tracks with positions in full pictures, ordered by camera, then point.
@@ -38,7 +36,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair], max_length
         b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
         joins.append(np.stack([a, b], axis=1))
     edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
-    root = _union(edges, photo, len(photo), max_length)
+    root = _union(edges, photo, len(photo), active().features.track_longest)
     return _tracks(root, photo, features)
 
 
@@ -99,25 +97,26 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
     return root
 
 
-def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64], per_cell: int = 3) -> Tracks:
-    """Fewer tracks that still cover every photo evenly: longest first, kept while a photo's cell has room.
+def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64]) -> Tracks:
+    """Fewer tracks that still cover every photo evenly: longest first, while one of their photos' cells has room.
 
     Args:
         tracks: of N photos.
         width: (N,) columns of each photo.
         rows: (N,) rows of each photo.
-        per_cell: observations in each of 8 x 6 cells of a photo from which on longer tracks are needed no more.
     """
     if not len(tracks.camera):
         return tracks
+    config = active().features
+    nx, ny = config.sift_cells
     length = np.bincount(tracks.point, minlength=tracks.count)
     order = np.lexsort((tracks.camera, tracks.point, -length[tracks.point]))
     start = np.flatnonzero(np.r_[True, np.diff(tracks.point[order]) != 0, True])
-    cx = np.clip(tracks.uv[:, 0] * 8 / np.asarray(width)[tracks.camera], 0, 7).astype(np.int64)
-    cy = np.clip(tracks.uv[:, 1] * 6 / np.asarray(rows)[tracks.camera], 0, 5).astype(np.int64)
-    cell = tracks.camera.astype(np.int64) * 48 + cy * 8 + cx
+    cx = np.clip(tracks.uv[:, 0] * nx / np.asarray(width)[tracks.camera], 0, nx - 1).astype(np.int64)
+    cy = np.clip(tracks.uv[:, 1] * ny / np.asarray(rows)[tracks.camera], 0, ny - 1).astype(np.int64)
+    cell = tracks.camera.astype(np.int64) * nx * ny + cy * nx + cx
     keep = np.zeros(len(order), np.bool_)
-    _thin(cell[order], start, per_cell, 48 * len(width), keep)
+    _thin(cell[order], start, config.track_per_cell, nx * ny * len(width), keep)
     kept = np.sort(order[keep])
     _, point = np.unique(tracks.point[kept], return_inverse=True)
     return Tracks(

@@ -1,7 +1,7 @@
-"""Following corners through one vehicle's pictures (RECIPE.md step 1): spread by cells, predicted by the records.
+"""Following corners through one vehicle's pictures: spread by cells, predicted by the records.
 
 Optical flow between consecutive pictures, started from the recorded attitude and the flown step; each window is
-turned and scaled as the prediction says, so that chains survive corners.
+turned and scaled as the prediction says, so that tracks survive the turns of the flight.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
 from orthoswarm.refine.features.pair_homography import (
@@ -24,19 +25,10 @@ from orthoswarm.refine.features.pair_homography import (
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-CELL_PX = 80
-BORDER_PX = 9
-FLOW_SIGMA_PX = 0.35
-HELD = 48
-"""Pictures that are held for comparison with first sights."""
-ANCHOR_PX = 1.5
-MISSED = 0.6
-"""Where fewer tracks are followed, the recorded angles are not what the pictures show (3 degrees are 17 pixels)."""
-
 
 @dataclass(slots=True)
 class _Live:
-    """Tracks alive in the last picture: pixel, id, age in pictures, first sight (picture number and pixel)."""
+    """Tracks alive in the last picture: pixel, id, age in pictures, first observation (picture number and pixel)."""
 
     uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -59,7 +51,7 @@ class Tracker:
     """
 
     scale: float = 1.0
-    cell_px: int = CELL_PX
+    cell_px: int = field(default_factory=lambda: active().features.cell_px)
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
@@ -95,38 +87,40 @@ class Tracker:
         self._gray, self._half = gray, half
         return survived
 
-    def tracks(self, min_observations: int = 3) -> Tracks:
+    def tracks(self) -> Tracks:
         """All tracks with enough observations, as observations in full-resolution pixels."""
+        config = active().features
         if not self._log:
             return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
         camera = np.concatenate([np.full(len(ident), i, np.int32) for i, ident, _ in self._log])
         ident = np.concatenate([ident for _, ident, _ in self._log])
         uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
-        keep = np.bincount(ident, minlength=self._next)[ident] >= min_observations
+        keep = np.bincount(ident, minlength=self._next)[ident] >= config.track_least_observations
         _, point = np.unique(ident[keep], return_inverse=True)
         uv = (uv[keep] + 0.5) * self.scale - 0.5
-        sigma = np.full(len(point), FLOW_SIGMA_PX * self.scale, np.float32)
+        sigma = np.full(len(point), config.flow_sigma_px * self.scale, np.float32)
         return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
 
     def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
+        config = active().features
         before, live = len(self._live.ident), self._live
         guess = apply_homography(predicted, live.uv)
         good, found = self._flow(gray, half, predicted, guess)
         inside = is_inside(guess, gray.shape, 0.0)
-        if good.sum() < max(6, 0.3 * inside.sum()):
+        if good.sum() < max(config.shift_below_corners, config.shift_below_share * inside.sum()):
             shifted = shifted_prediction(self._gray, gray, predicted)
             if shifted is not None:
                 good, found, predicted = self._better(gray, half, shifted, (good, found, predicted))
-        if good.sum() < MISSED * inside.sum():
-            seen = measured_homography(self._gray, gray, live.uv, predicted)
-            if seen is not None:
-                good, found, predicted = self._better(gray, half, seen, (good, found, predicted))
+        if good.sum() < config.homography_below_share * inside.sum():
+            measured = measured_homography(self._gray, gray, live.uv, predicted)
+            if measured is not None:
+                good, found, predicted = self._better(gray, half, measured, (good, found, predicted))
                 self._chain[-1] = predicted @ self._chain[-2]
                 self._chain[-1] /= self._chain[-1][2, 2]
-        kept = live.take(good)
-        kept.uv, kept.age = found[good], kept.age + 1
-        self._to_first_sight(kept, gray)
-        self._live = _oldest_per_cell(kept, gray.shape, self.cell_px)
+        followed = live.take(good)
+        followed.uv, followed.age = found[good], followed.age + 1
+        self._correct_drift(followed, gray)
+        self._live = _oldest_per_cell(followed, gray.shape, self.cell_px)
         return float(good.sum()) / max(before, 1)
 
     def _better(
@@ -136,30 +130,62 @@ class Tracker:
         good, found = self._flow(gray, half, other, apply_homography(other, self._live.uv))
         return (good, found, other) if good.sum() > now[0].sum() else now
 
-    def _to_first_sight(self, live: _Live, gray: Gray) -> None:
-        """Compare with the first sight; where it is no longer recognised, the present sight becomes the first."""
+    def _correct_drift(self, live: _Live, gray: Gray) -> None:
+        """Compare with the first observation; where it is not recognised any more, the present one takes its place."""
         if self._stack is None or not len(live.uv):
             return
+        config = active().features
+        photos = len(self._stack)
         now = len(self._chain) - 1
         anchors, which = np.unique(live.anchor, return_inverse=True)
         back = np.stack([self._chain[a] for a in anchors]) @ np.linalg.inv(self._chain[now])
         affine = _derivative(back[which], live.uv)
         ok = np.zeros(len(live.uv), bool)
-        klt.anchor(self._stack, live.anchor % HELD, live.anchor_uv, gray, affine, ANCHOR_PX, live.uv, ok)
-        lost = ~ok | (now + 1 - live.anchor >= HELD)
+        klt.anchor(
+            stack=self._stack,
+            slot=live.anchor % photos,
+            points=live.anchor_uv,
+            after=gray,
+            affine=affine,
+            limit=config.anchor_limit_px,
+            rounds=config.klt_rounds[2],
+            texture=config.klt_least_texture,
+            step=config.klt_step_px,
+            mismatch=config.klt_anchor_mismatch,
+            noise=config.klt_noise_variance,
+            found=live.uv,
+            ok=ok,
+        )
+        lost = ~ok | (now + 1 - live.anchor >= photos)
         live.anchor[lost], live.anchor_uv[lost] = now, live.uv[lost]
 
     def _hold(self, gray: Gray) -> None:
         if self._stack is None or self._stack.shape[1:] != gray.shape:
-            self._stack = np.zeros((HELD, *gray.shape), np.uint8)
-        self._stack[(len(self._chain) - 1) % HELD] = gray
+            self._stack = np.zeros((active().features.anchor_photos, *gray.shape), np.uint8)
+        self._stack[(len(self._chain) - 1) % len(self._stack)] = gray
 
     def _flow(
         self, gray: Gray, half: Gray, predicted: Array, guess: NDArray[np.float32]
     ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Flow of the live tracks from the guess, gated."""
+        config = active().features
         found, ok = np.empty_like(guess), np.zeros(len(guess), bool)
-        klt.track(self._gray, self._half, gray, half, self._live.uv, guess, _backward(predicted, guess), found, ok)
+        klt.track(
+            before=self._gray,
+            before_half=self._half,
+            after=gray,
+            after_half=half,
+            points=self._live.uv,
+            guess=guess,
+            affine=_backward(predicted, guess),
+            rounds=config.klt_rounds[:2],
+            texture=config.klt_least_texture,
+            step=config.klt_step_px,
+            mismatch=config.klt_mismatch,
+            noise=config.klt_noise_variance,
+            found=found,
+            ok=ok,
+        )
         return _gate(guess, found, ok, gray.shape), found
 
     def _start(self, gray: Gray) -> None:
@@ -186,27 +212,26 @@ class Tracker:
             )
 
 
-def corners(
-    gray: Gray, empty: NDArray[np.bool_], size: int = CELL_PX, top: int = 0, left: int = 0
-) -> NDArray[np.float32]:
+def corners(gray: Gray, empty: NDArray[np.bool_], size: int, top: int = 0, left: int = 0) -> NDArray[np.float32]:
     """The strongest corner (minimum eigenvalue) of each wanted cell: float32 (K, 2), column and row.
 
     Cells without texture give none. Only the rows of cells that are wanted are computed.
     """
+    config = active().features
+    window, reach = config.corner_window_px, (config.corner_window_px + 1) // 2
     found: list[tuple[float, float]] = []
-    floor = 1e-4
     for row in np.flatnonzero(empty.any(1)):
         y0 = top + int(row) * size
-        a, b = max(y0 - 3, 0), min(y0 + size + 3, gray.shape[0])
+        a, b = max(y0 - reach, 0), min(y0 + size + reach, gray.shape[0])
         for first, last in _runs(empty[row]):
             x0, x1 = left + first * size, left + last * size
-            c, d = max(x0 - 3, 0), min(x1 + 3, gray.shape[1])
-            score = cv2.cornerMinEigenVal(gray[a:b, c:d], 5, ksize=3)[y0 - a : y0 - a + size, x0 - c : x1 - c]
-            _mask_border(score, y0, x0, gray.shape)
+            c, d = max(x0 - reach, 0), min(x1 + reach, gray.shape[1])
+            score = cv2.cornerMinEigenVal(gray[a:b, c:d], window, ksize=3)[y0 - a : y0 - a + size, x0 - c : x1 - c]
+            _mask_border(score, y0, x0, gray.shape, config.border_px)
             cells = score.reshape(size, last - first, size).transpose(1, 0, 2).reshape(last - first, -1)
             best = cells.argmax(1)
             for n, k in enumerate(best):
-                if cells[n, k] > floor:
+                if cells[n, k] > config.corner_floor:
                     found.append((x0 + n * size + int(k) % size, y0 + int(k) // size))
     return np.array(found, np.float32).reshape(-1, 2)
 
@@ -216,8 +241,8 @@ def _runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     yield from zip(edges[::2].tolist(), edges[1::2].tolist())
 
 
-def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int, ...]) -> None:
-    b = BORDER_PX
+def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int, ...], b: int) -> None:
+    """No corners within b pixels of the border of a picture of this shape; the score's origin is (x0, y0)."""
     score[: max(0, b - y0)] = 0
     score[:, : max(0, b - x0)] = 0
     below, right = y0 + score.shape[0] - (shape[0] - b), x0 + score.shape[1] - (shape[1] - b)
@@ -244,19 +269,20 @@ def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
 def _gate(
     guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Keep flows that agree with the others: 5 px from the median residual, which is 12 px from the guess at most."""
-    good = ok & is_inside(found, shape, 3.0)
-    if good.sum() < 3:
+    """Keep flow that agrees with the others: near the median residual, which must be near the guess."""
+    config = active().features
+    good = ok & is_inside(found, shape, config.flow_inside_px)
+    if good.sum() < config.flow_least:
         return np.zeros_like(good)
     residual = found - guess
     centre = np.median(residual[good], axis=0)
-    if np.hypot(*centre) > 12.0:
+    if np.hypot(*centre) > config.flow_median_limit_px:
         return np.zeros_like(good)
-    return np.asarray(good & (np.hypot(*(residual - centre).T) < 5.0))
+    return np.asarray(good & (np.hypot(*(residual - centre).T) < config.flow_gate_px))
 
 
 def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
-    """One track a cell, the one followed longest: spread matters more than strength."""
+    """One track a cell, the one followed longest."""
     cols = shape[1] // size + 1
     cell = (live.uv[:, 1] // size).astype(np.int64) * cols + (live.uv[:, 0] // size).astype(np.int64)
     order = np.lexsort((live.ident, -live.age))
@@ -284,10 +310,19 @@ def follow(
     read: Callable[[int], Gray],
     prediction: Callable[[int], Array | None],
     scale: float = 1.0,
-    cell_px: int = CELL_PX,
+    cell_px: int | None = None,
 ) -> tuple[Tracks, NDArray[np.float64]]:
-    """Track through pictures 0..count-1; returns the tracks and the share that survived into each picture."""
-    tracker = Tracker(scale, cell_px)
+    """Follow corners through pictures 0 .. count - 1.
+
+    Args:
+        count: of pictures. read: gives picture i at working scale.
+        prediction: 3x3 homography from picture i - 1 to i, None where the chain begins anew.
+        scale: full-resolution pixels per working pixel. cell_px: see Tracker (None: as configured).
+
+    Returns:
+        The tracks, and the share of them that survived into each picture, float64 (count,).
+    """
+    tracker = Tracker(scale) if cell_px is None else Tracker(scale, cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))

@@ -19,7 +19,7 @@ from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.grey_pictures import Pictures
-from orthoswarm.refine.features.tracks import CELL_PX, follow, predicted_homography
+from orthoswarm.refine.features.tracks import follow, predicted_homography
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -166,8 +166,9 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
         step = np.array([steps[i, 0], steps[i, 1], 0.0])
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
+    cell_px = active().features.cell_px
     few = len(rotation) < FEW
-    return follow(len(rotation), pictures.gray, prediction, cell_px=CELL_PX // 2 if few else CELL_PX)
+    return follow(len(rotation), pictures.gray, prediction, cell_px=cell_px // 2 if few else cell_px)
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Run, serial
@@ -20,14 +21,12 @@ from orthoswarm.refine.flight.record_findings import findings, flipped_yaw, unpl
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.lens_groups import lens_per_vehicle, split_unlike_lenses
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, Progress, ReadGray, build_pair_graph
-from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments
 
 _OUTLIER_SIGMA_M = 5.0
 _STATED_FLOOR_M = 0.03
-_PER_CELL = 2
 _RECORDED_HEIGHT_SIGMA_M = 0.3
 _FREE_HEIGHT_SIGMA_M = 1.5
 
@@ -161,7 +160,7 @@ def assemble(
         tried: how many pairs were tried.
     """
     trusted = [pair for pair, ok in zip(pairs, start.pair_ok, strict=True) if ok]
-    tracks = thin_tracks(build_tracks(features, trusted), records.width, records.rows, _PER_CELL)
+    tracks = thin_tracks(build_tracks(features, trusted), records.width, records.rows)
     position, sigma, known = _position_priors(records, start)
     log_focal, log_focal_sigma = focal_by_hint(records)
     held = np.zeros(len(frames), bool)
@@ -210,7 +209,7 @@ def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[
     velocity = records.velocity()
     stated = np.isfinite(records.position_sigma)
     across = np.where(stated, np.hypot(records.position_sigma, _STATED_FLOOR_M), 1.0)
-    along = np.where(stated, 0.0, LAG_SPREAD_S)
+    along = np.where(stated, 0.0, active().initial.lag_spread_s)
     up = np.where(known, np.where(stated, np.maximum(across, 0.05), _RECORDED_HEIGHT_SIGMA_M), _FREE_HEIGHT_SIGMA_M)
     sigma = np.stack([np.hypot(across, along * velocity.real), np.hypot(across, along * velocity.imag), up], axis=1)
     off = ~start.gps_ok

@@ -1,7 +1,7 @@
-"""Headings of photos from pairs of photos: relative turns of the pictures, absolute ones from the way flown.
+"""Headings of photos from pairs of photos: relative ones by the pictures' turns, absolute ones by the way flown.
 
-A yaw tag that flips by 180 degrees while the picture does not, a gimbal yaw relative to the body, no yaw tag at all:
-the pictures know better. Tags are asked only for photos whose heading no picture tells.
+Yaw tags flip by 180 degrees, or are relative to the body, or are missing; they are used only for photos whose heading
+no pair gives.
 """
 
 from dataclasses import dataclass
@@ -12,13 +12,9 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
-
-_COURSE_SIGMA = float(np.radians(2.0))
-_C_SCHEDULE = (400.0, 100.0, 36.0, 9.0, 9.0)
-_CANDIDATES = 360
-_AGREE = float(np.radians(20.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +23,7 @@ class TagHeading:
 
     Attributes:
         source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
-        offset: constant difference picture - tag, radians. agree: share of photos within 20 degrees.
+        offset: constant difference picture - tag, radians. agree: share of photos that agree with it.
     """
 
     source: str
@@ -55,12 +51,12 @@ def chain_headings(graph: PairGraph, count: int) -> Array:
     tree = tree + tree.T
     turn = dict(zip(zip(graph.first.tolist(), graph.second.tolist()), np.angle(graph.factor).tolist()))
     yaw = np.zeros(count)
-    seen = np.zeros(count, bool)
+    visited = np.zeros(count, bool)
     for root in range(count):
-        if seen[root]:
+        if visited[root]:
             continue
         order, before = breadth_first_order(tree, root, directed=False)
-        seen[order] = True
+        visited[order] = True
         for k in order[1:].tolist():
             p = int(before[k])
             yaw[k] = yaw[p] + (turn[p, k] if (p, k) in turn else -turn[k, p])
@@ -82,6 +78,7 @@ def course_headings(
     Returns:
         Heading (E,) and its one sigma (E,), infinite where the way is too short to tell.
     """
+    config = active().initial
     i, j = graph.first, graph.second
     back = np.conj(graph.turn)
     ratio = metres[j] / metres[i]
@@ -90,15 +87,16 @@ def course_headings(
     blur = np.hypot(records.gps_sigma()[i], records.gps_sigma()[j])
     length = np.maximum(np.abs(way), 1e-9)
     tilt = np.abs(1.0 - ratio * back) * offset_sigma_px[i] * metres[i] / length
-    sigma = np.sqrt(_COURSE_SIGMA**2 + (blur / length) ** 2 + tilt**2)
-    sigma[(sigma > 1.0) | (np.abs(shift) * metres[i] < 0.3 * length)] = np.inf
+    sigma = np.sqrt(float(np.radians(config.course_sigma_deg)) ** 2 + (blur / length) ** 2 + tilt**2)
+    short = np.abs(shift) * metres[i] < config.course_shift_share * length
+    sigma[(sigma > config.course_sigma_limit_rad) | short] = np.inf
     return wrap_rad(np.angle(shift) - np.angle(way)), sigma
 
 
 def solve_headings(
     graph: PairGraph, component: Ints, start: Array, course: Array, course_sigma: Array
 ) -> tuple[Array, Flags]:
-    """Headings of all photos, and whether the pictures told them.
+    """Headings of all photos, and whether pairs give them.
 
     Each connected part is turned as a whole to the angle that most courses support, then all headings are solved
     together, robustly.
@@ -119,7 +117,7 @@ def solve_headings(
         turn = circular_mode(wrap_rad(course[rows] - yaw[graph.first[rows]]), course_sigma[rows] ** -2)
         yaw[component == part] += turn
         known[component == part] = True
-    for c in _C_SCHEDULE:
+    for c in active().initial.heading_schedule:
         yaw = yaw + _heading_step(graph, yaw, course, course_sigma, c)
     return wrap_rad(yaw), known
 
@@ -147,12 +145,14 @@ def _identity(count: int) -> csr_matrix:
     return csr_matrix((np.ones(count), (k, k)), shape=(count, count))
 
 
-def circular_mode(angle: Array, weight: Array, width: float = _AGREE) -> float:
+def circular_mode(angle: Array, weight: Array) -> float:
     """The angle that the most weight supports: the densest window, then the mean of what lies near it."""
-    tried = angle[:: max(1, len(angle) // _CANDIDATES)]
+    config = active().initial
+    width = float(np.radians(config.heading_agree_deg))
+    tried = angle[:: max(1, len(angle) // config.heading_candidates)]
     support = (weight[None, :] * (np.abs(wrap_rad(angle[None, :] - tried[:, None])) < width)).sum(1)
     mode = float(tried[int(support.argmax())])
-    for _ in range(5):
+    for _ in range(config.heading_rounds):
         r = wrap_rad(angle - mode)
         w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2
         mode += float((w * r).sum() / w.sum())
@@ -164,21 +164,22 @@ def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> Ta
 
     Args:
         records: all records.
-        rows: photos of one vehicle whose heading the pictures told.
+        rows: photos of one vehicle whose heading pairs give.
         yaw: float64 (N,), the pictures' headings.
     """
+    config = active().initial
     best = TagHeading("", 0.0, 0.0)
     for source in ("yaw", "flight_yaw"):
         tag = tag_yaw(records, source)[rows]
         finite = np.isfinite(tag)
-        if finite.sum() < 3:
+        if finite.sum() < config.tag_least_photos:
             continue
         difference = wrap_rad(yaw[rows] - tag)[finite]
         offset = circular_mode(difference, np.ones(len(difference)))
-        agree = float((np.abs(wrap_rad(difference - offset)) < _AGREE).mean())
-        if agree > best.agree + 0.1:
+        agree = float((np.abs(wrap_rad(difference - offset)) < np.radians(config.heading_agree_deg)).mean())
+        if agree > best.agree + config.tag_better_share:
             best = TagHeading(source, offset, agree)
-    return best if best.agree >= 0.5 else TagHeading("", 0.0, best.agree)
+    return best if best.agree >= config.tag_agree_share else TagHeading("", 0.0, best.agree)
 
 
 def tag_yaw(records: PhotoRecords, source: str) -> Array:

@@ -1,8 +1,8 @@
-"""Start values of every photo from pairs of photos: heading, ground scale, tilt, lens, position, height.
+"""Initial exterior and interior orientation of every photo from pairs of photos, without a map.
 
-All of it takes milliseconds and needs no tag but positions. The shapes of matches tell tilt and, where the photos look
-several ways, the focal length (`shape`); level pictures are then similar figures of the ground, whose turns tell
-headings (`heading`), whose zooms tell relative heights (`scales`) and whose shifts tell positions (`network`).
+All of it takes milliseconds and needs no tag but positions. The shapes of matches give the tilt and, where the photos
+look several ways, the focal length (`tilt_and_lens`). Level pictures are then similar figures of the ground: turns give
+headings (`heading`), zooms relative heights (`relative_scale`), shifts positions (`planar_network`).
 """
 
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
@@ -45,16 +46,10 @@ from orthoswarm.refine.initial.relative_scale import (
 )
 from orthoswarm.refine.initial.tilt_and_lens import Matches, TiltAndLens, similarities, solve_tilt_and_lens
 
-_ROUNDS = 2
-_HEIGHT_SIGMA = 0.12
-_TAG_TILT_SIGMA = float(np.radians(3.0))
-_FREE_TILT_SIGMA = float(np.radians(9.0))
-_TILT_FLOOR = float(np.radians(0.7))
-
 
 @dataclass(frozen=True, slots=True)
 class InitialOrientation:
-    """The start of N photos of L lenses in S segments with E pairs.
+    """Orientation of N photos of L lenses in S segments with E pairs.
 
     Attributes:
         position: complex (N,), east + i north of the network.
@@ -65,7 +60,7 @@ class InitialOrientation:
         component: int32 (N,), connected parts of the pair graph, the largest is 0.
         pair_ok: bool (E,), pairs that agree with the network. gps_ok: bool (N,), records that do.
         gps_residual: complex (N,), recorded minus network's position, lag removed. lag: float64 (V,) seconds.
-        yaw_known: bool (N,), whether pictures told the heading. scale_known: bool (L,), the ground scale.
+        yaw_known: bool (N,), whether pairs give the heading. scale_known: bool (L,), the ground scale.
         recorded_focal: float64 (L,), focal length that the recorded heights imply, NaN where they are impossible.
         tags: for each vehicle, which recorded heading follows the pictures.
         graph: pairs between level pictures. misfit: median misfit of pairs in pixels, before and after levelling.
@@ -97,7 +92,7 @@ class InitialOrientation:
         return rotation_of(self.yaw, self.level)
 
     def middle(self) -> Complex:
-        """Ground point that each picture shows in its middle, complex (N,)."""
+        """Ground point at each picture's centre, complex (N,)."""
         axis = self.level[:, :, 2]
         ahead = (axis[:, 0] - 1j * axis[:, 1]) / np.maximum(axis[:, 2], 0.3)
         return np.asarray(self.position + self.height * ahead * np.exp(-1j * self.yaw))
@@ -106,33 +101,35 @@ class InitialOrientation:
 def find_initial_orientation(
     records: PhotoRecords, pairs: Sequence[Pair], features: Sequence[Features]
 ) -> InitialOrientation:
-    """Find start values of all photos.
+    """Find the initial orientation of all photos.
 
     Args:
         records: of N photos.
-        pairs: trusted matches.
+        pairs: verified matches.
         features: of each photo.
     """
+    config = active().initial
+    tilt_floor = float(np.radians(config.tilt_floor_deg))
     count, segments = len(records), int(records.segment.max()) + 1
     lens_of = np.asarray(first_of(records.segment, records.lens, segments), np.int32)
     matches = Matches.of(pairs, features)
-    believed, believed_sigma = focal_by_hint(records)
-    shape = _shape(matches, records, believed, believed_sigma)
+    hint, hint_sigma = focal_by_hint(records)
+    shape = _shape(matches, records, hint, hint_sigma)
     graph = similarities(matches, records, shape)
     metres, scale_known = first_scale(graph, records, lens_of, np.exp(shape.log_focal))
     component = components(graph, count)
     yaw = chain_headings(graph, count)
     no_offset = np.zeros(count, np.complex128)
-    for round_ in range(_ROUNDS):
+    for round_ in range(config.rounds):
         focal = np.exp(shape.log_focal)
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
         if round_ == 0 or _differs(by_height, focal):
-            shape = _shape(matches, records, *_combine(believed, believed_sigma, by_height))
+            shape = _shape(matches, records, *_combine(hint, hint_sigma, by_height))
             graph = similarities(matches, records, shape)
             focal = np.exp(shape.log_focal)
         relative = relative_scales(graph, records, heights, count)
-        tilt_px = np.maximum(2.0 * shape.tilt_sigma, _TILT_FLOOR) * focal[lens_of]
+        tilt_px = np.maximum(config.tilt_sigma_factor * shape.tilt_sigma, tilt_floor) * focal[lens_of]
         course, sigma = course_headings(
             graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
         )
@@ -173,22 +170,27 @@ def find_initial_orientation(
 
 
 def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
+    config = active().initial
     tagged = np.isfinite(records.pitch)
     segments = int(records.segment.max()) + 1
     share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
-    tilt_sigma = np.where(share > 0.5, _TAG_TILT_SIGMA, _FREE_TILT_SIGMA)
+    tilt_sigma: Array = np.where(
+        share > config.tag_tilt_share,
+        float(np.radians(config.tag_tilt_sigma_deg)),
+        float(np.radians(config.free_tilt_sigma_deg)),
+    )
     return solve_tilt_and_lens(matches, records, records.tag_level(), log_focal, log_focal_sigma, tilt_sigma)
 
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
-    """Belief in the focal length from tags together with recorded heights (12 %: takeoff level is not ground level)."""
-    weight = np.where(np.isfinite(by_height), _HEIGHT_SIGMA**-2, 0.0)
+    """Weighted mean of the log focal lengths by tags and by recorded heights, and its sigma, float64 (L,) both."""
+    weight = np.where(np.isfinite(by_height), active().initial.height_focal_sigma ** -2, 0.0)
     total = sigma**-2 + weight
     return (log_focal * sigma**-2 + weight * np.log(np.where(weight > 0, by_height, 1.0))) / total, total**-0.5
 
 
 def _differs(one: Array, two: Array) -> bool:
-    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > 0.03)))
+    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > active().initial.focal_change)))
 
 
 def _network_priors(
@@ -202,13 +204,23 @@ def _network_priors(
     focal: Array,
 ) -> NetworkPriors:
     """Segments of one lens share its metres per pixel, scaled by their recorded heights where these are possible."""
-    link, link_sigma = np.ones(len(metres)), np.full(len(metres), 0.15)
+    config = active().initial
+    link, link_sigma = np.ones(len(metres)), np.full(len(metres), config.link_sigma)
     for k in range(len(focal)):
         rows = lens_of == k
         if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
             link[rows] = heights.segment[rows] / np.median(heights.segment[rows])
-            link_sigma[rows] = 0.03
-    return NetworkPriors(metres, relative, link, link_sigma, 0.5, tilt_px, lens_of, records.vehicle)
+            link_sigma[rows] = config.link_height_sigma
+    return NetworkPriors(
+        metres=metres,
+        relief=relative,
+        link=link,
+        link_sigma=link_sigma,
+        metres_sigma=config.lens_scale_sigma,
+        offset_sigma=tilt_px,
+        lens=lens_of,
+        vehicle=records.vehicle,
+    )
 
 
 def _fill_headings(
@@ -217,7 +229,9 @@ def _fill_headings(
     """Headings of parts that no course fixes: by the tag that follows the pictures elsewhere, else the way flown."""
     yaw = yaw.copy()
     velocity = records.velocity()
-    course = np.where(np.abs(velocity) > 0.3, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan)
+    course = np.where(
+        np.abs(velocity) > active().initial.course_least_m_s, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan
+    )
     guess = np.full(len(yaw), np.nan)
     for v, tag in enumerate(tags):
         rows = records.vehicle == v

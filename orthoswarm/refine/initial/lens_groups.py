@@ -1,4 +1,4 @@
-"""Whether cameras that go by one name have one lens: zooms and sister models do not, and pictures tell.
+"""Whether cameras of one name have one lens: zooms and sister models do not, and the pictures show it.
 
 A lens that is shared by cameras of different focal length bends the ground and every camera over it (measured: fields
 of view of 95 and 105 degrees under one name came out 10 degrees off, heights 24 m off 150 m).
@@ -8,13 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
-
-_UNLIKE_SIGMAS = 2.5
-_UNLIKE_SHARE = 0.06
-_ONE_WAY = 0.9
-"""Length of the mean of headings from which on the shapes of matches do not tell the focal length."""
 
 
 def lens_per_vehicle(records: PhotoRecords) -> PhotoRecords:
@@ -33,9 +29,10 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
     Returns:
         The same records where no vehicle's focal length is unlike that of others of its name.
     """
+    one_way = active().initial.one_way_concentration
     vehicles = len(alone.focal)
     name = np.array([int(records.lens[records.vehicle == v][0]) for v in range(vehicles)])
-    sure = np.array([abs(np.exp(1j * alone.yaw[records.vehicle == v]).mean()) < _ONE_WAY for v in range(vehicles)])
+    sure = np.array([abs(np.exp(1j * alone.yaw[records.vehicle == v]).mean()) < one_way for v in range(vehicles)])
     lens = np.zeros(vehicles, np.int32)
     count = 0
     for k in np.unique(name):
@@ -51,14 +48,16 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
 
 def _groups(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
     """Group of each vehicle (V,): the surest first, a new group where a value is unlike all groups there are."""
+    config = active().initial
     group = np.zeros(len(log_focal), np.int32)
     weight, mean = np.zeros(0), np.zeros(0)
     for v in sorted(range(len(log_focal)), key=lambda v: (not sure[v], sigma[v])):
         off = np.abs(log_focal[v] - mean)
         near = int(off.argmin()) if len(off) else -1
-        limit = (
-            0.0 if near < 0 else max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * float(np.hypot(sigma[v], weight[near] ** -0.5)))
-        )
+        limit = 0.0
+        if near >= 0:
+            total_sigma = float(np.hypot(sigma[v], weight[near] ** -0.5))
+            limit = max(config.unlike_share, config.unlike_sigmas * total_sigma)
         if near < 0 or (sure[v] and off[near] > limit):
             group[v] = len(mean)
             weight, mean = np.append(weight, sigma[v] ** -2), np.append(mean, log_focal[v])

@@ -1,7 +1,7 @@
-"""The pair graph of a set of photos: features of all, matches of the pairs worth trying, start values as they come.
+"""The pair graph of a set of photos: features of all, matches of candidate pairs, initial orientation as it improves.
 
-Which pairs are worth trying depends on where the photos look, and that depends on the tilt, which only pairs tell: so
-pairs in order of time come first, then near ones, then more for photos that have few.
+Which pairs are candidates depends on where the photos look, and so on the tilt, which only pairs give: pairs in order
+of time come first, then near ones, then more for photos that have few.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,27 +11,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
-from orthoswarm.refine.features.sift_features import FINE_PIXELS, WORKING_PIXELS, Features, detect
+from orthoswarm.refine.features.sift_features import Features, detect
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
 
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
 Progress = Callable[[str, int, int], None]
-
-REACH_SHARE = 0.68
-_WIDE_REACH_SHARE = 0.8
-_FIRST_COUNT = 3
-_COUNT = 6
-_MORE_COUNT = 12
-_ENOUGH_PAIRS = 5
-_WEAK_PAIRS = 2
-_WEAK_MATCHES = 40
-_CHUNK = 64
 
 
 @dataclass(slots=True)
@@ -58,18 +49,19 @@ class PairGraphBuilder:
     def detect_all(self) -> None:
         """Find the features of all photos."""
         self.features = [Features.none(f.width, f.height) for f in self.frames]
-        self._detect(list(range(len(self.frames))), WORKING_PIXELS)
+        self._detect(list(range(len(self.frames))), active().features.sift_pixels)
 
     def try_pairs(self, pairs: Ints) -> None:
         """Match pairs that were not tried yet."""
         fresh = [(int(a), int(b)) for a, b in pairs if (int(a), int(b)) not in self.tried]
-        chunks = [fresh[k : k + _CHUNK] for k in range(0, len(fresh), _CHUNK)]
+        size = active().initial.pairs_per_task
+        chunks = [fresh[k : k + size] for k in range(0, len(fresh), size)]
         tasks = [(chunk, {k: self.features[k] for pair in chunk for k in pair}) for chunk in chunks]
         done = 0
         for chunk, matches in zip(chunks, self.run(match_chunk, tasks), strict=True):
             self.tried.update(zip(chunk, matches, strict=True))
             done += len(chunk)
-            self._tell("pairs", done, len(fresh))
+            self._report("pairs", done, len(fresh))
 
     def pairs(self) -> list[Pair]:
         """The matched pairs in order."""
@@ -96,7 +88,7 @@ class PairGraphBuilder:
 
     def redetect(self, weak: NDArray[np.bool_]) -> None:
         """Find features of weak photos on larger pictures and forget their pairs."""
-        self._detect(np.flatnonzero(weak).tolist(), FINE_PIXELS)
+        self._detect(np.flatnonzero(weak).tolist(), active().features.sift_fine_pixels)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
 
     def _detect(self, photos: list[int], pixels: int) -> None:
@@ -107,9 +99,9 @@ class PairGraphBuilder:
                 self.damaged[k] = result
             else:
                 self.features[k] = result
-            self._tell("features", n + 1, len(photos))
+            self._report("features", n + 1, len(photos))
 
-    def _tell(self, stage: str, done: int, total: int) -> None:
+    def _report(self, stage: str, done: int, total: int) -> None:
         if self.progress:
             self.progress(stage, done, total)
 
@@ -121,7 +113,7 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
     except PictureError as error:
         return str(error)
     rows, columns = gray.shape
-    if abs(columns * frame.height - rows * frame.width) > 0.02 * columns * frame.height:
+    if abs(columns * frame.height - rows * frame.width) > active().initial.header_size_share * columns * frame.height:
         return f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"
     return detect(gray, frame.width, frame.height, pixels)
 
@@ -134,23 +126,24 @@ def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list
 
 def build_pair_graph(builder: PairGraphBuilder) -> InitialOrientation:
     """Find features, pairs and start values of all photos; the builder holds what was found."""
+    config = active().initial
     records = builder.records
     builder.detect_all()
     builder.try_pairs(consecutive(records.vehicle, records.time_s))
     start = builder.start()
-    for count in (_FIRST_COUNT, _COUNT):
-        builder.try_pairs(builder.near(start, count, REACH_SHARE))
+    for count in (config.pairs_first, config.pairs_usual):
+        builder.try_pairs(builder.near(start, count, config.pair_reach_share))
         start = builder.start()
-    few = builder.degree()[0] < _ENOUGH_PAIRS
+    few = builder.degree()[0] < config.enough_pairs
     if few.any():
-        builder.try_pairs(builder.near(start, _MORE_COUNT, REACH_SHARE, few))
+        builder.try_pairs(builder.near(start, config.pairs_more, config.pair_reach_share, few))
         start = builder.start()
     pairs, matches = builder.degree()
-    weak = (pairs < _WEAK_PAIRS) | (matches < _WEAK_MATCHES)
+    weak = (pairs < config.weak_pairs) | (matches < config.weak_matches)
     weak[list(builder.damaged)] = False
     if weak.any():
         builder.redetect(weak)
-        builder.try_pairs(builder.near(start, _MORE_COUNT, _WIDE_REACH_SHARE, weak))
+        builder.try_pairs(builder.near(start, config.pairs_more, config.weak_reach_share, weak))
         builder.try_pairs(consecutive(records.vehicle, records.time_s))
         start = builder.start()
     return start

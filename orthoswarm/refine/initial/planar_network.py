@@ -1,8 +1,8 @@
-"""The network of photos in the plane: positions, ground scale, nadir offset and lag together, one sparse robust solve.
+"""The network of photos in the plane: positions, ground scale, nadir offset and lag in one sparse robust adjustment.
 
 Given the headings everything is linear: P(second) - P(first) = m R (z - o) of the first minus the same of the second,
-for the middle of a pair's matches, against recorded positions. A wrong pair disagrees with the network, and so
-does a wrong position record; each is told from the other because photos have several neighbours.
+for the centre of a pair's matches, together with recorded positions. A wrong pair disagrees with the network, and so
+does a wrong position; as photos have several neighbours, the one can be distinguished from the other.
 """
 
 from dataclasses import dataclass, field
@@ -13,19 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
+from orthoswarm.config import active
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
-
-LAG_SPREAD_S = 0.3
-_LAG_SIGMA_S = 0.5
-_PAIR_SIGMA_M = 0.6
-_PAIR_SHARE = 0.05
-_C_SCHEDULE = (400.0, 400.0, 36.0, 9.0, 9.0)
-_GATE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkPriors:
-    """What is believed of the common unknowns before the network is solved (S segments, N photos).
+    """Priors of the common unknowns of the network (S segments, N photos).
 
     Attributes:
         metres: float64 (S,), metres per pixel. relief: float64 (N,), its factor for each photo (the photo's height
@@ -132,6 +126,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         yaw: float64 (N,), grid headings.
         beliefs: priors of the common unknowns.
     """
+    config = active().initial
     at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
     rows = _Rows(at.size)
     pair_sigma = _pair_rows(rows, at, graph, records, np.exp(-1j * yaw), beliefs)
@@ -142,7 +137,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     x[: 2 * at.photos] = np.r_[records.position.real, records.position.imag]
     x[at.metres : at.offset] = beliefs.metres
     pairs, photos = len(graph), at.photos
-    for c in _C_SCHEDULE:
+    for c in config.network_schedule:
         residual = (rhs - matrix @ x)[: 2 * (pairs + photos)]
         weight = np.ones(len(rhs))
         weight[: 2 * pairs] = np.tile(_robust(residual[: 2 * pairs], c), 2)
@@ -160,8 +155,8 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         offset=(q[0] + 1j * q[1]) / metres,
         offset_sigma=_sigmas(factor, at).max(0) / metres,
         lag=lag,
-        pair_ok=_norm(residual[: 2 * pairs]) < _GATE,
-        gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < _GATE,
+        pair_ok=_norm(residual[: 2 * pairs]) < config.network_gate_sigmas,
+        gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < config.network_gate_sigmas,
         gps_residual=records.position + lag[beliefs.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
         pair_residual=(residual[:pairs] + 1j * residual[pairs : 2 * pairs]) * pair_sigma,
     )
@@ -189,11 +184,12 @@ def _pair_rows(
     rows: _Rows, at: _Columns, graph: PairGraph, records: PhotoRecords, unit: Complex, b: NetworkPriors
 ) -> Array:
     """East, then north rows of all pairs; returns their one sigma in metres (E,)."""
+    config = active().initial
     i, j = graph.first, graph.second
     si, sj = records.segment[i], records.segment[j]
     ui, uj = unit[i] * b.relief[i], unit[j] * b.relief[j]
     reach = np.abs(b.metres[si] * graph.centre_first) + np.abs(b.metres[sj] * graph.centre_second)
-    sigma = np.asarray(_PAIR_SIGMA_M + _PAIR_SHARE * reach)
+    sigma = np.asarray(config.pair_sigma_m + config.pair_sigma_share * reach)
     for part, axis in ((0, 1.0 + 0j), (1, -1j)):  # the real part of axis * value: east, then north
         east = part * at.photos
         rows.block(
@@ -212,12 +208,13 @@ def _pair_rows(
 
 def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:
     """Rows of recorded positions along and across the way flown: P - lag v = recorded; returns v (N,)."""
+    config = active().initial
     velocity = records.velocity()
     speed = np.abs(velocity)
-    ahead = np.where(speed > 0.1, velocity / np.maximum(speed, 1e-9), 1.0)
+    ahead = np.where(speed > config.network_still_m_s, velocity / np.maximum(speed, 1e-9), 1.0)
     across = records.gps_sigma()
     photo = np.arange(at.photos)
-    for axis, sigma in ((ahead, np.hypot(across, LAG_SPREAD_S * speed)), (1j * ahead, across)):
+    for axis, sigma in ((ahead, np.hypot(across, config.lag_spread_s * speed)), (1j * ahead, across)):
         rows.block(
             (records.position * np.conj(axis)).real / sigma,
             (photo, axis.real / sigma),
@@ -233,6 +230,6 @@ def _prior_rows(rows: _Rows, at: _Columns, b: NetworkPriors) -> None:
     rows.block(np.zeros(at.segments), (at.metres + segment, 1.0 / link), (at.lens + b.lens, -b.link / link))
     for part in (0, at.segments):
         rows.block(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
-    believed = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
-    rows.block(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * believed)))
-    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / _LAG_SIGMA_S))
+    expected = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
+    rows.block(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
+    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / active().records.lag_sigma_s))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
 from orthoswarm.refine.features.sift_features import Features
 
@@ -16,10 +17,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
-
-GPS_SIGMA_M = 1.5
-_STATED_FLOOR_M = 0.1
-MAX_TAG_TILT_RAD = float(np.radians(45.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,34 +56,36 @@ class PhotoRecords:
         return len(self.position)
 
     def gps_sigma(self) -> Array:
-        """One sigma of the recorded positions in metres, (N,): as stated (0.1 m at least), else 1.5."""
-        stated = np.hypot(self.position_sigma, _STATED_FLOOR_M)
-        return np.asarray(np.where(np.isfinite(stated), stated, GPS_SIGMA_M))
+        """One sigma of the recorded positions in metres, (N,): as stated (with a floor), else as configured."""
+        stated = np.hypot(self.position_sigma, active().initial.stated_sigma_floor_m)
+        return np.asarray(np.where(np.isfinite(stated), stated, active().records.position_sigma_m))
 
     def velocity(self) -> Complex:
         """Ground velocity, complex (N,) m/s, from the neighbours in the segment; 0 at turns and where unknown."""
+        config, pause_s = active().initial, active().records.pause_s
         v = np.zeros(len(self), np.complex128)
         for s in np.unique(self.segment):
             rows = np.flatnonzero(self.segment == s)
             dt, dp = np.diff(self.time_s[rows]), np.diff(self.position[rows])
-            good = (dt > 0.05) & (dt < 60.0) & (np.abs(dp) < 40.0 * dt)
+            good = (dt > config.velocity_least_s) & (dt < pause_s) & (np.abs(dp) < config.velocity_limit_m_s * dt)
             leap = np.where(good, dp / np.where(good, dt, 1.0), np.nan)
             sides = np.stack([np.r_[np.nan, leap], np.r_[leap, np.nan]])
             known = np.isfinite(sides)
             mean = np.where(known, sides, 0.0).sum(0) / np.maximum(known.sum(0), 1)
-            turn = known.all(0) & (np.abs(sides[0] - sides[1]) > 0.5 * np.abs(np.where(known, sides, 0.0)).max(0))
+            larger = np.abs(np.where(known, sides, 0.0)).max(0)
+            turn = known.all(0) & (np.abs(sides[0] - sides[1]) > config.velocity_turn_share * larger)
             v[rows] = np.where(turn, 0.0, mean)
         return v
 
     def tag_level(self) -> Array:
         """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where they say nothing.
 
-        A tag of more than 45 degrees off nadir is not believed as a start: such a picture could not be matched anyway.
+        Tags beyond `tag_tilt_limit_deg` count as none: such a picture could not be matched anyway.
         """
         pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
         roll = np.where(np.isfinite(self.roll), self.roll, 0.0)
         level = _from_level(0.0).T @ rotation_from_angles(0.0, pitch, roll)
-        level[level[:, 2, 2] < np.cos(MAX_TAG_TILT_RAD)] = np.eye(3)
+        level[level[:, 2, 2] < np.cos(float(np.radians(active().initial.tag_tilt_limit_deg)))] = np.eye(3)
         return np.asarray(level)
 
 
@@ -116,9 +115,15 @@ class PairGraph:
 
     @property
     def turn_sigma(self) -> Array:
-        """One sigma of the turn, radians (E,): a degree (relief, tilt), more for few, close or ill-fitting matches."""
+        """One sigma of the turn, radians (E,): larger for few, close or ill-fitting matches."""
+        config = active().initial
         arm = np.maximum(self.spread * np.abs(self.factor), 1.0)
-        return np.asarray(np.hypot(np.radians(1.0), 3.0 * self.residual / (arm * np.sqrt(self.count))))
+        return np.asarray(
+            np.hypot(
+                np.radians(config.turn_sigma_deg),
+                config.turn_misfit_sigmas * self.residual / (arm * np.sqrt(self.count)),
+            )
+        )
 
     @property
     def turn(self) -> Complex:

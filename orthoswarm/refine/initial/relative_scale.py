@@ -1,4 +1,4 @@
-"""Ground scale of photos and segments: from the way flown, from each other, from recorded heights."""
+"""Ground scale of photos and segments: by the way flown, by the zoom between photos, by recorded heights."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, PhotoRecords
-
-DEFAULT_FOV_RAD = float(np.radians(75.0))
-DEFAULT_HEIGHT_M = 60.0
-PLAUSIBLE_FOV_RAD = (float(np.radians(30.0)), float(np.radians(120.0)))
-_CLOSE_TURN = 0.9
-"""Cosine of the turn up to which a pair's shift hardly depends on the tilt."""
-_PAIR_SIGMA = 0.02
-_C_SCHEDULE = (100.0, 25.0, 9.0, 9.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,25 +34,27 @@ def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
         records: of N photos.
         above: float64 (S,), height of each segment above the ground as known so far (altitudes tell differences only).
     """
+    config = active().initial
+    share, least, most = config.height_known_share, 1.0 / config.height_ratio, config.height_ratio
     relative = np.full(len(records), np.nan)
     level = np.full(len(above), np.nan)
     for s in range(len(above)):
         rows = records.segment == s
         h, a = records.height_m[rows], records.altitude_m[rows]
-        if np.isfinite(h).sum() > 0.5 * rows.sum() and np.nanmedian(h) > 2.0:
+        if np.isfinite(h).sum() > share * rows.sum() and np.nanmedian(h) > config.height_least_m:
             level[s] = float(np.nanmedian(h))
             ratio = h / level[s]
-        elif np.isfinite(a).sum() > 0.5 * rows.sum():
+        elif np.isfinite(a).sum() > share * rows.sum():
             ratio = 1.0 + (a - np.nanmedian(a)) / above[s]
         else:
             continue
-        relative[rows] = np.where((ratio > 0.2) & (ratio < 5.0), ratio, np.nan)
+        relative[rows] = np.where((ratio > least) & (ratio < most), ratio, np.nan)
     known = np.isfinite(relative)
     return RecordedHeights(np.where(known, relative, 1.0), known, level)
 
 
 def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: Array) -> tuple[Array, Flags]:
-    """Metres per pixel of each segment (S,) from ways recorded and shifts seen, and which lenses (L,) had such.
+    """Metres per pixel of each segment (S,) by recorded ways over pictures' shifts, and which lenses (L,) have such.
 
     Pairs of nearly equal heading, whose shift does not depend on the tilt, count alone where there are any. A lens
     without a pair takes its recorded height and its focal length.
@@ -68,47 +63,51 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
         graph: pairs of level pictures.
         records: of all photos.
         lens_of: int32 (S,), lens of each segment.
-        focal: float64 (L,), pixels, as believed so far.
+        focal: float64 (L,), pixels, as known so far.
     """
+    config, default_m = active().initial, active().records.default_height_m
     i, j = graph.first, graph.second
     way = np.abs(records.position[j] - records.position[i])
     shift = np.abs(graph.centre_first - np.conj(graph.turn) * graph.centre_second)
-    same = (records.lens[i] == records.lens[j]) & (way > 3.0) & (shift > 0.02 * records.width[i])
-    straight = same & (graph.turn.real > _CLOSE_TURN)
-    by_lens, told = np.full(len(focal), np.nan), np.zeros(len(focal), bool)
-    recorded = recorded_heights(records, np.full(len(lens_of), DEFAULT_HEIGHT_M)).segment
+    same = (records.lens[i] == records.lens[j]) & (way > config.scale_least_way_m)
+    same &= shift > config.scale_least_shift_share * records.width[i]
+    straight = same & (graph.turn.real > config.scale_turn_cosine)
+    by_lens, measured = np.full(len(focal), np.nan), np.zeros(len(focal), bool)
+    recorded = recorded_heights(records, np.full(len(lens_of), default_m)).segment
     for k in range(len(focal)):
         mine = records.lens[i] == k
         rows = np.flatnonzero(straight & mine)
-        rows = rows if len(rows) >= 3 else np.flatnonzero(same & mine)
+        rows = rows if len(rows) >= config.scale_lens_pairs else np.flatnonzero(same & mine)
         if len(rows):
-            by_lens[k], told[k] = weighted_median(way[rows] / shift[rows], way[rows]), True
+            by_lens[k], measured[k] = weighted_median(way[rows] / shift[rows], way[rows]), True
         else:
             high = recorded[(lens_of == k) & np.isfinite(recorded)]
-            by_lens[k] = (float(np.median(high)) if len(high) else DEFAULT_HEIGHT_M) / focal[k]
+            by_lens[k] = (float(np.median(high)) if len(high) else default_m) / focal[k]
     metres = by_lens[lens_of]
     for s in range(len(lens_of)):
         rows = np.flatnonzero(straight & (records.segment[i] == s) & (records.segment[j] == s))
-        if len(rows) >= 5:
+        if len(rows) >= config.scale_segment_pairs:
             metres[s] = weighted_median(way[rows] / shift[rows], way[rows])
-    return np.asarray(metres), told
+    return np.asarray(metres), measured
 
 
 def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHeights, count: int) -> Array:
     """Metres per pixel of each photo over its segment's, float64 (N,), from the zoom between level pictures.
 
-    Recorded heights are believed to 3 %, none to 15 %; pairs of one segment to 2 % (relief). Robust.
+    One robust adjustment of the zooms within each segment, with the recorded heights as priors.
     """
+    config = active().initial
     i, j = graph.first, graph.second
     inside = np.flatnonzero(records.segment[i] == records.segment[j])
     i, j = i[inside], j[inside]
     zoom = np.log(np.maximum(np.abs(graph.factor[inside]), 1e-6))
     misfit = graph.residual[inside] / np.maximum(graph.spread[inside] * np.exp(zoom), 1.0)
-    sigma = np.hypot(_PAIR_SIGMA, 3.0 * misfit / np.sqrt(graph.count[inside]))
-    prior, prior_sigma = np.log(heights.relative), np.where(heights.known, 0.03, 0.15)
+    sigma = np.hypot(config.zoom_sigma, config.zoom_misfit_sigmas * misfit / np.sqrt(graph.count[inside]))
+    prior = np.log(heights.relative)
+    prior_sigma = np.where(heights.known, config.relative_height_sigma, config.relative_level_sigma)
     x = prior.copy()
     k = np.arange(len(inside))
-    for c in _C_SCHEDULE:
+    for c in config.scale_schedule:
         e = (zoom - (x[i] - x[j])) / sigma
         d = (prior - x) / prior_sigma
         w = 1.0 / ((1.0 + e * e / c) * sigma)
@@ -124,23 +123,26 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
 
 def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Array, lens_of: Ints) -> Array:
     """Focal length in pixels of each lens, height over metres per pixel, NaN where that is no lens that exists."""
+    narrowest, widest = np.radians(active().initial.hint_fov_deg)
     focal = np.full(len(records.fov_hint), np.nan)
     for k in range(len(focal)):
         rows = (lens_of == k) & np.isfinite(heights.segment)
         if rows.any():
             f = float(np.median(heights.segment[rows] / metres[rows]))
             view = fov_rad(f, int(records.width[records.lens == k][0]))
-            focal[k] = f if PLAUSIBLE_FOV_RAD[0] < view < PLAUSIBLE_FOV_RAD[1] else np.nan
+            focal[k] = f if narrowest < view < widest else np.nan
     return focal
 
 
 def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
-    """Log of the focal length in pixels of each lens, and its one sigma: tags to 6 %, else 75 degrees to 35 %."""
+    """Log of the focal length in pixels of each lens, by its tags or the default, and its sigma, float64 (L,) both."""
+    config = active().initial
+    narrowest, widest = np.radians(config.hint_fov_deg)
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
     with np.errstate(invalid="ignore"):
-        good = (records.fov_hint > PLAUSIBLE_FOV_RAD[0]) & (records.fov_hint < PLAUSIBLE_FOV_RAD[1])
-    view = np.where(good, records.fov_hint, DEFAULT_FOV_RAD)
-    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, 0.06, 0.35)
+        good = (records.fov_hint > narrowest) & (records.fov_hint < widest)
+    view = np.where(good, records.fov_hint, float(np.radians(config.default_fov_deg)))
+    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, config.hint_sigma, config.default_fov_sigma)
 
 
 def weighted_median(value: Array, weight: Array) -> float:

@@ -3,24 +3,18 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
-
-GAP_S = 180.0
-JUMP_M = 5.0
-LEG_GAP_S = 60.0
-STILL_M = 1.5
-TILT_JUMP_RAD = float(np.radians(1.5))
-JUMP_SIGMAS = 5.0
-"""A jump must stand out of the record's own noise as well: a camera that sways is not turned at every photo."""
 
 
 def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, pitch_rad: Array) -> Ints:
     """Number of the segment of each photo, int32 (N,), from 0 in order of first appearance.
 
-    A segment ends at a pause of more than 180 s (landing, battery), at a jump of the recorded height of more than 5 m
-    and at a jump of the recorded tilt of more than 1.5 degrees (the gimbal was turned), or of more than five sigmas of
-    the record's own noise if that is more. A jump that the very next photo takes back is a wrong tag and ends nothing.
+    A segment ends at a long pause (landing, battery), at a jump of the recorded height and at a jump of the recorded
+    tilt (the gimbal was turned) that exceeds the record's own noise. A jump that the very next photo takes back is a
+    wrong tag and ends nothing.
 
     Args:
         group: integers (N,), vehicle and lens; photos of a group stand in order of time.
@@ -28,13 +22,15 @@ def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, p
         height_m: float64 (N,), height or altitude, NaN where unknown.
         pitch_rad: float64 (N,), NaN where unknown.
     """
+    config = active().initial
+    tilt_rad = float(np.radians(config.segment_tilt_deg))
     segment = np.zeros(len(group), np.int32)
     used = 0
     for g in dict.fromkeys(group.tolist()):
         rows = np.flatnonzero(group == g)
         cut = np.zeros(len(rows), bool)
-        cut[1:] = np.diff(time_s[rows]) > GAP_S
-        cut |= _jumps(height_m[rows], JUMP_M) | _jumps(pitch_rad[rows], TILT_JUMP_RAD)
+        cut[1:] = np.diff(time_s[rows]) > config.segment_gap_s
+        cut |= _jumps(height_m[rows], config.segment_climb_m) | _jumps(pitch_rad[rows], tilt_rad)
         number = np.cumsum(cut)
         segment[rows] = used + number
         used += int(number[-1]) + 1
@@ -48,7 +44,7 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
     v = value[known]
     if len(v) > 2:
         noise = 1.4826 * float(np.median(np.abs(np.diff(v)))) / np.sqrt(2.0)
-        limit = max(limit, JUMP_SIGMAS * noise)
+        limit = max(limit, active().initial.segment_jump_sigmas * noise)
     level = 0
     for k in range(1, len(v)):
         if abs(v[k] - v[level]) <= limit:
@@ -59,9 +55,7 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
     return jump
 
 
-def photo_legs(
-    position: NDArray[np.complex128], segment: Ints, time_s: Array, turn_rad: float = float(np.radians(35.0))
-) -> Ints:
+def photo_legs(position: NDArray[np.complex128], segment: Ints, time_s: Array) -> Ints:
     """Leg of each photo, int32 (N,), numbered in order: runs of photos flown straight on; every photo has one.
 
     Made for photos far apart: two photos are a leg, and the way from the last photo of one to the first of the next
@@ -70,16 +64,17 @@ def photo_legs(
     Args:
         position: complex (N,), east + i north, in order of time.
         segment: int32 (N,); a leg lies in one segment.
-        time_s: float64 (N,), NaN where unknown; a pause of more than 60 s ends a leg.
-        turn_rad: a leg ends where a step leaves the mean of its steps by more than this.
+        time_s: float64 (N,), NaN where unknown; a pause ends a leg.
     """
+    config, pause_s = active().initial, active().records.pause_s
+    turn_rad = float(np.radians(config.leg_turn_deg))
     leg = np.zeros(len(position), np.int32)
     way = 0j
     for k in range(1, len(position)):
         step = complex(position[k] - position[k - 1])
-        still = abs(step) < STILL_M
+        still = abs(step) < config.leg_still_m
         turned = not still and abs(way) > 0 and abs(np.angle(step * np.conj(way))) > turn_rad
-        new = segment[k] != segment[k - 1] or time_s[k] - time_s[k - 1] > LEG_GAP_S or turned
+        new = segment[k] != segment[k - 1] or time_s[k] - time_s[k - 1] > pause_s or turned
         leg[k] = leg[k - 1] + int(new)
         way = 0j if new else way + (0j if still else step)
     return leg

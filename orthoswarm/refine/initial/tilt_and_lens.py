@@ -1,6 +1,6 @@
-"""Tilt, focal length and distortion from the shapes of matches alone: no positions, no tags.
+"""Tilt, focal length and radial distortion from the shapes of matches alone: no positions, no tags.
 
-Level pictures of flat ground are similar figures; tilt, and radial distortion, bend them in ways that no turn, shift or
+Level pictures of flat ground are similar figures; tilt and radial distortion bend them in ways that no turn, shift or
 zoom explains. The tilt of each segment and the lens are changed until the matches of all pairs fit similarities best:
 Gauss-Newton on what is left after each pair's own similarity is projected out (variable projection, Golub and Pereyra
 1973). Relief disturbs each pair, but not all of them alike.
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.refine.initial.planar_similarity import (
@@ -24,14 +25,6 @@ from orthoswarm.refine.initial.planar_similarity import (
     centred,
     level_from_nadir,
 )
-
-_ITERATIONS = 12
-_SETTLED = 1e-3
-_MOST_MATCHES = 64
-_INFORMATION = 0.05
-"""Share of independent matches: relief moves neighbouring points together."""
-_FLOOR_SHARE = 1e-3
-"""Least misfit that is believed, as a share of the picture's width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,18 +45,19 @@ class Matches:
 
     @classmethod
     def of(cls, pairs: Sequence[Pair], features: Sequence[Features]) -> "Matches":
-        """Gather the matches, at most 64 a pair."""
+        """Gather the matches, evenly picked where a pair has many."""
+        most = active().initial.shape_most_matches
         z = [centred(f) for f in features]
-        picked = [p.match[_spaced(len(p.match))] for p in pairs]
+        picked = [p.match[_spaced(len(p.match), most)] for p in pairs]
         start = np.concatenate([[0], np.cumsum([len(m) for m in picked], dtype=np.int64)])
         none = [np.zeros(0, np.complex128)]
         return cls(
-            np.array([p.first for p in pairs], np.int32),
-            np.array([p.second for p in pairs], np.int32),
-            start.astype(np.int64),
-            np.array([len(p) for p in pairs], np.int64),
-            np.concatenate([z[p.first][m[:, 0]] for p, m in zip(pairs, picked)] or none),
-            np.concatenate([z[p.second][m[:, 1]] for p, m in zip(pairs, picked)] or none),
+            first=np.array([p.first for p in pairs], np.int32),
+            second=np.array([p.second for p in pairs], np.int32),
+            start=start.astype(np.int64),
+            count=np.array([len(p) for p in pairs], np.int64),
+            p=np.concatenate([z[p.first][m[:, 0]] for p, m in zip(pairs, picked)] or none),
+            q=np.concatenate([z[p.second][m[:, 1]] for p, m in zip(pairs, picked)] or none),
         )
 
 
@@ -85,10 +79,10 @@ class TiltAndLens:
     misfit: tuple[float, float]
 
 
-def _spaced(count: int) -> NDArray[np.intp]:
-    if count <= _MOST_MATCHES:
+def _spaced(count: int, most: int) -> NDArray[np.intp]:
+    if count <= most:
         return np.arange(count)
-    return np.linspace(0, count - 1, _MOST_MATCHES).astype(np.intp)
+    return np.linspace(0, count - 1, most).astype(np.intp)
 
 
 def solve_tilt_and_lens(
@@ -98,7 +92,6 @@ def solve_tilt_and_lens(
     log_focal: Array,
     log_focal_sigma: Array,
     tilt_sigma: Array,
-    bend_sigma: float = 0.06,
 ) -> TiltAndLens:
     """Find tilt, focal length and first radial term that make the matches similar figures.
 
@@ -106,90 +99,95 @@ def solve_tilt_and_lens(
         matches: of all pairs.
         records: of N photos in S segments, L lenses.
         level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none).
-        log_focal: float64 (L,), belief.
+        log_focal: float64 (L,), prior.
         log_focal_sigma: float64 (L,), its one sigma.
         tilt_sigma: float64 (S,), one sigma of the tilt about that of `level`, radians.
-        bend_sigma: one sigma of the radial distortion at the picture's corner, as a share of the radius.
     """
+    config = active().initial
     segments, lenses = int(records.segment.max()) + 1, len(log_focal)
     size = 2 * segments + 2 * lenses
     sigma = np.concatenate(
-        [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, bend_sigma)], 1).ravel()]
+        [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, config.shape_bend_sigma)], 1).ravel()]
     )
     total = np.zeros(size)
     first_misfit = float("nan")
     level = level.copy()
     lens = np.stack([log_focal, np.zeros(lenses), corner_radius(records) ** 2], axis=1)
     normal, misfit = np.zeros((size, size)), np.zeros(len(matches.first))
-    for _ in range(_ITERATIONS):
+    for _ in range(config.shape_iterations):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         _accumulate(
-            matches.first,
-            matches.second,
-            matches.start,
-            matches.p,
-            matches.q,
-            level,
-            lens,
-            records.lens,
-            records.segment,
-            _FLOOR_SHARE * records.width,
-            normal,
-            gradient,
-            misfit,
+            first=matches.first,
+            second=matches.second,
+            start=matches.start,
+            p=matches.p,
+            q=matches.q,
+            level=level,
+            lens=lens,
+            lens_id=records.lens,
+            segment=records.segment,
+            floor=config.shape_floor_share * records.width,
+            rounds=config.shape_rounds,
+            robust=config.shape_robust_scale,
+            normal=normal,
+            gradient=gradient,
+            misfit=misfit,
         )
         if np.isnan(first_misfit) and len(misfit):
             first_misfit = float(np.median(misfit))
-        normal = _INFORMATION * normal + np.diag(sigma**-2)
-        step = np.linalg.solve(normal, _INFORMATION * gradient - total / sigma**2)
-        step *= min(1.0, 0.15 / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
+        normal = config.shape_independent_share * normal + np.diag(sigma**-2)
+        step = np.linalg.solve(normal, config.shape_independent_share * gradient - total / sigma**2)
+        step *= min(1.0, config.shape_tilt_step_rad / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
         total += step
         for s in range(segments):
             rows = records.segment == s
             level[rows] = level_from_nadir(complex(step[2 * s], step[2 * s + 1]), 1.0) @ level[rows]
         lens[:, :2] += step[2 * segments :].reshape(-1, 2)
-        lens[:, 1] = np.clip(lens[:, 1], -0.3, 0.3)
-        if np.abs(step).max() < _SETTLED:
+        lens[:, 1] = np.clip(lens[:, 1], -config.shape_bend_limit, config.shape_bend_limit)
+        if np.abs(step).max() < config.shape_settled:
             break
     deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
     last_misfit = float(np.median(misfit)) if len(misfit) else float("nan")
     return TiltAndLens(
-        level,
-        deviation[: 2 * segments].reshape(-1, 2).max(1),
-        lens[:, 0].copy(),
-        deviation[2 * segments :: 2].copy(),
-        lens[:, 1] * np.exp(2.0 * lens[:, 0]) / lens[:, 2],
-        (first_misfit, last_misfit),
+        level=level,
+        tilt_sigma=deviation[: 2 * segments].reshape(-1, 2).max(1),
+        log_focal=lens[:, 0].copy(),
+        log_focal_sigma=deviation[2 * segments :: 2].copy(),
+        k1=lens[:, 1] * np.exp(2.0 * lens[:, 0]) / lens[:, 2],
+        misfit=(first_misfit, last_misfit),
     )
 
 
 def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) -> PairGraph:
     """The similarity of every pair between its level, undistorted pictures."""
+    config = active().initial
     pairs = len(matches.first)
     table = np.zeros((pairs, 5), np.complex128)
     radius = corner_radius(records)
     lens = np.stack([shape.log_focal, shape.k1 * radius**2 * np.exp(-2.0 * shape.log_focal), radius**2], axis=1)
     _similarities(
-        matches.first,
-        matches.second,
-        matches.start,
-        matches.p,
-        matches.q,
-        shape.level,
-        lens,
-        records.lens,
-        _FLOOR_SHARE * records.width,
-        table,
+        first=matches.first,
+        second=matches.second,
+        start=matches.start,
+        p=matches.p,
+        q=matches.q,
+        level=shape.level,
+        lens=lens,
+        lens_id=records.lens,
+        floor=config.shape_floor_share * records.width,
+        rounds=config.shape_rounds,
+        robust=config.shape_robust_scale,
+        table=table,
     )
     return PairGraph(
-        matches.first,
-        matches.second,
-        table[:, 0].copy(),
-        table[:, 1].copy(),
-        table[:, 2].copy(),
-        matches.count,
-        table[:, 3].real.copy(),
-        table[:, 4].real.copy(),
+        first=matches.first,
+        second=matches.second,
+        factor=table[:, 0].copy(),
+        centre_first=table[:, 1].copy(),
+        centre_second=table[:, 2].copy(),
+        count=matches.count,
+        spread=table[:, 3].real.copy(),
+        residual=table[:, 4].real.copy(),
     )
 
 
@@ -220,13 +218,16 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
 
 
 @kernel
-def _fit(p, q, n, floor, w):  # type: ignore[no-untyped-def]
-    """Robust similarity q = a p + b: a, mean p, mean q, scale of the misfit; weights are left in w."""
+def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
+    """Robust similarity q = a p + b: a, mean p, mean q, scale of the misfit; weights are left in w.
+
+    floor: least scale. rounds: of reweighting. robust: scale of the kernel in scales of the misfit.
+    """
     misfit = np.empty(n)
     for k in range(n):
         w[k] = 1.0
     a, cp, cq, scale = 1.0 + 0.0j, 0.0j, 0.0j, floor
-    for _ in range(4):
+    for _ in range(rounds):
         total = 0.0
         cp, cq = 0.0j, 0.0j
         for k in range(n):
@@ -245,7 +246,7 @@ def _fit(p, q, n, floor, w):  # type: ignore[no-untyped-def]
             misfit[k] = abs(q[k] - cq - a * (p[k] - cp))
         scale = max(np.median(misfit), floor)
         for k in range(n):
-            e = misfit[k] / (2.0 * scale)
+            e = misfit[k] / (robust * scale)
             w[k] = 1.0 / ((1.0 + e * e) * (1.0 + e * e))
     return a, cp, cq, scale
 
@@ -279,7 +280,23 @@ def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _accumulate(first, second, start, p, q, level, lens, lens_id, segment, floor, normal, gradient, misfit):  # type: ignore[no-untyped-def]
+def _accumulate(  # type: ignore[no-untyped-def]
+    first,
+    second,
+    start,
+    p,
+    q,
+    level,
+    lens,
+    lens_id,
+    segment,
+    floor,
+    rounds,
+    robust,
+    normal,
+    gradient,
+    misfit,
+):
     """Normal equations of tilt (2 S) and lens (2 L) after each pair's similarity is projected out."""
     segments, most = segment.max() + 1, 0
     for e in range(len(first)):
@@ -295,7 +312,7 @@ def _accumulate(first, second, start, p, q, level, lens, lens_id, segment, floor
         for k in range(n):
             zp[k] = _flatten(pe[k], level[i], fi, ki, ri, 0.0, 0.0)
             zq[k] = _flatten(qe[k], level[j], fj, kj, rj, 0.0, 0.0)
-        a, cp, cq, scale = _fit(zp, zq, n, floor[j], w)
+        a, cp, cq, scale = _fit(zp, zq, n, floor[j], rounds, robust, w)
         misfit[e] = scale
         for k in range(n):
             r[k] = zq[k] - cq - a * (zp[k] - cp)
@@ -323,7 +340,7 @@ def _accumulate(first, second, start, p, q, level, lens, lens_id, segment, floor
 
 
 @kernel
-def _similarities(first, second, start, p, q, level, lens, lens_id, floor, table):  # type: ignore[no-untyped-def]
+def _similarities(first, second, start, p, q, level, lens, lens_id, floor, rounds, robust, table):  # type: ignore[no-untyped-def]
     for e in range(len(first)):
         i, j = first[e], second[e]
         n = start[e + 1] - start[e]
@@ -333,7 +350,7 @@ def _similarities(first, second, start, p, q, level, lens, lens_id, floor, table
         for k in range(n):
             zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
             zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
-        a, cp, cq, scale = _fit(zp, zq, n, floor[j], w)
+        a, cp, cq, scale = _fit(zp, zq, n, floor[j], rounds, robust, w)
         spread = 0.0
         for k in range(n):
             spread += abs(zp[k] - cp) ** 2

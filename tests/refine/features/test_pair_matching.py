@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.refine.features.overlap import forward_overlap
-from orthoswarm.refine.features.pair_matching import MIN_INLIERS, Pair, consecutive, match_features, nearby
+from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
 from orthoswarm.refine.features.sift_features import Features, detect, reduce_picture, spread
 from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
 from tests.kit.sparse_world import texture
@@ -132,7 +132,7 @@ def test_tracks_never_hold_two_points_of_a_photo_nor_more_than_the_longest(seed)
         first = rng.permutation(count)[:n]
         second = np.where(wrong >= 0, wrong, first)
         pairs.append(Pair(a, b, np.stack([first, second], 1).astype(np.int32)))
-    tracks = build_tracks(features, pairs, max_length=20)
+    tracks = build_tracks(features, pairs)
     length = np.bincount(tracks.point)
     assert (length >= 2).all()
     assert (length <= 20).all()
@@ -170,7 +170,7 @@ def test_thinning_keeps_every_cell_that_was_covered():
     same = np.stack([np.arange(400)] * 2, 1).astype(np.int32)
     tracks = build_tracks(features, [Pair(0, 1, same), Pair(1, 2, same[:200]), Pair(2, 3, same[:100])])
     size = np.full(4, 100.0)
-    thin = thin_tracks(tracks, size, size, 2)
+    thin = thin_tracks(tracks, size, size)
     assert len(thin.camera) < 0.8 * len(tracks.camera)
 
     def cells(t):
@@ -195,4 +195,3 @@ def test_overlap_of_unrelated_pictures_is_nothing_and_not_dense():
     overlap = forward_overlap(frames, lambda f: texture(10 + int(f.image[0]))[:360, :480])
     assert overlap.share == 0.0
     assert not overlap.dense
-    assert MIN_INLIERS >= 15

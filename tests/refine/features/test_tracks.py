@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.model.camera import rotation_from_angles
-from orthoswarm.refine.features.tracks import CELL_PX, Tracker, predicted_homography
+from orthoswarm.refine.features.tracks import Tracker, predicted_homography
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_there_is_at_most_one_track_in_a_cell(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(8)]
     tracker, _ = follow(ground, matrices)
     live = tracker._live
-    cells = np.floor(live.uv / CELL_PX).astype(int)
+    cells = np.floor(live.uv / tracker.cell_px).astype(int)
     old = live.age > 0
     assert len(np.unique(cells[old], axis=0)) == old.sum()
 
