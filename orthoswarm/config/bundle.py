@@ -41,7 +41,7 @@ class BundleConfig:
     """Recorded heights are contradicted where the offset that pictures alone give exceeds so many of its sigmas."""
     contradiction_share: float = 0.15
     """... and this share of the height: distortion and principal point of real lenses, as far as they are not modelled,
-    also look like a wrong height (measured: 10 % on a lens of k1 = -0.4 seen straight down)."""
+    also look like a wrong height (measured: 10 % on a lens of k1 = -0.4 that looks straight down)."""
     agreement_sigmas: float = 2.0
     """What an offset exceeds so many sigmas by enters the sigma of the field of view (chosen; not measured)."""
     covariance_every_photos: int = 24
@@ -60,12 +60,12 @@ class BundleConfig:
     """Factor of the covariance where map ties hold a photo: corners are followed better than their sigma says (0.05 and
     not 0.35 px, with a drift between; fitted as above)."""
     scatter_least_ties: int = 40
-    """With fewer ties than this the adjustment follows them, and their residuals say little: their scatter is then at
-    least their sigma (chosen; not measured)."""
+    """With fewer ties the adjustment follows them, and their residuals are too small: their scatter is then at least
+    their sigma (chosen; not measured)."""
     systematic_least_ties: int = 4
-    """Fewer ties about a photo do not tell whether the map is systematically off there (chosen; not measured)."""
+    """With fewer ties about a photo a systematic offset of the map there is not estimated (chosen; not measured)."""
     systematic_reach_photos: int = 4
-    """Ties of so many photos before and after, of the same leg, tell whether the map is off about a photo (chosen)."""
+    """... which uses the ties of so many photos before and after, of the same leg (chosen; not measured)."""
     systematic_sigmas: float = 2.0
     """So many sigmas of the ties' median are taken off before it counts as a systematic offset (chosen)."""
     oblique_axis_down: float = 0.2

@@ -37,7 +37,7 @@ class FeaturesConfig:
     flow_gate_px: float = 5.0
     """Flow that is farther from the median of its picture is dropped, pixels (chosen; not measured)."""
     flow_least: int = 3
-    """Fewer corners that agree say nothing (chosen; not measured)."""
+    """Fewer corners that agree are no consensus (chosen; not measured)."""
     shift_below_share: float = 0.3
     """Where a smaller share of the corners is followed, its shift is measured on the whole picture (chosen)."""
     shift_below_corners: int = 6
@@ -100,21 +100,21 @@ class FeaturesConfig:
     calibration_response: float = 0.03
     """Least response of the pair's phase correlation (chosen; not measured)."""
     calibration_least_predicted_px: float = 2.0
-    """A pair with less predicted flow tells no scale, pixels (chosen; not measured)."""
+    """A pair with less predicted flow gives no scale, pixels (chosen; not measured)."""
     calibration_least_flow_px: float = 1.0
-    """A pair with less measured flow tells no scale, pixels (chosen; not measured)."""
+    """A pair with less measured flow gives no scale, pixels (chosen; not measured)."""
     calibration_ratio: float = 10.0
     """Measured over predicted flow beyond this factor, either way, is a wrong peak (chosen; not measured)."""
     calibration_fov_deg: tuple[float, float] = (35.0, 135.0)
-    """A focal length within these fields of view is believed; else the recorded height is wrong (chosen)."""
+    """A focal length outside these fields of view does not exist: then the recorded height is wrong (chosen)."""
     calibration_least_height_m: float = 3.0
     """A median recorded height below this is none: the takeoff's, or a missing one (chosen; not measured)."""
     calibration_sigma: float = 0.03
     """Relative sigma of the focal length by flow: receivers drift and lag by some per cent (chosen; not measured)."""
     heading_ratio: float = 0.25
-    """Pairs whose flow differs from the median by more than this share do not tell the heading (chosen)."""
+    """Pairs whose flow differs from the median by more than this share give no heading (chosen)."""
     heading_least_pairs: int = 3
-    """Fewest pairs of a leg that tell its heading (chosen; not measured)."""
+    """Fewest pairs of a leg that give its heading (chosen; not measured)."""
     heading_spread_deg: float = 20.0
     """Headings are taken from the flow where its pairs agree to this, and no yaw is recorded, degrees (chosen)."""
     heading_wrong_deg: float = 40.0
@@ -177,7 +177,7 @@ class FeaturesConfig:
     pair_sectors: int = 6
     """Directions over which a photo's neighbours are spread (chosen; not measured)."""
     pair_best_distance: float = 0.4
-    """Best distance of a pair as a share of its reach: nearer photos tell little about relief and tilt, farther ones
+    """Best distance of a pair as a share of its reach: nearer photos hold relief and tilt badly, farther ones
     share little ground (chosen; not measured)."""
 
     # Tracks of matched features

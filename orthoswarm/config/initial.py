@@ -91,7 +91,7 @@ class InitialConfig:
     tilt_floor_deg: float = 0.7
     """Least sigma of a tilt for the nadir's prior, degrees (chosen; not measured)."""
     tilt_sigma_factor: float = 2.0
-    """The nadir's prior is so many times looser than the shapes say (chosen; not measured)."""
+    """The nadir's prior is so many times looser than the shapes' own sigma (chosen; not measured)."""
 
     # Focal length
     hint_fov_deg: tuple[float, float] = (30.0, 120.0)
@@ -120,7 +120,7 @@ class InitialConfig:
 
     # Ground scale
     scale_least_way_m: float = 3.0
-    """A pair whose positions are nearer tells no scale, metres (chosen; not measured)."""
+    """A pair whose positions are nearer gives no scale, metres (chosen; not measured)."""
     scale_least_shift_share: float = 0.02
     """... nor one whose pictures shift by less than this share of the width (chosen; not measured)."""
     scale_turn_cosine: float = 0.9

@@ -1,4 +1,4 @@
-"""What is taken as known where a picture recorded nothing, and how far records are trusted."""
+"""Defaults where a picture recorded nothing, and sigmas of what it recorded."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,9 @@ class RecordsConfig:
     far_spreads: float = 10.0
     """... and so many times the median distance: a set may be larger than that (chosen; not measured)."""
     default_height_m: float = 80.0
-    """Height above ground of photos that record none, metres, where nothing else gives it."""
+    """Height above ground where no photo records one, metres, until pictures give the scale. Measured on two flights at
+    90 m with positions only, with 60, 80 and 100 m: error of the map 0.147, 0.142, 0.145 m (95 %: 0.51, 0.51, 0.48),
+    heights off by 3.3, 2.8, 2.8 m."""
     usual_heights_m: tuple[float, float] = (50.0, 150.0)
     """Heights between which mapping flights are flown, metres: where the photos' spacing gives a height (chosen)."""
     usual_overlap: float = 0.75
@@ -24,7 +26,10 @@ class RecordsConfig:
     corner_deg: float = 50.0
     """A change of course above this is a corner between two legs and no bend, degrees (chosen; not measured)."""
     position_sigma_m: float = 1.5
-    """Sigma of a horizontal position whose source states none, metres."""
+    """Sigma of a horizontal position, an axis, whose source states none, metres; receivers' drift has its own prior.
+    Measured: 0.57 m on a real flight with a map (18 photos), whose real-time ground points lie within one stated sigma
+    in 97 % of the axes (2 of 2 sigmas: all); 0.5, 1.5 and 3 m give 43 real photos without tags the same place on their
+    control points (0.593, 0.593, 0.594 m rms). Drifting receivers exceed it (9 m, simulated)."""
     lag_sigma_s: float = 0.5
     """Sigma of the delay of recorded positions behind the shutter, seconds (chosen; lags of up to 0.4 s are found)."""
     tagged_tilt_sigma: float = 0.03

@@ -107,9 +107,9 @@ def _vehicle(
     if np.isnan(yaws).any():
         yaws = np.where(np.isnan(yaws), course(ground), yaws)
         warnings.append(
-            f"{vehicle}: photos without a heading are taken to point along the flight"
+            f"{vehicle}: photos without a heading are assumed to point along the flight"
             if len(frames) > 1
-            else f"{vehicle}: its only photo has no heading and is taken to point north"
+            else f"{vehicle}: its only photo has no heading and is assumed to point north"
         )
     pitches = np.array([NADIR_PITCH_RAD if f.fix.pitch_rad is None else f.fix.pitch_rad for f in frames])
     rolls = np.array([f.fix.roll_rad or 0.0 for f in frames])

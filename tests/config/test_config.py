@@ -35,6 +35,28 @@ def test_every_threshold_says_what_it_is():
                 assert said, f"{cls.__name__}.{node.target.id} says nothing of its unit, meaning and source"
 
 
+def test_no_module_reads_the_values_when_it_is_imported():
+    """Overrides come later: values are read inside functions, never at module level nor as default arguments."""
+    import ast
+    from pathlib import Path
+
+    import orthoswarm
+
+    def early(tree):
+        inside = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.Lambda):
+                body = node.body if isinstance(node.body, list) else [node.body]
+                inside |= {id(n) for part in body for n in ast.walk(part)}
+        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+        return [n.lineno for n in calls if n.func.id == "active" and id(n) not in inside]
+
+    assert early(ast.parse("A = active().x\ndef f(a=active().y): return active().z\n")) == [1, 2]
+    files = [f for p in (orthoswarm,) for f in Path(p.__path__[0]).rglob("*.py")]
+    found = {f.name: early(ast.parse(f.read_text(encoding="utf-8"))) for f in files}
+    assert len(files) > 100 and not {name: lines for name, lines in found.items() if lines}
+
+
 def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
     file = tmp_path / "config.toml"
     file.write_text("[records]\ntheta_hat_deg = 55\n")

@@ -56,7 +56,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     if len(residual) == 0:
         return floor
     scatter = 1.4826 * float(np.median(np.abs(residual)))
-    if len(residual) < config.scatter_least_ties:  # the adjustment follows so few: their residuals say little
+    if len(residual) < config.scatter_least_ties:  # the adjustment follows so few: their residuals are too small
         scatter = max(scatter, float(np.median(sigma_m)))
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
 
@@ -71,7 +71,7 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
         leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
 
     Returns:
-        float64 (N,), metres, 0 where ties are few, do not agree, or lie where they should.
+        float64 (N,), metres, 0 where ties are few, do not agree, or agree with the adjustment.
     """
     config = active().bundle
     near = config.systematic_reach_photos

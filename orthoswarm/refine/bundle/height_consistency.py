@@ -1,6 +1,6 @@
 """Whether recorded heights agree with the pictures: the height offset that the adjustment finds without their prior.
 
-Over flat ground seen straight down only f / h is observable, and a wrong height makes a wrong focal length unseen. But
+Over flat ground and straight down only f / h is observable, and a wrong height makes a wrong focal length. But
 aircraft sway, and legs cross: how far the picture moves with the recorded attitude gives f by itself, and with it h
 (measured: heights 30 % off are found to some per cent, by 20 pictures as by 300).
 """

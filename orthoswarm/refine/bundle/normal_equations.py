@@ -2,7 +2,7 @@
 
 Unknowns of a camera are 3 of position and 3 of rotation (R <- R Exp(omega), camera frame); of a lens 6:
 log f, k1, k2, k3, cx, cy. Points are eliminated one by one (Schur complement); cameras whose slot is -1 are held.
-The camera system is kept as LAPACK's lower band (row = distance from the diagonal), the lens part as dense columns.
+The camera system is stored as LAPACK's lower band (row = distance from the diagonal), the lens part as dense columns.
 """
 
 import numpy as np
@@ -118,7 +118,7 @@ def build(  # type: ignore[no-untyped-def]
         tie_point: (P,) row of the tie of a point or -1; tie_xy (Q, 2), tie_weight (Q,), tie_c: map ties
             (X, Y) = tie_xy, whatever the height.
         band: (6 (bandwidth + 1), 6 n) lower band, side: (6 n, 6 L), corner: (6 L, 6 L), rhs: (6 n,), rhs_lens: (6 L,).
-        w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): kept for back substitution.
+        w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): for back substitution.
         obs_weight: (M,) robust weight times 1 (0 where invisible). tie_residual: (Q, 2).
 
     Returns:
@@ -128,7 +128,7 @@ def build(  # type: ignore[no-untyped-def]
     v = np.zeros((3, 3))
     b = np.zeros(3)
     wv = np.zeros((6, 3))
-    cost, seen = 0.0, 0
+    cost, visible = 0.0, 0
     lenses = lens.shape[0]
     for p in range(len(points)):
         v[:] = 0.0
@@ -148,7 +148,7 @@ def build(  # type: ignore[no-untyped-def]
             obs_weight[m] = rw
             w = rw * weight[m]
             cost += e2 / (1.0 + e2 / c)
-            seen += 1
+            visible += 1
             s = slot[i]
             for a in range(3):
                 b[a] += w * (jp[0, a] * r[0] + jp[1, a] * r[1])
@@ -239,7 +239,7 @@ def build(  # type: ignore[no-untyped-def]
                         corner[6 * li + a, 6 * lj + q] -= (
                             t0 * w_lens[p, lj, q, 0] + t1 * w_lens[p, lj, q, 1] + t2 * w_lens[p, lj, q, 2]
                         )
-    return cost, seen
+    return cost, visible
 
 
 @kernel

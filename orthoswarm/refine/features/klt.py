@@ -1,4 +1,4 @@
-"""Compiled Lucas-Kanade tracking of small windows, with the expected turn and scale of each window given.
+"""Compiled Lucas-Kanade tracking of small windows, for which the expected turn and scale of each are known.
 
 Translation only, inverse compositional (Baker and Matthews 2004), two levels. The template is sampled in the later
 picture's geometry through a local affine map, so a turn between pictures costs nothing; brightness may shift.

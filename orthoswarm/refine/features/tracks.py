@@ -47,7 +47,7 @@ class Tracker:
 
     Attributes:
         scale: full-resolution pixels per pixel of the pictures that are fed.
-        cell_px: one track is kept in each cell of this size.
+        cell_px: at most one track in each cell of this size.
     """
 
     scale: float = 1.0
@@ -195,11 +195,11 @@ class Tracker:
         if rows == 0 or cols == 0:
             return
         top, left = (gray.shape[0] - rows * size) // 2, (gray.shape[1] - cols * size) // 2
-        taken = np.zeros((rows, cols), bool)
+        occupied = np.zeros((rows, cols), bool)
         r = ((self._live.uv[:, 1] - top) // size).astype(int).clip(0, rows - 1)
         c = ((self._live.uv[:, 0] - left) // size).astype(int).clip(0, cols - 1)
-        taken[r, c] = True
-        uv = corners(gray, ~taken, size, top, left)
+        occupied[r, c] = True
+        uv = corners(gray, ~occupied, size, top, left)
         if len(uv):
             ident = np.arange(self._next, self._next + len(uv))
             self._next += len(uv)

@@ -179,7 +179,11 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
-    horizontal = np.where(np.isfinite(records.position_sigma), np.maximum(records.position_sigma, 0.02), 1.5)
+    horizontal = np.where(
+        np.isfinite(records.position_sigma),
+        np.maximum(records.position_sigma, 0.02),
+        active().records.position_sigma_m,
+    )
     tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
     yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
     model = GroupPriors(

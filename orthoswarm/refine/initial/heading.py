@@ -76,7 +76,7 @@ def course_headings(
         offset_sigma_px: float64 (N,), how well it is known.
 
     Returns:
-        Heading (E,) and its one sigma (E,), infinite where the way is too short to tell.
+        Heading (E,) and its one sigma (E,), infinite where the way is too short.
     """
     config = active().initial
     i, j = graph.first, graph.second

@@ -37,7 +37,7 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
     count = 0
     for k in np.unique(name):
         members = np.flatnonzero(name == k)
-        group = _groups(np.log(alone.focal[members]), alone.focal_sigma[members], sure[members])
+        group = group_focal_lengths(np.log(alone.focal[members]), alone.focal_sigma[members], sure[members])
         lens[members] = count + group
         count += int(group.max()) + 1
     if count == len(records.fov_hint):
@@ -46,7 +46,7 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
     return replace(records, lens=lens[records.vehicle], fov_hint=hint)
 
 
-def _groups(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
+def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
     """Group of each vehicle (V,): the surest first, a new group where a value is unlike all groups there are."""
     config = active().initial
     group = np.zeros(len(log_focal), np.int32)

@@ -77,7 +77,7 @@ class PairGraphBuilder:
         return pairs, matches
 
     def near(self, start: InitialOrientation, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
-        """Pairs whose pictures should overlap by the start; `only` bool (N,) asks for one of them to be set."""
+        """Pairs whose pictures should overlap by the initial orientation; of `only` bool (N,) one must be set."""
         reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
         pairs = nearby(start.middle(), reach, self.records.segment, count)
         return pairs if only is None or not len(pairs) else pairs[only[pairs].any(1)]
@@ -119,7 +119,7 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
 
 
 def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
-    """Matches of some pairs, given the features of their photos."""
+    """Matches of some pairs; the task holds the pairs and the features of their photos."""
     pairs, features = task
     return [match_features(features[a], features[b]) for a, b in pairs]
 

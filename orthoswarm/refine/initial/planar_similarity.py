@@ -21,13 +21,13 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class PhotoRecords:
-    """What was recorded of N photos taken with L lenses in S segments; NaN where unknown.
+    """Records of N photos of L lenses in S segments; NaN where unknown.
 
     Photos of a vehicle stand in order of time.
 
     Attributes:
         position: complex (N,), east + i north in metres about some origin.
-        position_sigma: float64 (N,), stated one sigma, NaN where the receiver does not say.
+        position_sigma: float64 (N,), stated one sigma, NaN where it is not stated.
         time_s: float64 (N,). height_m: float64 (N,) above takeoff or ground. altitude_m: float64 (N,) absolute.
         yaw: float64 (N,) grid azimuth of the picture's up direction; flight_yaw: of the airframe, radians.
         pitch: float64 (N,), -pi/2 is nadir; roll: float64 (N,).
@@ -78,7 +78,7 @@ class PhotoRecords:
         return v
 
     def tag_level(self) -> Array:
-        """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where they say nothing.
+        """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where there are none.
 
         Tags beyond `tag_tilt_limit_deg` count as none: such a picture could not be matched anyway.
         """
@@ -148,7 +148,7 @@ def centred(features: Features) -> Complex:
 
 
 def level_from_nadir(offset: complex, focal: float) -> Array:
-    """The smallest rotation (3, 3) that puts the nadir, seen at pixel `offset` (y up), onto the optical axis."""
+    """The smallest rotation (3, 3) that puts the nadir, at pixel `offset` (y up), onto the optical axis."""
     n = np.array([offset.real, -offset.imag, focal])
     n /= np.linalg.norm(n)
     axis = np.array([n[1], -n[0], 0.0])  # n x z

@@ -32,7 +32,7 @@ def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
 
     Args:
         records: of N photos.
-        above: float64 (S,), height of each segment above the ground as known so far (altitudes tell differences only).
+        above: float64 (S,), height of each segment above the ground as known so far (altitudes give differences only).
     """
     config = active().initial
     share, least, most = config.height_known_share, 1.0 / config.height_ratio, config.height_ratio

@@ -19,7 +19,7 @@ from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse, trusted_heights
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
-from orthoswarm.refine.initial.lens_groups import _groups, lens_per_vehicle, split_unlike_lenses
+from orthoswarm.refine.initial.lens_groups import group_focal_lengths, lens_per_vehicle, split_unlike_lenses
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
 
 
@@ -145,5 +145,5 @@ def test_focal_lengths_fall_into_groups_and_unsure_ones_join_the_nearest():
     log_focal = np.log([300.0, 248.0, 305.0, 400.0, 251.0])
     sigma = np.array([0.02, 0.02, 0.03, 0.03, 0.05])
     sure = np.array([True, True, True, False, True])
-    group = _groups(log_focal, sigma, sure)
+    group = group_focal_lengths(log_focal, sigma, sure)
     assert group[0] == group[2] == group[3] != group[1] == group[4]

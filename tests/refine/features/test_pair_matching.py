@@ -180,14 +180,16 @@ def test_thinning_keeps_every_cell_that_was_covered():
     assert cells(thin) == cells(tracks)
 
 
-@pytest.mark.parametrize(("step", "low", "high"), [(40, 0.87, 0.95), (120, 0.68, 0.80), (220, 0.45, 0.60)])
-def test_overlap_is_measured_from_pictures_without_any_tag(step, low, high):
+@pytest.mark.parametrize(
+    ("step", "low", "high", "dense"), [(40, 0.87, 0.95, True), (120, 0.68, 0.80, False), (220, 0.45, 0.60, False)]
+)
+def test_overlap_is_measured_from_pictures_without_any_tag(step, low, high, dense):
     ground = texture(5, 500, 2200)
     frames = [Frame(f"{k}.jpg", Path(f"{k}.jpg"), "v", None, Fix(0.0, 0.0), 480, 360) for k in range(6)]
     pictures = {f.image: ground[40:400, 40 + k * step : 520 + k * step].copy() for k, f in enumerate(frames)}
     overlap = forward_overlap(frames, lambda f: pictures[f.image])
     assert low < overlap.share < high
-    assert overlap.dense == (overlap.share >= 0.8)
+    assert overlap.dense == dense
 
 
 def test_overlap_of_unrelated_pictures_is_nothing_and_not_dense():

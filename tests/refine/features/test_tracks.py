@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from orthoswarm.config import override
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.refine.features.tracks import Tracker, predicted_homography
 
@@ -120,10 +121,21 @@ def test_pictures_of_different_ground_are_not_followed(ground):
 def test_there_is_at_most_one_track_in_a_cell(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(8)]
     tracker, _ = follow(ground, matrices)
-    live = tracker._live
-    cells = np.floor(live.uv / tracker.cell_px).astype(int)
-    old = live.age > 0
-    assert len(np.unique(cells[old], axis=0)) == old.sum()
+    tracks = tracker.tracks()
+    cells = np.column_stack([np.floor(tracks.uv / tracker.cell_px).astype(int), tracks.camera])
+    assert len(cells) > 200
+    assert len(np.unique(cells, axis=0)) == len(cells)
+
+
+def test_cells_are_as_large_as_configured(ground):
+    matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(4)]
+    usual, _ = follow(ground, matrices)
+    override({"features": {"cell_px": 160}})
+    try:
+        wide, _ = follow(ground, matrices)
+    finally:
+        override({})
+    assert wide.tracks().count < 0.4 * usual.tracks().count
 
 
 def test_a_blank_picture_gives_nothing_and_breaks_nothing():
