@@ -76,7 +76,10 @@ def test_missing_heights_come_from_the_others_or_the_spacing():
     # 20 m steps at 75 % overlap: the picture's short side is 80 m of ground
     assert made.placed[0].camera.position[2] == pytest.approx(80 * made.placed[0].camera.lens.focal_px / 300)
     assert any("no photo has a height" in w for w in made.warnings)
-    assert made.placed[0].sigma_m > 3
+    records, height = active().records, made.placed[0].camera.position[2]
+    assert made.placed[0].sigma_m == pytest.approx(
+        np.hypot(records.position_sigma_m, records.tagged_tilt_sigma * height)
+    )
 
 
 def test_a_position_that_cannot_be_is_left_out():
