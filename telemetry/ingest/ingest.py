@@ -22,8 +22,9 @@ from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings
+from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frames_of
-from telemetry.photos.photo_tags import Angles, PhotoTags, read_photos
+from telemetry.photos.photo_tags import PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 

@@ -34,6 +34,7 @@ _CLOCK_DOUBT = 1e-3
 _CANDIDATES = 24
 _FIRST_JITTER_S = 0.08
 _JITTERS_S = (0.02, 0.04, 0.08, 0.16)
+_MAD_TO_SIGMA = 1.4826
 _MOST_BINS = 1 << 19
 _MOST_DRIFTS = 81
 
@@ -148,7 +149,7 @@ def _without_coincidences(
     expected = offset + (1.0 + drift) * problem.e[np.clip(first + best, 0, len(problem.e) - 1)]
     farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s
     total = probability.sum(axis=1)
-    alone = (farthest < least) & (probability[rows, best] > 0.05)
+    alone = (farthest < least) & (probability[rows, best] > 1e-4)
     return np.where(alone[:, None], probability / np.maximum(total, 1e-300)[:, None], probability)
 
 
@@ -198,12 +199,14 @@ class _Problem:
         return np.asarray(np.where(inside, self.interval_s * density, 0.0))
 
     def regular(self) -> "_Problem":
-        """The same for exposures at even intervals.
+        """The same for exposures at intervals as even as these.
 
-        There a clock that is wrong by whole intervals brings photos onto events, too, so that a coincidence weighs no
-        more than the exposure that it spares; only how well it fits still counts.
+        At even intervals a clock that is wrong by whole intervals brings photos onto events, too, so that a coincidence
+        is worth as much as the intervals vary, and not a whole interval.
         """
-        widest = max(self.resolution_s, self.jitter_s * float(np.sqrt(2.0 * np.pi)))
+        steps = np.diff(self.e)
+        spread = _MAD_TO_SIGMA * float(np.median(np.abs(steps - np.median(steps))))
+        widest = max(self.resolution_s, float(np.sqrt(2.0 * np.pi)) * max(self.jitter_s, spread))
         return replace(self, interval_s=min(self.interval_s, widest))
 
 

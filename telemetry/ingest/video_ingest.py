@@ -54,6 +54,8 @@ def read_videos(
             matched = read_or_reason(add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched
+        if not poses.has_positions:
+            poses.findings.append(Finding("no-position", f"{name}: {NO_POSITION}"))
         if options.decode:
             _take(path, name, found.videos[path], scanned, poses, options, progress, source, result)
         else:

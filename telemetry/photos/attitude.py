@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
-from telemetry.photos.photo_tags import Angles, PhotoTags
+from telemetry.photos.maker_angles import Angles
+from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import Straight
 from telemetry.samples.findings import Finding, plural
 

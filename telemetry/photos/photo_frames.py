@@ -8,7 +8,8 @@ import numpy as np
 
 from orthoswarm.model.frame import Fix, Frame
 from telemetry.photos.attitude import check_legs, decide
-from telemetry.photos.photo_tags import Angles, PhotoTags
+from telemetry.photos.maker_angles import Angles
+from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import courses_deg, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 

@@ -14,12 +14,11 @@ from typing import Any
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
+from telemetry.photos.maker_angles import Angles, camera_angles, flight_angles
 from telemetry.samples.sample import is_position
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import ZONE_UNKNOWN, parse_time
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
-Angles = tuple[float | None, float | None, float | None]
-"""Yaw, pitch, roll in degrees, as recorded."""
 Run = Callable[..., Iterator[Any]]
 """Maps a function over items, in order."""
 
@@ -127,8 +126,9 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     position = exif.gps_position(tags.gps)
     source = "EXIF GPS"
     if position is None:
-        lat = xmp.number(found, "drone-dji:GpsLatitude", "drone-dji:Latitude")
-        lon = xmp.number(found, "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude")
+        lat = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in ("GpsLatitude", "Latitude")))
+        lon_names = ("GpsLongitude", "GpsLongtitude", "Longitude")
+        lon = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in lon_names))
         if lat is not None and lon is not None and is_position(lat, lon):
             position, source = (lat, lon), "XMP position"
     if position is not None:
@@ -142,7 +142,7 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
             photo.position_sigma_m = max(known)
             photo.origin["position_sigma"] = "XMP RTK"
     if photo.position_sigma_m is None:
-        stated = xmp.number(found, "Camera:GPSXYAccuracy") or exif.number(tags.gps.get(31))
+        stated = xmp.number(found, "Camera:GPSXYAccuracy", "sensefly:GPSXYAccuracy") or exif.number(tags.gps.get(31))
         if stated is not None and 0.0 < stated < 1000.0:
             photo.position_sigma_m = stated
             photo.origin["position_sigma"] = "stated accuracy"
@@ -157,11 +157,17 @@ def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         photo.height_m, photo.height_is_ground = ground, True
         photo.origin["height"] = "XMP AboveGroundAltitude"
         return
-    names = ("drone-dji:RelativeAltitude", "drone-parrot:RelativeAltitude", "drone:RelativeAltitude")
-    relative = xmp.number(found, *names)
+    relative = xmp.number(found, *_RELATIVE_ALTITUDES)
     if relative is not None and abs(relative) < _MAX_HEIGHT_M:
         photo.height_m = relative
         photo.origin["height"] = "XMP RelativeAltitude"
+
+
+_POSITION_PREFIXES = ("drone-dji", "drone", "drone-skydio")
+_RELATIVE_ALTITUDES = (
+    *(f"{prefix}:RelativeAltitude" for prefix in ("drone-dji", "drone-parrot", "drone", "drone-skydio")),
+    "drone-yuneec:AboveHomeAltitude",
+)
 
 
 def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
@@ -170,28 +176,18 @@ def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     if taken is None:
         written = parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
         if written is not None:
-            taken = written[0], "XMP time" if written[1] else "XMP time without zone, taken as UTC"
+            taken = written[0], "XMP time" if written[1] else f"XMP time {ZONE_UNKNOWN}"
     if taken is not None:
         photo.time_s, photo.origin["time"] = taken
 
 
 def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
-    """Camera and airframe attitude: DJI, then Parrot, then Pix4D's Camera name space, then DJI's maker note."""
-    for prefix, names in _CAMERA_ANGLES:
-        angles = tuple(_angle(found, f"{prefix}:{name}") for name in names)
-        if angles[0] is not None or angles[1] is not None:
-            yaw, pitch, roll = angles
-            if prefix == "Camera":
-                pitch, roll = _from_pix4d(pitch, roll, photo.make)
-            photo.camera_deg = (yaw, pitch, roll)
-            photo.origin["angles"] = f"XMP {prefix}"
-            break
-    for prefix, names in _FLIGHT_ANGLES:
-        angles = tuple(_angle(found, f"{prefix}:{name}") for name in names)
-        if angles[0] is not None:
-            photo.flight_deg = (angles[0], angles[1], angles[2])
-            photo.origin["flight_yaw"] = f"XMP {prefix}"
-            break
+    """Camera and airframe attitude: XMP, then DJI's maker note, then the EXIF direction."""
+    camera, flight = camera_angles(found, photo.make), flight_angles(found)
+    if camera is not None:
+        photo.camera_deg, photo.origin["angles"] = camera[0], f"XMP {camera[1]}"
+    if flight is not None:
+        photo.flight_deg, photo.origin["flight_yaw"] = flight[0], f"XMP {flight[1]}"
     note = tags.exif.get(exif.MAKER_NOTE)
     if photo.camera_deg == (None, None, None) and isinstance(note, bytes):
         dji = parse_dji(note)
@@ -209,34 +205,6 @@ def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     ):
         photo.camera_deg = (direction, photo.camera_deg[1], photo.camera_deg[2])
         photo.origin["angles"] = "EXIF GPSImgDirection"
-
-
-_CAMERA_ANGLES = (
-    ("drone-dji", ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")),
-    ("drone-parrot", ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree")),
-    ("Camera", ("Yaw", "Pitch", "Roll")),
-)
-_FLIGHT_ANGLES = (
-    ("drone-dji", ("FlightYawDegree", "FlightPitchDegree", "FlightRollDegree")),
-    ("drone-parrot", ("DroneYawDegree", "DronePitchDegree", "DroneRollDegree")),
-)
-
-
-def _angle(found: xmp.Properties, name: str) -> float | None:
-    value = xmp.number(found, name)
-    return value if value is not None and abs(value) <= 720.0 else None
-
-
-def _from_pix4d(pitch: float | None, roll: float | None, make: str) -> tuple[float | None, float | None]:
-    """The Camera name space counts pitch from nadir (senseFly, MicaSense) or from the horizon (Autel): by value.
-
-    senseFly's roll has the other sign.
-    """
-    if pitch is not None and pitch > -45.0:
-        pitch -= 90.0
-    if roll is not None and make.lower().startswith("sensefly"):
-        roll = -roll
-    return pitch, roll
 
 
 def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
@@ -283,6 +251,10 @@ def _fov_hints(
     if calibrated and centre and calibrated > 0 and centre > 0:
         # Stated for the full picture, whose half width the centre tells: holds for a scaled copy, too.
         yield 2.0 * math.atan(centre / calibrated), "XMP CalibratedFocalLength"
+    skydio = xmp.number(found, "drone-skydio:CalibratedFocalLength/X")
+    middle = xmp.number(found, "drone-skydio:CalibratedOpticalCenter/X")
+    if skydio and middle and skydio > 0 and middle > 0:
+        yield 2.0 * math.atan(middle / skydio), "XMP CalibratedFocalLength"
     perspective = xmp.number(found, "Camera:PerspectiveFocalLength") or focal
     per_unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_X))
     unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_UNIT))

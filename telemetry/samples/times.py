@@ -3,6 +3,9 @@
 import calendar
 import re
 
+ZONE_UNKNOWN = "without zone, taken as UTC"
+"""End of the origin of a time whose zone nobody knows."""
+
 _WRITTEN = re.compile(
     r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*(Z|[+-]\d{2}:?\d{2})?"
 )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
+from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.video.extraction_cache import Kept, Taken, key_of, recall, remember
 from telemetry.video.picture_choice import Candidate, Picker
 from telemetry.video.picture_poses import Pose, Poses
@@ -294,4 +295,7 @@ def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTa
         "flight_yaw": sample.flight_yaw_deg, "fov_hint": sample.fov_deg,
     }  # fmt: skip
     photo.origin = {field: pose.origin for field, value in names.items() if value is not None}
+    sources = set(pose.origin.split(" + "))
+    if "time" in photo.origin and "SRT" in sources and not sources - {"SRT", "djmd"}:
+        photo.origin["time"] += f", {ZONE_UNKNOWN}"  # subtitles are written in local time
     return photo

@@ -111,7 +111,7 @@ class Poses:
     def has_positions(self) -> bool:
         """Whether any source of this video knows positions."""
         return (
-            bool(self._interpolated)
+            any(sample.has_position for _, samples in self._interpolated for sample in samples)
             or any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
             or any(sample.has_position for _, sample in self._djmd)
         )
@@ -251,9 +251,6 @@ class Poses:
         self.findings += [
             Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items() if cues.cues
         ]
-        if not self.has_positions:
-            text = f"{name} carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
-            self.findings.append(Finding("no-position", text))
 
 
 def _held_timeline(samples: list[Sample]) -> Timeline:

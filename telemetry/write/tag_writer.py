@@ -1,8 +1,8 @@
 """Poses written into JPEG files, as EXIF and XMP that OpenDroneMap, QGIS and our own reader understand.
 
-EXIF: position, altitude, time (UTC, with sub-seconds), direction of the picture's up, a focal length that gives the
-field of view. XMP: yaw, pitch (from nadir) and roll in Pix4D's Camera name space, which ODM reads for every make, and
-RelativeAltitude or AboveGroundAltitude.
+EXIF: position, altitude, time (UTC, with sub-seconds; local where the zone is unknown), direction of the picture's up,
+a focal length that gives the field of view. XMP: yaw, pitch (from nadir) and roll in Pix4D's Camera name space, which
+ODM reads for every make, and RelativeAltitude or AboveGroundAltitude.
 """
 
 import math
@@ -10,6 +10,7 @@ import struct
 from datetime import UTC, datetime
 
 from orthoswarm.model.frame import Frame
+from telemetry.samples.times import ZONE_UNKNOWN
 
 MAKE = "OrthoSwarm"
 _NOMINAL_SENSOR_MM = 36.0
@@ -80,12 +81,14 @@ def exif_of(frame: Frame) -> bytes:
         moment = datetime.fromtimestamp(round(frame.time_s, 6), UTC)
         stamp = moment.strftime("%Y:%m:%d %H:%M:%S")
         main.append(_text(0x0132, stamp))
-        detail += [_text(0x9003, stamp), _text(0x9011, "+00:00"), _text(0x9291, f"{moment.microsecond:06d}")]
-        seconds = moment.second * 1_000_000 + moment.microsecond
-        gps += [
-            (7, _RATIONAL, 3, struct.pack("<6I", moment.hour, 1, moment.minute, 1, seconds, 1_000_000)),
-            _text(29, moment.strftime("%Y:%m:%d")),
-        ]
+        detail += [_text(0x9003, stamp), _text(0x9291, f"{moment.microsecond:06d}")]
+        if not frame.origin.get("time", "").endswith(ZONE_UNKNOWN):
+            detail.append(_text(0x9011, "+00:00"))
+            seconds = moment.second * 1_000_000 + moment.microsecond
+            gps += [
+                (7, _RATIONAL, 3, struct.pack("<6I", moment.hour, 1, moment.minute, 1, seconds, 1_000_000)),
+                _text(29, moment.strftime("%Y:%m:%d")),
+            ]
     if frame.fov_hint_rad is not None:
         # A 36 mm wide sensor: the focal length is then the 35 mm one, and the pixel pitch makes it exact.
         focal = 0.5 * _NOMINAL_SENSOR_MM / math.tan(0.5 * frame.fov_hint_rad)

@@ -160,6 +160,25 @@ def test_damaged_ulogs_are_survived(tmp_path_factory, data):
         assert str(reason)
 
 
+def test_a_ulogs_capture_attitude_is_the_gimbals_where_it_looks_down(tmp_path):
+    """PX4 logs the camera's attitude there when a gimbal is fitted, also without the gimbal's own topic."""
+    path = ulog(tmp_path / "a.ulg")
+    yaw, pitch = math.radians(90.0), math.radians(-90.0)
+    down = (
+        math.cos(yaw / 2) * math.cos(pitch / 2), -math.sin(yaw / 2) * math.sin(pitch / 2),
+        math.cos(yaw / 2) * math.sin(pitch / 2), math.sin(yaw / 2) * math.cos(pitch / 2),
+    )  # fmt: skip
+    east = struct.pack("<4f", math.cos(math.radians(45)), 0.0, 0.0, math.sin(math.radians(45)))
+    data = path.read_bytes()
+    captures = struct.pack("<ff", 450.0, -1.0)
+    path.write_bytes(data.replace(captures + east, captures + struct.pack("<4f", *down)))
+    (log,) = read_log(path)
+    sample = log.events[1].sample
+    assert (sample.yaw_deg, sample.pitch_deg) == pytest.approx((90.0, -90.0), abs=0.1)
+    assert sample.flight_pitch_deg is None
+    assert log.has_gimbal
+
+
 # --- older and sparse logs ------------------------------------------------------------------------------------------
 
 

@@ -10,6 +10,7 @@ from gcs_plugin.cli.main import main
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.ingest.summary import summarise
 from tests.telemetry.test_ingest import flight, photo
+from tests.telemetry.test_photos import gps_exif, jpeg
 from tests.telemetry.test_video import make_video, pose
 
 from telemetry.write.sei_writer import add_sei  # isort: skip
@@ -143,6 +144,20 @@ def test_photos_are_copied_with_what_a_geo_txt_adds(tmp_path, capsys):
     (frame,) = load([tmp_path / "o"]).frames
     assert (frame.fix.lat_deg, frame.fix.altitude_m) == pytest.approx((48.0, 600.0))
     assert math.degrees(frame.fix.pitch_rad) == pytest.approx(-80.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("offset", "written"), [("+02:00", "+00:00"), (None, None)])
+def test_frames_state_a_zone_only_where_it_is_known(tmp_path, capsys, offset, written):
+    from PIL import Image
+
+    (tmp_path / "in").mkdir()
+    jpeg(tmp_path / "in" / "a.jpg", exif_bytes=gps_exif(offset=offset))
+    assert main(["frames", str(tmp_path / "in"), "--out", str(tmp_path / "o")]) == 0
+    with Image.open(tmp_path / "o" / "in" / "a.jpg") as image:
+        exif = image.getexif()
+        assert exif.get_ifd(0x8769).get(0x9011) == written
+        assert (7 in exif.get_ifd(0x8825)) == (written is not None)
+        assert exif.get_ifd(0x8769)[0x9003] == ("2024:05:06 10:00:01" if offset else "2024:05:06 12:00:01")
 
 
 def test_frames_without_anything_to_take_is_one_clear_error(tmp_path, capsys):

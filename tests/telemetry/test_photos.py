@@ -56,6 +56,16 @@ def gps_exif(
     return tags.tobytes()
 
 
+def test_the_lens_of_a_skydio_is_read(tmp_path):
+    packet = (
+        b'<x:xmpmeta><drone-skydio:CalibratedFocalLength drone-skydio:X="3046.6" drone-skydio:Y="3046.6"/>'
+        b'<drone-skydio:CalibratedOpticalCenter drone-skydio:X="2028.0" drone-skydio:Y="1520.0"/></x:xmpmeta>'
+    )
+    photo = read_photo(jpeg(tmp_path / "a.jpg", xmp_packet=packet, exif_bytes=gps_exif(make="Skydio")))
+    assert photo.fov_hint_rad == pytest.approx(2.0 * math.atan(2028.0 / 3046.6))
+    assert photo.origin["fov_hint"] == "XMP CalibratedFocalLength"
+
+
 def test_xmp_attributes_and_elements_read_alike():
     elements = (
         b"<x:xmpmeta><drone-dji:GimbalYawDegree>+44.20</drone-dji:GimbalYawDegree>"
@@ -85,6 +95,50 @@ MAKERS = {
         "Autel Robotics",
         'Camera:Yaw="-75.0" Camera:Pitch="-90.0" Camera:Roll="0.0" drone:RelativeAltitude="55.0"',
         (-75.0, -90.0, 0.0), (55.0, False), None,
+    ),
+    "autel-2021": (
+        "Autel Robotics",
+        'drone:GimbalYawDegree="31.5" drone:GimbalPitchDegree="-88" drone:GimbalRollDegree="0.5" Camera:Pitch="-88" '
+        'drone:FlightYawDegree="30.0" drone:RelativeAltitude="55.0"',
+        (31.5, -88.0, 0.5), (55.0, False), None,
+    ),
+    "autel-oblique": (
+        "Autel Robotics", 'Camera:Yaw="-75.0" Camera:Pitch="-20.0" Camera:Roll="0.0"', (-75.0, -20.0, 0.0),
+        (None, False), None,
+    ),
+    "wingtra-oblique": (
+        "SONY", 'Camera:Yaw="10.0" Camera:Pitch="-44.0" Camera:Roll="0.0"', (10.0, -44.0, 0.0), (None, False), None,
+    ),
+    "skydio-x2": (
+        "Skydio",
+        '><drone-skydio:CameraOrientationNED drone-skydio:Roll="0.1" drone-skydio:Pitch="-45.5" '
+        'drone-skydio:Yaw="120.0"/><drone-skydio:CameraOrientationFLU drone-skydio:Roll="1" drone-skydio:Pitch="2" '
+        'drone-skydio:Yaw="3"/><x',
+        (120.0, -45.5, 0.1), (None, False), None,
+    ),
+    "skydio-x10": (
+        "Skydio",
+        '><drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Roll>0.1</drone-skydio:Roll>'
+        "<drone-skydio:Pitch>-89.5</drone-skydio:Pitch><drone-skydio:Yaw>-120.0</drone-skydio:Yaw>"
+        "</drone-skydio:CameraOrientationNED><drone-skydio:CameraOrientationFLU><drone-skydio:Yaw>7</drone-skydio:Yaw>"
+        "</drone-skydio:CameraOrientationFLU><x",
+        (-120.0, -89.5, 0.1), (None, False), None,
+    ),
+    "yuneec": (
+        "Yuneec",
+        'drone-yuneec:GimbalYaw="73.230003" drone-yuneec:GimbalPitch="-89.95999" drone-yuneec:GimbalRoll="0.0" '
+        'drone-yuneec:DroneYaw="96.699997" drone-yuneec:AboveHomeAltitude="69.84"',
+        (73.230003, -89.95999, 0.0), (69.84, False), None,
+    ),
+    "teal, and whoever follows the names of DJI": (
+        "Teal",
+        'drone-teal:GimbalYawDegree="12.0" drone-teal:GimbalPitchDegree="-60.0" drone-teal:GimbalRollDegree="0.0"',
+        (12.0, -60.0, 0.0), (None, False), None,
+    ),
+    "sensefly-older": (
+        "senseFly",
+        'sensefly:Yaw="189.428" sensefly:Pitch="12.5908" sensefly:Roll="-3.384" sensefly:GPSXYAccuracy="1.5"',
+        (189.428, -77.4092, -3.384), (None, False), 1.5,
     ),
     "sensefly": (
         "senseFly",

@@ -124,3 +124,11 @@ def test_omega_phi_kappa_is_the_same_rotation_as_ours(yaw, pitch, roll):
     assert rotation_from_angles(*np.radians(found)) == pytest.approx(
         rotation_from_angles(*np.radians([yaw, pitch, roll])), abs=1e-9
     )
+
+
+@pytest.mark.parametrize("written", ["nan", "inf", "-1e400", "1e400"])
+def test_a_time_that_cannot_be_one_is_left_out(tmp_path, written):
+    (tmp_path / "poses.csv").write_text(f"image,time,lat_deg,lon_deg\na.jpg,{written},47.5,8.25\n")
+    (row,) = read_pose_csv(tmp_path / "poses.csv").values()
+    assert row.time_s is None
+    assert row.lat_deg == 47.5

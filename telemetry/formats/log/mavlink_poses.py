@@ -6,19 +6,25 @@ towards the nose. Message fields: MAVLink common and ardupilotmega.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked, is_position
+
+Array = NDArray[np.float64]
 
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5
 _EARLIEST_UTC_S = 946_684_800.0  # 2000-01-01: clocks before that were never set
 _DOWNWARD = 25
 _REBOOT_S = 10.0
+_LOOKS_DOWN = 0.7
+"""Sine of 45 degrees: no airframe flies that far nose down."""
 
 TYPES = frozenset(
     {
@@ -121,14 +127,9 @@ class MavlinkPoses:
         return Sample(time_s=boot_s, flight_yaw_deg=yaw, flight_pitch_deg=pitch, flight_roll_deg=roll)
 
     def _gimbal(self, m: Any) -> Sample | None:
-        if not all(map(math.isfinite, m.q)) or not any(m.q):
+        rotation = gimbal_rotation(m.q, m.flags, self.heading_deg)
+        if rotation is None:
             return None
-        rotation = quaternion_ned(*m.q)
-        in_vehicle = bool(m.flags & _YAW_IN_VEHICLE) or not m.flags & (_YAW_IN_EARTH | _YAW_LOCK)
-        if in_vehicle and not m.flags & _YAW_IN_EARTH:
-            if self.heading_deg is None:
-                return None
-            rotation = euler_ned(self.heading_deg, 0.0, 0.0) @ rotation
         self.has_gimbal = True
         return _camera(self._boot(m.time_boot_ms), rotation)
 
@@ -177,13 +178,7 @@ class MavlinkPoses:
             sample.height_m = m.relative_alt * 1e-3
         elif self.home_altitude_m is not None and sample.altitude_m is not None:
             sample.height_m = sample.altitude_m - self.home_altitude_m
-        if all(map(math.isfinite, m.q)) and any(m.q):
-            rotation = quaternion_ned(*m.q)
-            # PX4 sends the airframe's attitude here, a camera manager the camera's: only that looks down.
-            if rotation[2, 0] > 0.7:
-                sample.yaw_deg, sample.pitch_deg, sample.roll_deg = camera_angles_deg(rotation)
-            else:
-                sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg = euler_deg(rotation)
+        put_capture_attitude(sample, m.q)
         utc_s = m.time_utc * 1e-6
         boot_s = self._boot(m.time_boot_ms)
         event = self._event(utc_s, m.image_index, sample, "CAMERA_IMAGE_CAPTURED")
@@ -223,6 +218,36 @@ def euler_deg(rotation: Any) -> tuple[float, float, float]:
         float(np.degrees(-np.arcsin(np.clip(rotation[2, 0], -1.0, 1.0)))),
         float(np.degrees(np.arctan2(rotation[2, 1], rotation[2, 2]))),
     )
+
+
+def gimbal_rotation(q: Sequence[float], flags: int, heading_deg: float | None) -> Array | None:
+    """Rotation of a gimbal to north-east-down, from a GIMBAL_DEVICE_ATTITUDE_STATUS in the frame that its flags name.
+
+    Args:
+        q: quaternion w, x, y, z.
+        flags: GIMBAL_DEVICE_FLAGS.
+        heading_deg: of the airframe, for a yaw that is relative to it.
+
+    Returns:
+        float64 (3, 3); None where the quaternion is none, or the heading is needed and not known.
+    """
+    if not all(map(math.isfinite, q)) or not any(q):
+        return None
+    rotation = quaternion_ned(*q)
+    if flags & _YAW_IN_EARTH or (flags & _YAW_LOCK and not flags & _YAW_IN_VEHICLE):
+        return rotation
+    return None if heading_deg is None else euler_ned(heading_deg, 0.0, 0.0) @ rotation
+
+
+def put_capture_attitude(sample: Sample, q: Sequence[float]) -> None:
+    """The attitude of a capture: PX4 reports the airframe's there, or the camera's, and only the camera looks down."""
+    if not all(map(math.isfinite, q)) or not any(q):
+        return
+    rotation = quaternion_ned(*q)
+    if rotation[2, 0] > _LOOKS_DOWN:
+        sample.yaw_deg, sample.pitch_deg, sample.roll_deg = camera_angles_deg(rotation)
+    else:
+        sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg = euler_deg(rotation)
 
 
 def _camera(boot_s: float, forward_ned: Any) -> Sample:

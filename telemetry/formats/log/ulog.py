@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
-from telemetry.formats.log.mavlink_poses import CameraEvent, euler_deg
-from telemetry.samples.rotations import camera_angles_deg, euler_ned, quaternion_ned
+from telemetry.formats.log.mavlink_poses import CameraEvent, euler_deg, gimbal_rotation, put_capture_attitude
+from telemetry.samples.rotations import camera_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked
 
 _MAGIC = b"ULog\x01\x12\x35"
@@ -28,7 +28,6 @@ _WANTED = frozenset(
     }
 )  # fmt: skip
 _EVENTS = frozenset({"camera_capture", "camera_trigger"})
-_YAW_IN_VEHICLE, _YAW_IN_EARTH, _YAW_LOCK = 32, 64, 16
 
 
 def read_ulog(path: Path) -> FlightLog:
@@ -66,6 +65,7 @@ def read_ulog(path: Path) -> FlightLog:
         found = _event(row, name, clock, home)
         if found is not None:
             log.events.append(found)
+            log.has_gimbal |= found.sample.yaw_deg is not None
 
     def fix(row: Row) -> None:
         """A receiver's position: degrees and metres since PX4 1.14, 1e-7 degrees and millimetres before."""
@@ -185,17 +185,13 @@ def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:
 
 
 def _gimbal(log: FlightLog, row: Row, clock: float | None, headings: list[tuple[float, float]]) -> None:
-    q = row.get("q")
-    if q is None or not all(map(np.isfinite, q)) or not any(q):
-        return
-    rotation = quaternion_ned(*q)
-    flags = int(row.get("device_flags", 0))
-    if flags & _YAW_IN_VEHICLE or not flags & (_YAW_IN_EARTH | _YAW_LOCK):
-        if not headings:
-            return
+    heading = None
+    if headings:
         times = np.array([t for t, _ in headings])
-        nearest = min(int(np.searchsorted(times, row["timestamp"])), len(headings) - 1)
-        rotation = euler_ned(headings[nearest][1], 0.0, 0.0) @ rotation
+        heading = headings[min(int(np.searchsorted(times, row["timestamp"])), len(headings) - 1)][1]
+    rotation = gimbal_rotation(row["q"], int(row.get("device_flags", 0)), heading)
+    if rotation is None:
+        return
     log.has_gimbal = True
     yaw, pitch, roll = camera_angles_deg(rotation)
     _add(log, row, clock, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
@@ -216,8 +212,7 @@ def _event(row: Row, kind: str, clock: float | None, home: float | None) -> Came
             sample.height_m, sample.height_is_ground = above, True
         elif home is not None:
             sample.height_m = altitude - home
-        q = row.get("q")
-        if q is not None and all(map(np.isfinite, q)) and any(q):
-            sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg = euler_deg(quaternion_ned(*q))
+        if "q" in row:
+            put_capture_attitude(sample, row["q"])
     number = row.get("seq")
     return CameraEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, field
 
 from telemetry.samples.sample import is_position
-from telemetry.samples.times import parse_offset, parse_time
+from telemetry.samples.times import ZONE_UNKNOWN, parse_offset, parse_time
 
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
@@ -187,4 +187,4 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
         if abs(quarters) <= 60 and abs(seconds - stamp - 900.0 * quarters) < 120.0:
             return seconds - 900.0 * quarters, "EXIF time, zone from GPS time"
         return stamp, "EXIF GPS time"
-    return seconds, "EXIF time without zone, taken as UTC"
+    return seconds, f"EXIF time {ZONE_UNKNOWN}"

@@ -15,6 +15,12 @@ _LIST = re.compile(
     rb"<([A-Za-z][\w.-]{0,63}:[A-Za-z]\w{0,63})>\s*<rdf:(?:Seq|Bag|Alt)>\s*<rdf:li[^>]{0,64}>([^<]{1,1024})</"
 )
 
+_STRUCTURES = (
+    b"drone-skydio:CameraOrientationNED", b"drone-skydio:CalibratedFocalLength",
+    b"drone-skydio:CalibratedOpticalCenter",
+)  # fmt: skip
+_MAX_STRUCTURE = 1024
+
 PACKET_START = b"<x:xmpmeta"
 _MAX_PACKET = 1 << 18
 
@@ -32,7 +38,28 @@ def properties(packet: bytes) -> dict[str, str]:
     if b"rdf:li" in packet:
         for name, value in _LIST.findall(packet):
             found.setdefault(name.decode("ascii", "replace"), value.decode("utf-8", "replace").strip())
+    for name in _STRUCTURES:
+        for field, value in _structure(packet, name).items():
+            found[f"{name.decode()}/{field}"] = value
     return found
+
+
+def _structure(packet: bytes, name: bytes) -> dict[str, str]:
+    """Fields of a property with several, "Name" -> text: as attributes of its element or as elements within it."""
+    start = packet.find(b"<" + name)
+    if start < 0:
+        return {}
+    body = packet[start + 1 + len(name) : start + _MAX_STRUCTURE]
+    end = body.find(b"</" + name)
+    single = body.find(b"/>")
+    if single >= 0 and (end < 0 or b"<" not in body[:single]):
+        end = single
+    fields = [(name, first or second) for name, first, second in _ATTRIBUTE.findall(body[: max(end, 0)])]
+    fields += _ELEMENT.findall(body[: max(end, 0) + 1] + b"</")
+    return {
+        name.partition(b":")[2].decode("ascii", "replace"): value.decode("utf-8", "replace").strip()
+        for name, value in fields
+    }
 
 
 def number(found: Properties, *names: str) -> float | None:
