@@ -1,0 +1,52 @@
+// The daemon's HTTP: token, requests, and failures that say what to do.
+
+const KEY = "orthoswarm-token";
+const given = new URLSearchParams(location.hash.slice(1)).get("token");
+if (given) {
+  sessionStorage.setItem(KEY, given);
+  history.replaceState(null, "", location.pathname);
+}
+
+export const token = () => sessionStorage.getItem(KEY) || "";
+export const setToken = (text) => sessionStorage.setItem(KEY, text.trim());
+
+const headers = () => (token() ? { Authorization: `Bearer ${token()}` } : {});
+
+// kind: "http" the daemon answered no (status), "time" it did not answer in time, "network" it could not be reached.
+export class ApiError extends Error {
+  constructor(message, kind, status = 0) {
+    super(message);
+    Object.assign(this, { kind, status });
+  }
+}
+
+export async function request(method, path, body, limit_ms = 30_000) {
+  const control = new AbortController();
+  const timer = setTimeout(() => control.abort(), limit_ms);
+  const plain = body !== undefined && !(body instanceof FormData);
+  const options = {
+    method, signal: control.signal, cache: "no-store",
+    headers: { ...(plain ? { "Content-Type": "application/json" } : {}), ...headers() },
+    body: body === undefined ? undefined : plain ? JSON.stringify(body) : body,
+  };
+  try {
+    const response = await fetch(path, options);
+    const text = await response.text();
+    let answer = null;
+    try { answer = text ? JSON.parse(text) : null; } catch { /* no JSON: the status says enough */ }
+    if (response.ok) return answer;
+    const detail = typeof answer?.detail === "string" ? answer.detail : `the daemon answered ${response.status}`;
+    throw new ApiError(detail, "http", response.status);
+  } catch (error) {
+    if (error instanceof ApiError) throw error;
+    if (error?.name === "AbortError") throw new ApiError("the daemon did not answer in time", "time");
+    throw new ApiError("the daemon cannot be reached", "network");
+  } finally {
+    clearTimeout(timer);
+  }
+}
+
+export const get = (path) => request("GET", path);
+export const post = (path, body = {}, limit_ms = 60_000) => request("POST", path, body, limit_ms);
+export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);
+export const tileRequest = (url) => ({ url: new URL(url, location.href).href, headers: headers() });

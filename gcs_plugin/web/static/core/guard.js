@@ -1,0 +1,22 @@
+// An error in one card or layer never takes another: it is reported once, and the rest goes on.
+
+const reported = new Map();
+let tell = () => {};
+
+export const onFault = (listener) => { tell = listener; };
+
+export function guarded(name, work) {
+  return (...values) => {
+    try {
+      return work(...values);
+    } catch (error) {
+      const text = `${name}: ${error?.message ?? error}`;
+      if (reported.get(name) !== text) {
+        reported.set(name, text);
+        console.warn(text, error);
+        tell(name, text);
+      }
+      return undefined;
+    }
+  };
+}

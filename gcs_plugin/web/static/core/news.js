@@ -1,0 +1,75 @@
+// What comes in: everything once at the start and after each gap, then only what changes.
+
+import { get } from "/static/core/api.js";
+import { guarded } from "/static/core/guard.js";
+import { changed, state } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import { ring, vehicle } from "/static/core/values.js";
+import { announce } from "/static/fly/alarms.js";
+import { heardCommand } from "/static/fly/commands.js";
+
+const HEALTH_MS = 5000;
+const list = (value) => (Array.isArray(value) ? value : []);
+
+const takeVehicle = guarded("a vehicle", (message) => {
+  const id = message?.id == null ? "" : String(message.id);
+  if (!id) return;
+  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), performance.now()));
+  changed("vehicles");
+});
+const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); changed("jobs"); } };
+
+const READS = {
+  "/api/vehicles": (rows) => list(rows).forEach(takeVehicle),
+  "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
+  "/api/jobs": (rows) => list(rows).forEach(takeJob),
+  "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },
+  "/api/completions": (rows) => { state.completions = list(rows); changed("completions"); },
+  "/healthz": (body) => { state.problems = list(body?.problems).map(String); changed("problems"); },
+};
+
+async function read(path) {
+  try {
+    guarded(path, READS[path])(await get(path));
+  } catch (error) {
+    if (error.kind === "http") { state.problems = [error.status === 401 ? t("app.token") : `${path}: ${error.message}`]; changed("problems"); }
+  }
+}
+export const refresh = () => Promise.all(Object.keys(READS).map(read));
+
+// What is asked for again after an event, at most once in two seconds.
+const SOON_MS = 2000;
+const due = new Set();
+let timer = null;
+function soon(...paths) {
+  paths.forEach((path) => due.add(path));
+  timer ??= setTimeout(() => { timer = null; const now = [...due]; due.clear(); now.forEach(read); }, SOON_MS);
+}
+
+const KINDS = {
+  resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
+  vehicle: takeVehicle,
+  vehicle_event: (event) => {
+    const row = state.vehicles.get(String(event.vehicle));
+    if (row && event.text) { row.texts.push({ text: String(event.text).slice(0, 300), time: event.time ?? null, severity: event.severity ?? 6 }); row.texts.splice(0, row.texts.length - 50); changed("vehicles"); }
+    if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
+    soon("/api/vehicles");
+  },
+  frame: (event) => {
+    const outline = ring(event.outline);
+    if (outline.length > 2) { state.outlines.set(String(event.vehicle), outline); changed("outlines"); }
+    soon("/api/vehicles");
+  },
+  layer: () => soon("/api/layers"),
+  job: (event) => { takeJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
+  completion: () => soon("/api/completions", "/api/vehicles"),
+  plan: () => changed("plan"),
+  finds: () => changed("finds-changed"),
+  command: heardCommand,
+  alarm: announce,
+  problem: () => read("/healthz"),
+  overload: () => read("/healthz"),
+};
+export const news = guarded("the stream of events", (event) => KINDS[event.type]?.(event));
+
+setInterval(() => { if (state.link === "live" && !document.hidden) read("/healthz"); }, HEALTH_MS);

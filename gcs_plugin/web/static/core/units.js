@@ -1,0 +1,35 @@
+// Numbers for people: metric or US, fixed numbers of digits so that nothing jumps.
+
+import { settings } from "/static/core/settings.js";
+
+const FOOT = 0.3048;
+const us = () => settings.units === "us";
+const none = "–";
+const show = (value, digits, unit) => (value == null ? none : `${value.toFixed(digits)} ${unit}`);
+
+export const height = (metres) => (us() ? show(metres == null ? null : metres / FOOT, 0, "ft") : show(metres, 0, "m"));
+export const speed = (m_s) => (us() ? show(m_s == null ? null : m_s * 2.236936, 0, "mph") : show(m_s, 1, "m/s"));
+export const percent = (share) => (share == null ? none : `${Math.round(100 * share)} %`);
+export const clock = (seconds) => {
+  if (seconds == null || !Number.isFinite(seconds)) return none;
+  const whole = Math.max(0, Math.round(seconds));
+  return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
+};
+export const ageText = (seconds) => (seconds == null ? none : seconds < 10 ? `${seconds.toFixed(1)} s` : seconds < 100 ? `${Math.round(seconds)} s` : clock(seconds));
+
+export function distance(metres) {
+  if (metres == null) return none;
+  if (us()) return metres < 1609.344 ? `${(metres / FOOT).toFixed(0)} ft` : `${(metres / 1609.344).toFixed(2)} mi`;
+  return metres < 10 ? `${metres.toFixed(2)} m` : metres < 1000 ? `${metres.toFixed(1)} m` : `${(metres / 1000).toFixed(2)} km`;
+}
+
+export function area(m2) {
+  if (m2 == null) return none;
+  if (us()) return m2 < 4046.86 ? `${(m2 / FOOT / FOOT).toFixed(0)} ft²` : `${(m2 / 4046.8564).toFixed(2)} acres`;
+  return m2 < 10_000 ? `${m2.toFixed(0)} m²` : `${(m2 / 10_000).toFixed(2)} ha`;
+}
+
+// Input fields hold what the person reads; these turn it into metres and back.
+export const lengthUnit = () => (us() ? "ft" : "m");
+export const toMetres = (value) => (us() ? value * FOOT : value);
+export const fromMetres = (metres) => (us() ? metres / FOOT : metres);

@@ -1,0 +1,67 @@
+// Any value may come over the air: what is out of range becomes null here, so that nothing behind has to ask again.
+
+const MERCATOR_DEG = 85.05;
+
+export const number = (value, low = -1e12, high = 1e12) =>
+  typeof value === "number" && Number.isFinite(value) && value >= low && value <= high ? value : null;
+
+export const text = (value, most = 200) => (value == null || typeof value === "object" ? "" : String(value).slice(0, most));
+
+export const position = (lon, lat) => {
+  const [x, y] = [number(lon, -180, 180), number(lat, -MERCATOR_DEG, MERCATOR_DEG)];
+  return x == null || y == null ? null : [x, y];
+};
+
+const points = (list) => (Array.isArray(list) ? list.map((p) => Array.isArray(p) && position(p[0], p[1])).filter(Boolean) : []);
+export const ring = (list) => points(list);
+
+const object = (value) => (value && typeof value === "object" && !Array.isArray(value) ? value : {});
+const count = (value) => number(value, 0, 1e9) ?? 0;
+
+function flight(row) {
+  const given = object(row.flight);
+  if (given.text || given.state) return { state: text(given.state), text: text(given.text || given.state), item: count(given.item), items: count(given.items) };
+  const mission = object(row.mission);
+  return { state: "", text: text(row.landed), item: count(mission.item), items: count(mission.items) };
+}
+
+function messages(list) {
+  if (!Array.isArray(list)) return [];
+  return list.slice(-50).map((m) => (typeof m === "string" ? { text: text(m, 300), time: null, severity: 6 }
+    : { text: text(object(m).text, 300), time: number(object(m).time), severity: number(object(m).severity, 0, 7) ?? 6 })).filter((m) => m.text);
+}
+
+// A vehicle as the page keeps it. `before` keeps what this message leaves out: its name, trail and counts.
+export function vehicle(message, before, now) {
+  const row = { ...(before?.raw ?? {}), ...message };
+  const moved = position(row.lon_deg, row.lat_deg);
+  const trail = Array.isArray(message.trail) ? points(message.trail) : (before?.trail ?? []);
+  if (moved && !Array.isArray(message.trail)) extend(trail, moved);
+  delete row.trail;
+  const battery = number(row.battery, 0, 1.5);
+  const frames = object(row.frames);
+  return {
+    raw: row, id: text(row.id), name: text(row.name) || before?.name || text(row.id), system: number(row.system, 0, 255),
+    linked: number(row.system, 0, 255) != null, state: text(row.state), mode: text(row.mode), armed: row.armed === true,
+    flight: flight(row), position: moved ?? before?.position ?? null, height_m: number(row.height_m, -5000, 50000),
+    speed_m_s: number(row.speed_m_s, 0, 1000), heading_deg: number(row.heading_deg, -720, 720), battery,
+    battery_left_s: number(row.battery_left_s, 0, 1e6), gps_fix: number(row.gps_fix, 0, 10), satellites: number(row.satellites, 0, 254),
+    link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
+    frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
+    sortie: count(row.sortie), phase: text(object(row.mission).phase), takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
+    texts: messages(row.texts), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot),
+  };
+}
+
+const TRAIL = 600;
+const STEP_DEG = 1e-5; // a metre
+
+function extend(trail, point) {
+  const last = trail.at(-1);
+  if (last && Math.abs(last[0] - point[0]) < STEP_DEG && Math.abs(last[1] - point[1]) < STEP_DEG) return;
+  trail.push(point);
+  if (trail.length > TRAIL) trail.splice(0, trail.length - TRAIL);
+}
+
+// Seconds since a vehicle was heard, as of now (performance.now()); null for one that only sends pictures.
+export const age = (row, now) => (row.linked ? row.silent_s + (now - row.at) / 1000 : null);

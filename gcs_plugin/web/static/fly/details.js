@@ -1,0 +1,60 @@
+// The selected vehicle: its figures in full, its commands, and what its autopilot says.
+
+import { button, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { settings } from "/static/core/settings.js";
+import { select, state, subscribe } from "/static/core/store.js";
+import { positionText } from "/static/core/coordinates.js";
+import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
+import { need } from "/static/fly/need.js";
+import { askOne } from "/static/fly/command_bar.js";
+import { wordOf } from "/static/fly/tiles.js";
+import { map } from "/static/map/map.js";
+import { refine } from "/static/work/jobs.js";
+
+const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "mission", "pictures", "refined"];
+
+export function detailsPanel() {
+  const name = make("h2", {});
+  const why = make("p", { class: "why" });
+  const cells = Object.fromEntries(FACTS.map((key) => [key, make("dd", {})]));
+  const facts = make("dl", {}, ...FACTS.flatMap((key) => [make("dt", {}, t(`details.${key}`)), cells[key]]));
+  const chosen = () => state.vehicles.get(state.selected);
+  const verb = (key) => make("button", { type: "button", dataset: { verb: key }, onclick: () => chosen() && askOne(chosen(), key) }, t(`verb.${key}`));
+  const linked = make("div", { class: "row wrap", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
+  const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
+  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.text); row.dataset.severity = message.severity; });
+  const box = make("aside", { class: "details", "aria-label": t("details.title"), hidden: true },
+    make("div", { class: "row" }, name, button("×", () => select(null), { class: "close", "aria-label": t("details.close") })),
+    why, linked, make("div", { class: "row wrap" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
+      button(t("details.refine"), () => chosen() && refine(chosen().id))),
+    facts, make("h3", {}, t("details.messages")), messages);
+  subscribe("vehicles selected tick completions", "details of a vehicle", () => {
+    const row = chosen();
+    setHidden(box, !row);
+    if (!row) return;
+    const wanted = need(row, performance.now());
+    setText(name, row.name === row.id ? row.id : `${row.name} (${row.id})`);
+    setText(why, wanted.why.map((item) => item.words).join("; "));
+    setHidden(linked, !row.linked);
+    const values = {
+      state: [wordOf(row), row.mode, row.armed ? t("details.armed") : t("details.disarmed")].filter(Boolean).join(", "),
+      position: row.position ? positionText(row.position[1], row.position[0], settings.coordinates) : "–",
+      height: units.height(row.height_m), speed: units.speed(row.speed_m_s),
+      battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
+      gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
+      link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("state.pictures"),
+      mission: row.flight.items ? t("details.item", { item: row.flight.item, items: row.flight.items }) : "–",
+      pictures: t("details.counts", { taken: Math.max(row.photos, row.frames.frames), ...row.frames }),
+      refined: refinedText(row.id),
+    };
+    for (const key of FACTS) setText(cells[key], values[key]);
+    draw(row.texts.map((message, k) => [`${message.time ?? ""}/${message.text}/${message.time ? "" : k}`, message]));
+  });
+  return box;
+}
+
+function refinedText(vehicle) {
+  const last = state.completions.filter((row) => row.vehicle === vehicle && row.refine_ended_s).pop();
+  return last ? t("details.refined_s", { s: (last.refine_ended_s - last.complete_s).toFixed(1) }) : "–";
+}

@@ -1,0 +1,32 @@
+// What a vehicle needs of a person: its level (ok, stale, warn, bad) and why, in words. One place for tiles, map and alarms.
+
+import { age } from "/static/core/values.js";
+import { t } from "/static/core/strings.js";
+import { ageText, percent } from "/static/core/units.js";
+import { state } from "/static/core/store.js";
+
+export const STALE_S = 2;
+export const LOST_S = 5;
+const LOW = 0.25;
+const EMPTY = 0.12;
+const WEIGHT = { bad: 3, warn: 2, stale: 1, ok: 0 };
+
+const GROUND = new Set(["on ground", "complete"]);
+export const inAir = (row) => (row.flight.state ? !GROUND.has(row.flight.state) && row.flight.state !== "lost"
+  : row.linked && row.armed && row.flight.text !== "on ground");
+
+export function need(row, now) {
+  if (!row.linked) return { level: "ok", why: [], age_s: null, weight: 0 };
+  const age_s = age(row, now);
+  const why = [];
+  const add = (level, key, words) => why.push({ level, key, words });
+  if (age_s > LOST_S || row.state === "lost") add("bad", "link", t("need.link", { age: ageText(age_s) }));
+  else if (age_s > STALE_S || state.link !== "live") add("stale", "stale", t("need.stale", { age: ageText(age_s) }));
+  if (row.state === "conflict") add("warn", "twins", t("need.twins"));
+  if (row.battery != null && row.battery < EMPTY) add("bad", "battery", t("need.empty", { share: percent(row.battery) }));
+  else if (row.battery != null && row.battery < LOW) add("warn", "battery", t("need.low", { share: percent(row.battery) }));
+  if (row.gps_fix != null && row.gps_fix < 3) add(inAir(row) ? "bad" : "warn", "gps", t("need.gps"));
+  if (row.takeoff?.failed) add("warn", "takeoff", row.takeoff.failed);
+  const level = why.reduce((worst, item) => (WEIGHT[item.level] > WEIGHT[worst] ? item.level : worst), "ok");
+  return { level, why, age_s, weight: WEIGHT[level] };
+}

@@ -1,0 +1,104 @@
+// Before a start: what starts, when and how high, and the daemon's check of each vehicle. Red stops the start; each red
+// item can be allowed by itself, never all at once.
+
+import { post } from "/static/core/api.js";
+import { button, make, setHidden, setText } from "/static/core/dom.js";
+import { notice } from "/static/core/notices.js";
+import { state } from "/static/core/store.js";
+import { daemonTime } from "/static/core/stream.js";
+import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
+
+const CHECK_MS = 60_000;
+const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
+const title = make("h2", { id: "preflight-title" });
+const facts = make("ul", { class: "starts" });
+const checks = make("div", { class: "checks" });
+const status = make("p", { role: "status" });
+const again = button(t("preflight.again"), () => check());
+const go = button(t("preflight.start"), () => start(), { class: "primary" });
+const dialog = make("dialog", { class: "preflight", "aria-labelledby": "preflight-title" }, title, make("p", { class: "quiet" }, t("preflight.about")), facts, checks, status,
+  make("div", { class: "row wrap" }, again, button(t("confirm.no"), () => dialog.close()), go));
+export const preflightDialog = () => dialog;
+
+let plan = null;
+let names = {};
+let rows = null;
+let allowed = {};
+
+export function openPreflight(chosen, vehicles) {
+  plan = chosen;
+  names = vehicles;
+  allowed = {};
+  setText(title, t("preflight.title", { n: plan.vehicles.length }));
+  dialog.showModal();
+  check();
+}
+
+async function check() {
+  rows = null;
+  checks.replaceChildren();
+  setText(status, t("preflight.checking"));
+  draw();
+  try {
+    const answer = await post(`/api/plans/${plan.id}/preflight`, { sortie: 1, vehicles: names }, CHECK_MS);
+    rows = Array.isArray(answer?.checks) ? answer.checks : [];
+    setText(status, "");
+  } catch (error) {
+    setText(status, error.status === 404 || error.status === 405 ? t("preflight.absent") : t("preflight.failed", { why: error.message }));
+  }
+  draw();
+}
+
+const stopped = () => (rows ?? []).flatMap((row) => row.items.filter((item) => item.state === "red" && !allowed[row.vehicle]?.has(item.name)));
+
+// What starts: vehicle, mission, height and times, as the daemon will fly them.
+function drawFacts() {
+  const first = Math.min(...plan.vehicles.map((row) => row.flights?.[0]?.start_s ?? 0));
+  facts.replaceChildren(...plan.vehicles.map((part) => {
+    const row = (rows ?? []).find((checked) => checked.vehicle === names[part.id]);
+    return make("li", {}, make("b", {}, nameOf(names[part.id])), t("preflight.fact", {
+      mission: `${plan.id} ${part.id}`, height: units.height(row?.height_m), at: units.clock((part.flights?.[0]?.start_s ?? 0) - first), time: units.clock(row?.time_s ?? part.time_s), photos: part.photos }));
+  }));
+}
+
+function draw() {
+  drawFacts();
+  checks.replaceChildren(...(rows ?? []).map((row) => make("section", { dataset: { level: row.state } }, make("h3", {}, `${nameOf(row.vehicle)}: ${t(`preflight.state.${row.state}`)}`),
+    make("ul", {}, ...row.items.map((item) => line(row.vehicle, item))))));
+  refresh();
+}
+
+function refresh() {
+  const left = stopped();
+  go.disabled = rows == null || left.length > 0;
+  setText(go, rows && left.length ? t("preflight.stopped", { n: left.length }) : t("preflight.start", { n: plan?.vehicles.length ?? 0 }));
+}
+
+function line(vehicle, item) {
+  const words = t(`preflight.${item.state}`);
+  const box = item.state === "red" ? make("label", { class: "check" }, make("input", { type: "checkbox", checked: allowed[vehicle]?.has(item.name) ?? false, onchange: (event) => allow(vehicle, item.name, event.target.checked) }),
+    make("span", {}, t("preflight.allow", { item: t(`preflight.item.${item.name}`), name: nameOf(vehicle) }))) : null;
+  return make("li", { dataset: { level: item.state } }, make("b", {}, words), make("span", {}, `${t(`preflight.item.${item.name}`)}: ${item.reason}`), box);
+}
+
+function allow(vehicle, item, on) {
+  allowed[vehicle] ??= new Set();
+  on ? allowed[vehicle].add(item) : allowed[vehicle].delete(item);
+  refresh();
+}
+
+async function start() {
+  go.disabled = true;
+  setText(status, t("preflight.starting"));
+  try {
+    const override = Object.fromEntries(Object.entries(allowed).map(([vehicle, items]) => [vehicle, [...items]]));
+    const answer = await post(`/api/plans/${plan.id}/start`, { sortie: 1, vehicles: names, override, given_s: daemonTime() });
+    dialog.close();
+    const times = Object.entries(answer?.takeoffs_in_s ?? {}).map(([vehicle, s]) => t("preflight.takeoff", { name: nameOf(vehicle), time: units.clock(s) }));
+    notice("done", t("preflight.started", { list: times.join(", ") }));
+  } catch (error) {
+    setText(status, t("preflight.refused", { why: error.message }));
+    refresh();
+  }
+}

@@ -1,0 +1,83 @@
+// The picture layers in words, with opacity. A layer comes onto the map once it holds something.
+
+import { make, setAttribute, setHidden, setText } from "/static/core/dom.js";
+import { tileRequest } from "/static/core/api.js";
+import { guarded } from "/static/core/guard.js";
+import { state, subscribe } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import { FIRST_OVERLAY, FLIGHT_LAYERS, fit, isMoved, map } from "/static/map/map.js";
+
+export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
+const address = (name) => tileRequest(`/tiles/${name}/{z}/{x}/{y}.webp`).url.replaceAll("%7B", "{").replaceAll("%7D", "}");
+export const rasterSource = (name) => ({ type: "raster", tiles: [address(name)], tileSize: 256, maxzoom: 22 });
+export const rasterLayer = (name) => ({ id: name, type: "raster", source: name, paint: { "raster-fade-duration": 0 } });
+
+const shares = new Map();
+const versions = new Map();
+const stale = new Set();
+const rows = new Map();
+let fitted = "";
+
+export function setOpacity(name, share) {
+  shares.set(name, share);
+  if (!map.getLayer(name)) return;
+  map.setPaintProperty(name, "raster-opacity", share);
+  map.setLayoutProperty(name, "visibility", share > 0 ? "visible" : "none");
+}
+
+// News of a layer's content. Tiles carry ETags, so asking again costs little; once a second is enough for the eye.
+export function setVersion(name, version) {
+  if (versions.get(name) === version) return;
+  const first = !versions.has(name);
+  versions.set(name, version);
+  if (!first) stale.add(name);
+}
+setInterval(guarded("tiles", () => {
+  for (const name of stale) if (map.getSource(name)) map.refreshTiles(name);
+  stale.clear();
+}), 1000);
+
+function showRaster(name) {
+  if (map.getSource(name)) return;
+  map.addSource(name, rasterSource(name));
+  const above = [...RASTERS.slice(RASTERS.indexOf(name) + 1), FIRST_OVERLAY].find((id) => map.getLayer(id));
+  map.addLayer(rasterLayer(name), above);
+  if (shares.has(name)) setOpacity(name, shares.get(name));
+}
+
+export function layerPanel() {
+  const line = (name) => {
+    const on = make("input", { type: "checkbox", checked: true });
+    const opacity = make("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": t("layers.opacity", { name: t(`layers.${name}`) }) });
+    const apply = () => setOpacity(name, on.checked ? opacity.value / 100 : 0);
+    on.onchange = opacity.oninput = apply;
+    const about = make("small", {});
+    const row = make("div", { class: "layer", dataset: { layer: name, empty: "true" } }, make("label", { class: "check" }, on, make("span", {}, t(`layers.${name}`))), opacity, about);
+    rows.set(name, { row, about });
+    return row;
+  };
+  const over = make("input", { type: "checkbox", checked: true, onchange: () => FLIGHT_LAYERS.forEach((id) => map.setLayoutProperty(id, "visibility", over.checked ? "visible" : "none")) });
+  return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line), make("label", { class: "check" }, over, make("span", {}, t("layers.flight"))));
+}
+
+subscribe("layers", "layers", () => {
+  for (const layer of state.layers) {
+    guarded(`layer ${layer.name}`, () => {
+      setVersion(layer.name, layer.version);
+      const line = rows.get(layer.name);
+      if (!line) return;
+      setAttribute(line.row, "data-empty", layer.empty ? "true" : "false");
+      setText(line.about, layer.empty ? t("layers.none") : t(`layers.${layer.name}.about`));
+      setHidden(line.about, false);
+    })();
+  }
+  const full = state.layers.filter((layer) => Array.isArray(layer.bounds));
+  const best = full.find((layer) => layer.name === "best") ?? full.find((layer) => layer.name === "basemap");
+  if (best && String(best.bounds) !== fitted && !isMoved()) {
+    fit(best.bounds);
+    fitted = String(best.bounds);
+  }
+  for (const layer of full) if (RASTERS.includes(layer.name)) guarded(`layer ${layer.name} on the map`, showRaster)(layer.name);
+});
+
+export const mappedBounds = () => (state.layers.find((layer) => layer.name === "best" && layer.bounds) ?? state.layers.find((layer) => layer.bounds))?.bounds ?? null;

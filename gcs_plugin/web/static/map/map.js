@@ -1,0 +1,82 @@
+// The map itself. It repaints only when something on it changes: sources take data only if it differs.
+
+import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
+import { tileRequest } from "/static/core/api.js";
+
+maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
+export { maplibregl };
+
+export const EMPTY = { type: "FeatureCollection", features: [] };
+export const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
+
+const STATE = ["match", ["get", "state"], "matched", "#2b8a3e", "carried", "#d9780a", "#c92a2a"];
+const COLOUR = ["coalesce", ["get", "colour"], "#16202a"];
+// id, type, paint, filter, source if it is not the id
+const OVERLAYS = [
+  ["footprints", "fill", { "fill-color": COLOUR, "fill-opacity": 0.12, "fill-outline-color": COLOUR }],
+  ["trails", "line", { "line-color": COLOUR, "line-width": 2, "line-opacity": 0.85 }],
+  ["legs", "line", { "line-color": "#fff", "line-width": 7, "line-opacity": 0.6 }],
+  ["legs-refined", "line", { "line-color": STATE, "line-width": 4 }, ["==", ["get", "stage"], "fine"], "legs"],
+  ["legs-flying", "line", { "line-color": STATE, "line-width": 4, "line-dasharray": [2, 1.2] }, ["!=", ["get", "stage"], "fine"], "legs"],
+  ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15 }],
+  ["area-line", "line", { "line-color": "#fff", "line-width": 4 }, null, "area"],
+  ["area-edge", "line", { "line-color": "#1c64b0", "line-width": 2.5 }, null, "area"],
+  ["plan-edge", "line", { "line-color": "#fff", "line-width": 5, "line-opacity": 0.7 }, null, "plan"],
+  ["plan", "line", { "line-color": COLOUR, "line-width": ["match", ["get", "kind"], "leg", 3, 1.5] }],
+  ["homes", "circle", { "circle-radius": 6, "circle-color": "#fff", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],
+  ["ellipses", "fill", { "fill-color": "#d6409f", "fill-opacity": 0.2, "fill-outline-color": "#d6409f" }],
+  ["measure-area", "fill", { "fill-color": "#ffd43b", "fill-opacity": 0.25 }, null, "measure"],
+  ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],
+  ["measure-line", "line", { "line-color": "#ffd43b", "line-width": 3 }, null, "measure"],
+];
+export const FLIGHT_LAYERS = ["footprints", "trails", "legs", "legs-refined", "legs-flying", "homes"];
+export const FIRST_OVERLAY = OVERLAYS[0][0];
+
+export const mapOptions = (container) => ({
+  container, center: [0, 20], zoom: 1.5, maxZoom: 23, attributionControl: false, dragRotate: false, pitchWithRotate: false,
+  style: { version: 8, sources: {}, layers: [{ id: "ground", type: "background", paint: { "background-color": "#cfd6dc" } }] },
+  transformRequest: tileRequest, fadeDuration: 0, trackResize: true,
+});
+
+export const map = new maplibregl.Map(mapOptions("map"));
+map.addControl(new maplibregl.NavigationControl({ showCompass: false }), "top-right");
+map.touchZoomRotate.disableRotation();
+map.keyboard.disableRotation();
+
+export const ready = new Promise((resolve) => {
+  map.on("load", () => {
+    for (const id of new Set(OVERLAYS.map(([name, , , , source]) => source || name))) map.addSource(id, { type: "geojson", data: EMPTY });
+    for (const [id, type, paint, filter, source] of OVERLAYS) {
+      map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}) });
+    }
+    resolve();
+  });
+});
+
+const shown = new Map();
+
+// Show features on a source; the same ones again cost nothing.
+export function show(id, features) {
+  const text = JSON.stringify(features);
+  if ((shown.get(id) ?? "[]") === text) return;
+  const source = map.getSource(id);
+  if (!source) return;
+  shown.set(id, text);
+  source.setData({ type: "FeatureCollection", features });
+}
+
+// Whether somebody has moved the map by hand; until then it follows what is mapped.
+let moved = false;
+map.on("movestart", (event) => { moved ||= Boolean(event.originalEvent); });
+export const isMoved = () => moved;
+
+export function fit([west, south, east, north]) {
+  if (![west, south, east, north].every(Number.isFinite)) return;
+  map.fitBounds([[west, south], [east, north]], { padding: 40, duration: 0, maxZoom: 19 });
+}
+
+export function boundsOf(points) {
+  if (!points.length) return null;
+  const [x, y] = [points.map((p) => p[0]), points.map((p) => p[1])];
+  return [Math.min(...x), Math.min(...y), Math.max(...x), Math.max(...y)];
+}

@@ -1,0 +1,53 @@
+// Everything that needs the map: the map itself, and the panels of Plan and Map.
+
+import { button, byId, make } from "/static/core/dom.js";
+import { guarded } from "/static/core/guard.js";
+import { t } from "/static/core/strings.js";
+import { detailsPanel } from "/static/fly/details.js";
+import "/static/fly/overlays.js";
+import { preflightDialog } from "/static/fly/preflight.js";
+import { cursorLine } from "/static/map/cursor.js";
+import { layerPanel, mappedBounds } from "/static/map/layers.js";
+import { legPanel } from "/static/map/legs.js";
+import { boundsOf, fit, map, ready } from "/static/map/map.js";
+import { measurePanel } from "/static/map/measure.js";
+import { setSwipe, swipeParts } from "/static/map/swipe.js";
+import "/static/map/vehicle_markers.js";
+import { setEditing } from "/static/plan/editor.js";
+import { loadPlan, planPanel } from "/static/plan/panel.js";
+import { exportPanel } from "/static/work/exports.js";
+import { findPanel, loadFinds } from "/static/work/finds.js";
+import { jobPanel } from "/static/work/jobs.js";
+import { area } from "/static/plan/area.js";
+import { state, subscribe } from "/static/core/store.js";
+
+function showAll() {
+  const vehicles = [...state.vehicles.values()].filter((row) => row.position).map((row) => row.position);
+  const mapped = mappedBounds();
+  const corners = mapped ? [mapped.slice(0, 2), mapped.slice(2)] : [];
+  const bounds = boundsOf([...vehicles, ...corners, ...(area.rings[0] ?? [])]);
+  if (bounds) fit(bounds);
+}
+
+// Before anything is mapped the map goes once to where the vehicles are.
+let went = false;
+subscribe("vehicles ready", "first look", () => {
+  if (went || !map.loaded() || mappedBounds() || ![...state.vehicles.values()].some((row) => row.position)) return;
+  went = true;
+  showAll();
+});
+
+export async function withMap(panels) {
+  const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
+  byId("stage").append(...swipeParts(), make("div", { class: "under" }, button(t("map.all"), showAll), cursorLine()), detailsPanel());
+  panels.plan.append(planPanel());
+  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  document.body.append(preflightDialog());
+  await ready;
+  subscribe("plan", "the shared plan", () => loadPlan());
+  subscribe("finds-changed", "finds of others", () => loadFinds());
+  guarded("the plan", loadPlan)();
+  guarded("finds", loadFinds)();
+  window.orthoswarm = { map };
+  return { setEditing };
+}

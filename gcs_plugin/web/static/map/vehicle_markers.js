@@ -1,0 +1,42 @@
+// Vehicles on the map, with name and heading. Markers are moved in place; the map's canvas is not repainted for them.
+
+import { setAttribute, setStyle, setText } from "/static/core/dom.js";
+import { guarded } from "/static/core/guard.js";
+import { select, state, subscribe } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import { colourOf } from "/static/map/colours.js";
+import { map, maplibregl } from "/static/map/map.js";
+import { need } from "/static/fly/need.js";
+
+const ARROW = '<svg viewBox="-17 -17 34 34" width="34" height="34" aria-hidden="true"><path d="M0-14 10 11 0 6-10 11Z" stroke="#fff" stroke-width="2"/></svg><span></span>';
+const markers = new Map();
+
+function create(row) {
+  const element = document.createElement("button");
+  element.type = "button";
+  element.className = "vehicle";
+  element.innerHTML = ARROW;
+  element.querySelector("path").setAttribute("fill", colourOf(row.id));
+  element.addEventListener("click", (event) => { event.stopPropagation(); select(row.id); });
+  const marker = new maplibregl.Marker({ element }).setLngLat(row.position).addTo(map);
+  markers.set(row.id, marker);
+  return marker;
+}
+
+const place = (row, now) => {
+  if (!row.position) return;
+  const marker = markers.get(row.id) ?? create(row);
+  const { lng, lat } = marker.getLngLat();
+  if (lng !== row.position[0] || lat !== row.position[1]) marker.setLngLat(row.position);
+  const element = marker.getElement();
+  setStyle(element.firstChild, "transform", `rotate(${Math.round(row.heading_deg ?? 0)}deg)`);
+  setText(element.lastChild, row.name);
+  setAttribute(element, "aria-label", t("map.vehicle", { name: row.name }));
+  setAttribute(element, "data-level", need(row, now).level);
+  setAttribute(element, "data-selected", state.selected === row.id);
+};
+
+subscribe("vehicles selected tick", "vehicles on the map", () => {
+  const now = performance.now();
+  for (const row of state.vehicles.values()) guarded(`${row.id} on the map`, place)(row, now);
+});

@@ -1,0 +1,97 @@
+// The plan that was made: its figures, which vehicle flies what, upload, and the way to the preflight check.
+
+import { get } from "/static/core/api.js";
+import { button, choice, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { notice } from "/static/core/notices.js";
+import { state, subscribe } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
+import { command } from "/static/fly/commands.js";
+import { openPreflight } from "/static/fly/preflight.js";
+import { colourOf } from "/static/map/colours.js";
+import { show } from "/static/map/map.js";
+
+let plan = null;
+let names = {};
+let changedNames = () => {};
+let picture = [];
+const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
+const heard = () => [...state.vehicles.values()].filter((row) => row.linked);
+
+const box = make("section", { class: "plan-result", hidden: true });
+const summary = make("p", {});
+const warnings = make("ul", { class: "warnings" });
+const list = make("ul", { class: "assignments" });
+const wrong = make("p", { class: "wrong", role: "status" });
+
+export function planResult() {
+  const upload = button(t("plan.upload"), uploadAll);
+  const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names), { class: "primary" });
+  box.append(make("h2", {}, t("plan.result")), summary, warnings, list, wrong, make("div", { class: "row wrap" }, upload, start));
+  return box;
+}
+
+const draw = keyedList(list, (row) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true" }), make("b", {}), make("span", {}), make("span", { class: "pick" })), (item, row) => {
+  item.firstChild.style.background = colourOf(names[row.id] || row.id);
+  setText(item.children[1], t("plan.part", { n: row.id }));
+  setText(item.children[2], t("plan.share", { length: units.distance(row.length_m), time: units.clock(row.time_s), photos: row.photos, sorties: row.sorties }));
+  const ids = heard().map((vehicle) => vehicle.id);
+  const key = ids.map((id) => `${id}=${nameOf(id)}`).join();
+  if (item.dataset.key !== key) {
+    item.dataset.key = key;
+    item.lastChild.replaceChildren(choice([["", t("plan.nobody")], ...ids.map((id) => [id, nameOf(id)])], names[row.id] ?? "", (id) => pick(row.id, id), t("plan.flies", { n: row.id })));
+  }
+  item.lastChild.firstChild.value = names[row.id] ?? "";
+});
+
+function pick(part, vehicle) {
+  names = { ...names, [part]: vehicle };
+  changedNames(names);
+  redraw();
+  paint();
+}
+
+function paint() {
+  show("plan", picture.map((feature) => ({ ...feature, properties: { ...feature.properties, colour: colourOf(names[feature.properties.vehicle] || feature.properties.vehicle) } })));
+}
+
+function problem() {
+  const chosen = plan.vehicles.map((row) => names[row.id]);
+  const twice = chosen.find((id, k) => id && chosen.indexOf(id) !== k);
+  if (twice) return t("plan.twice", { name: nameOf(twice) });
+  const missing = plan.vehicles.filter((row) => !names[row.id]);
+  if (missing.length) return t("plan.missing", { parts: missing.map((row) => row.id).join(", ") });
+  return "";
+}
+
+function assigned() {
+  const text = problem();
+  if (text) notice("bad", text);
+  return !text;
+}
+
+function redraw() {
+  if (!plan) return;
+  draw(plan.vehicles.map((row) => [row.id, row]));
+  setText(wrong, problem());
+}
+
+async function uploadAll() {
+  if (!assigned()) return;
+  await Promise.all(plan.vehicles.map((row) => command(names[row.id], "upload", { plan: plan.id, mission: row.id })));
+}
+
+export async function showPlan(made, assignment, onNames) {
+  plan = made;
+  names = assignment;
+  changedNames = onNames;
+  const km = plan.spacing_m == null ? "" : t("plan.spacing", { m: units.distance(plan.spacing_m) });
+  setText(summary, t("plan.summary", { share: `${(100 * plan.covered_share).toFixed(1)} %`, time: units.clock(plan.makespan_s), photos: plan.vehicles.reduce((n, row) => n + row.photos, 0), spacing: km }));
+  warnings.replaceChildren(...(plan.warnings ?? []).map((text) => make("li", {}, text)));
+  setHidden(box, false);
+  redraw();
+  picture = ((await get(`/api/plans/${plan.id}/map`)).features ?? []).filter((feature) => feature.geometry?.type === "LineString");
+  paint();
+}
+
+subscribe("vehicles", "who flies what", redraw);

@@ -1,0 +1,43 @@
+// The operator's plan as the daemon keeps it: a reload, a second browser and a tablet see the same.
+
+import { get, request } from "/static/core/api.js";
+import { notice } from "/static/core/notices.js";
+import { t } from "/static/core/strings.js";
+
+const SAVE_MS = 700;
+let timer = null;
+let there = true; // whether this daemon keeps plans
+let version = null;
+let saving = false;
+
+export async function loadShared() {
+  try {
+    const body = await get("/api/plan");
+    if (body?.version != null && body.version === version) return null;
+    version = body?.version ?? null;
+    return body;
+  } catch (error) {
+    if (error.status === 404) there = false;
+    return null;
+  }
+}
+
+export const isSaving = () => saving || timer != null;
+
+export function saveShared(body) {
+  if (!there) return;
+  clearTimeout(timer);
+  timer = setTimeout(async () => {
+    timer = null;
+    saving = true;
+    try {
+      const answer = await request("PUT", "/api/plan", body);
+      version = answer?.version ?? version;
+    } catch (error) {
+      if (error.status === 404) there = false;
+      else notice("warn", t("plan.unsaved", { why: error.message }));
+    } finally {
+      saving = false;
+    }
+  }, SAVE_MS);
+}

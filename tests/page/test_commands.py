@@ -1,0 +1,180 @@
+"""Commands: always on the screen, confirmed once, and each ends visibly."""
+
+import threading
+
+import pytest
+
+from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, send, standing, vehicle
+
+ALL = ("pause", "rtl", "land")
+
+
+def confirm(page):
+    page.wait_for_timeout(400)  # a press within a third of a second is a double press
+    page.click(".confirm-yes")
+
+
+def outcomes(page) -> list[str]:
+    return page.locator(".outcomes .outcome").all_inner_texts()
+
+
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_commands_to_all_are_on_the_screen_in_every_mode(browser, size):
+    with standing(*(vehicle(k) for k in range(1, 31))) as station, opened(browser, station.url, size) as page:
+        for mode in ("plan", "fly", "map"):
+            page.click(f"#tab-{mode}")
+            for verb in ALL:
+                box = page.locator(f".command[data-verb={verb}]").bounding_box()
+                assert box["height"] >= 44
+                assert box["x"] >= 0 and box["x"] + box["width"] <= size[0]
+                assert box["y"] + box["height"] <= size[1]
+                hit = "([x, y]) => document.elementFromPoint(x, y).closest('.command')?.dataset.verb"
+                assert page.evaluate(hit, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]) == verb
+            stage = page.locator("#stage").bounding_box()
+            if size == PHONE:
+                assert stage["height"] >= 2 / 3 * size[1]
+
+
+def test_one_press_and_one_confirmation_send_once_to_all(browser):
+    with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile >> nth=1")
+        page.dblclick(".command[data-verb=rtl]")
+        assert station.commands("rtl") == []  # a double press is no confirmation
+        confirm(page)
+        page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
+        assert [path for _, path, _ in station.heard] == ["/api/missions/all/rtl"]
+        body = station.commands("rtl")[0]
+        assert body["id"]
+        assert abs(body["given_s"] - page.evaluate("Date.now() / 1000")) < 3600
+
+
+def test_a_finger_holds_for_a_second(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url, PHONE, has_touch=True) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile")
+        page.locator(".command[data-verb=land]").tap()
+        page.wait_for_timeout(400)
+        page.locator(".confirm-yes").tap()
+        page.wait_for_timeout(300)
+        assert station.commands("land") == []
+        box = page.locator(".confirm-yes").bounding_box()
+        session = page.context.new_cdp_session(page)
+        point = {"x": box["x"] + 20, "y": box["y"] + 20}
+        session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+        page.wait_for_selector("[data-outcome=done]")
+        session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        assert len(station.commands("land")) == 1
+
+
+def test_keys_command_and_give_the_focus_back(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile")
+        page.focus(".command[data-verb=pause]")
+        page.keyboard.press("Enter")
+        page.wait_for_timeout(400)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("[data-outcome=done]")
+        assert page.evaluate("document.activeElement.dataset.verb") == "pause"
+        page.keyboard.press("Enter")
+        page.keyboard.press("Escape")
+        page.wait_for_selector(".confirm", state="hidden")
+        assert len(station.commands("pause")) == 1
+
+
+@pytest.mark.parametrize(
+    ("outcome", "word"), [("refused", "REFUSED"), ("not_sent", "NOT SENT"), ("unknown", "UNKNOWN")]
+)
+def test_what_was_not_done_stays_on_the_screen_with_its_reason(browser, outcome, word):
+    with standing(vehicle(1, name="Falcon")) as station, opened(browser, station.url) as page:
+        ok_for_all(station, outcome, "the battery is empty")
+        page.click(".tile")
+        page.click(".details [data-verb=rtl]")
+        assert "Falcon" in page.inner_text(".confirm")
+        confirm(page)
+        page.wait_for_selector(f"[data-outcome={outcome}]")
+        assert outcomes(page) == [word]
+        assert "the battery is empty" in page.inner_text(".outcomes")
+        assert "Falcon" in page.inner_text(".outcomes")
+
+
+def test_a_station_that_never_answers_makes_the_outcome_unknown(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        gate = threading.Event()
+        station.answer = lambda *_: (gate.wait(30), (200, {}))[1]
+        page.click(".tile")
+        page.evaluate("station.beats = false")
+        page.click(".details [data-verb=rtl]")
+        confirm(page)
+        page.wait_for_selector("[data-outcome=unknown]")
+        assert "remote control" in page.inner_text(".outcomes")
+        gate.set()
+
+
+def test_a_station_that_is_gone_sends_nothing_and_says_so(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click(".tile")
+        page.route("**/api/missions/**", lambda route: route.abort("connectionrefused"))
+        page.evaluate("station.beats = false; station.sockets.forEach((s) => s.close())")
+        page.click(".details [data-verb=pause]")
+        confirm(page)
+        page.wait_for_selector("[data-outcome=not_sent]")
+
+
+def test_commands_of_other_pages_are_shown(browser):
+    with standing(vehicle(1, name="Falcon")) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile")
+        send(
+            page,
+            {"type": "command", "id": "x", "vehicle": "v1", "command": "rtl", "outcome": "refused", "reason": "busy"},
+        )
+        page.wait_for_selector("[data-outcome=refused]")
+        assert "Falcon: Return" in page.inner_text(".outcomes")
+
+
+def test_red_items_stop_a_start_until_each_is_allowed(browser):
+    part = {
+        "id": "v1",
+        "length_m": 900.0,
+        "time_s": 312,
+        "photos": 40,
+        "sorties": 1,
+        "turns": 4,
+        "flights": [{"start_s": 0}],
+    }
+    plan = {
+        "id": "plan-1",
+        "covered_share": 0.99,
+        "makespan_s": 312,
+        "spacing_m": 20,
+        "vehicles": [part],
+        "warnings": [],
+    }
+    checks = [{"vehicle": "v7", "state": "red", "height_m": 80, "time_s": 312, "start_s": 0, "items": [
+        {"name": "link", "state": "ok", "reason": "heard 0.1 s ago"},
+        {"name": "battery", "state": "red", "reason": "0 % left, the mission needs about 40 %"},
+        {"name": "gps", "state": "red", "reason": "no 3D fix"}]}]  # fmt: skip
+    shared = {"area": None, "settings": {}, "plan": "plan-1", "vehicles": {"v1": "v7"}, "version": 1}
+    with standing(vehicle(7, name="Falcon")) as station:
+        station.gets |= {"/api/plan": shared, "/api/plans": [plan], "/api/plans/plan-1/map": {"features": []}}
+        station.answer = lambda method, path, body: (
+            (200, {"checks": checks}) if path.endswith("preflight") else (202, {"takeoffs_in_s": {"v7": 0}})
+        )
+        with opened(browser, station.url) as page:
+            page.click("#tab-plan")
+            page.click("text=Check and start")
+            page.wait_for_selector(".checks section")
+            words = page.inner_text(".preflight")
+            for said in ("Falcon", "plan-1", "80 m", "5:12", "0 % left, the mission needs about 40 %"):
+                assert said in words
+            start = page.locator(".preflight .primary")
+            assert start.is_disabled()
+            boxes = page.locator(".checks input")
+            assert boxes.count() == 2
+            boxes.nth(0).check()
+            assert start.is_disabled()
+            boxes.nth(1).check()
+            start.click()
+            page.wait_for_selector(".preflight", state="hidden")
+            assert station.commands("start")[0]["override"] == {"v7": ["battery", "gps"]}

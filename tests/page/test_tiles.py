@@ -1,0 +1,140 @@
+"""Vehicle tiles: they survive any value, stay where they are, lose no press, and show how old they are."""
+
+import pytest
+
+from tests.kit.page_kit import opened, send, standing, vehicle
+
+UPDATES = """() => {
+  let k = 0;
+  setInterval(() => {
+    k++;
+    for (let n = 1; n <= 96; n++) {
+      const moving = { lat_deg: 47.39 + 1e-5 * (k % 100) * n, lon_deg: 8.54 + 1e-4 * n, height_m: 80 + (k % 10) };
+      const figures = { silent_s: 0.1, speed_m_s: k % 9, battery: 0.5 + 0.001 * (k % 90) };
+      station.send({ type: "vehicle", id: `v${n}`, system: n, ...moving, ...figures });
+    }
+  }, 100);
+}"""
+COUNT = """() => {
+  window.presses = 0;
+  for (const tile of document.querySelectorAll(".tile")) tile.addEventListener("click", () => { window.presses++; });
+}"""
+FOCUSED = "document.activeElement.closest('.tile').querySelector('b').textContent"
+WILD = [
+    {"type": "vehicle", "id": "v1", "lat_deg": 1e308}, {"type": "frame", "outline": 7}, {"type": "job"}, {},
+    {"type": "vehicle_event", "vehicle": {}, "text": {}}, {"type": "alarm"}, {"type": "command"},
+]  # fmt: skip
+
+
+def many():
+    return [vehicle(k, name=f"Bird {k}") for k in range(1, 97)]
+
+
+def press(page, times, hold_ms):
+    page.evaluate(COUNT)
+    page.evaluate(UPDATES)
+    tiles = page.locator(".tile")
+    spots = [b for b in (tiles.nth(k).bounding_box() for k in range(96)) if b["y"] + b["height"] < 780]
+    names = page.locator(".tile b").all_inner_texts()
+    for k in range(times):
+        box = spots[k % len(spots)]
+        page.mouse.move(box["x"] + 60, box["y"] + 30)
+        page.mouse.down()
+        page.wait_for_timeout(hold_ms)
+        page.mouse.up()
+        assert page.evaluate(FOCUSED) == names[k % len(spots)]
+    for _ in range(times):
+        page.keyboard.press("Enter")
+    assert page.evaluate("window.presses") == 2 * times
+    assert page.evaluate("document.activeElement.className") == "tile"  # the focus stayed
+
+
+def test_no_press_is_lost_while_96_vehicles_send(browser):
+    with standing(*many()) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile >> nth=95")
+        press(page, 60, 40)
+
+
+@pytest.mark.slow
+def test_a_thousand_presses_arrive(browser):
+    with standing(*many()) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile >> nth=95")
+        press(page, 1000, 120)
+
+
+def test_any_value_leaves_the_other_vehicles_in_command(browser):
+    wild = [
+        vehicle(1, lat_deg=1e9), vehicle(2, lat_deg=None, lon_deg="east", height_m=[], battery="full", flight=7),
+        vehicle(3, name={"a": 1}, mission=None, frames="many", trail=[[1], None, "x", [900, 900]], texts=3),
+        vehicle(4, heading_deg=None, silent_s=-5, gps_fix=99, satellites=1e300, takeoff=5), {"id": None}, 17, None,
+    ]  # fmt: skip
+    with standing(*wild, vehicle(5, name="Falcon")) as station:
+        station.gets["/api/layers"] = [{"name": "fine", "version": 1, "empty": False, "bounds": [None, "x", 3, 4]}, 5]
+        station.gets["/api/legs"] = {"features": [None, {"geometry": None}, 3]}
+        station.gets["/api/jobs"] = [None, {"id": 1}, "x"]
+        with opened(browser, station.url) as page:
+            page.wait_for_selector(".tile:has-text('Falcon')")
+            for event in WILD:
+                send(page, event)
+            page.evaluate(
+                "station.sockets[0].onmessage({ data: 'no JSON' }); station.sockets[0].onmessage({ data: '3' })"
+            )
+            page.wait_for_timeout(500)
+            assert page.locator(".tile").count() == 5
+            page.click(".tile:has-text('Falcon')")
+            page.wait_for_selector(".details [data-verb=rtl]")
+            assert page.locator(".vehicle:has-text('Falcon')").count() == 1
+
+
+def test_a_name_stays_when_news_leave_it_out(browser):
+    with standing(vehicle(1, name="Falcon")) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile")
+        for k in range(5):
+            send(
+                page, {"type": "vehicle", "id": "v1", "system": 1, "height_m": 10 + k, "lat_deg": 47.4, "lon_deg": 8.5}
+            )
+            page.wait_for_timeout(150)
+            assert page.inner_text(".tile b") == "Falcon"
+            assert page.inner_text(".vehicle span") == "Falcon"
+
+
+def test_silence_is_shown_with_its_age_and_a_banner(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile[data-level=ok]")
+        assert page.locator(".banner").is_hidden()
+        page.evaluate("station.beats = false")
+        page.wait_for_selector(".tile[data-level=stale]")
+        assert "old:" in page.inner_text(".tile .why")
+        page.wait_for_selector(".banner")
+        assert "commands may not arrive" in page.inner_text(".banner")
+        assert page.inner_text(".link") == "No link"
+        assert page.locator(".command[data-verb=rtl]").is_visible()
+        page.evaluate("station.beats = true")
+        page.wait_for_selector(".banner", state="hidden")
+
+
+def test_tiles_keep_their_places_until_the_person_sorts(browser):
+    with standing(*(vehicle(k) for k in range(1, 6))) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile >> nth=4")
+        names = page.locator(".tile b")
+        send(page, {"type": "vehicle", "id": "v4", "system": 4, "battery": 0.05})
+        page.wait_for_selector(".tile[data-level=bad]")
+        assert names.all_inner_texts() == ["v1", "v2", "v3", "v4", "v5"]
+        assert "DANGER v4" in page.inner_text(".alarms")
+        page.select_option("select[aria-label=Order]", "need")
+        assert names.all_inner_texts() == ["v4", "v1", "v2", "v3", "v5"]
+        page.select_option("select[aria-label='Which vehicles']", "need")
+        assert page.locator(".tile:visible").count() == 1
+
+
+def test_the_map_is_not_repainted_when_nothing_changes(browser):
+    with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".vehicle >> nth=1")
+        page.evaluate("setInterval(() => station.send({ type: 'vehicle', id: 'v1', system: 1, silent_s: 0.1 }), 100)")
+        page.evaluate("window.paints = 0; orthoswarm.map.on('render', () => { window.paints++; })")
+        for _ in range(10):  # what is drawn at the start ends by itself
+            page.evaluate("window.paints = 0")
+            page.wait_for_timeout(3000)
+            if page.evaluate("window.paints") == 0:
+                return
+        raise AssertionError("the map is repainted all the time")
