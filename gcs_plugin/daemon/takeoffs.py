@@ -9,22 +9,18 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
+from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.mission.exchange import Outcome
+from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _LOOK_S: Final = 0.05
 _log = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class _Takeoff:
-    system: int
-    due: float
 
 
 class Takeoffs:
@@ -39,7 +35,8 @@ class Takeoffs:
     ) -> None:
         self._links, self._plans, self._say, self._clock = links, plans, say, clock
         self._condition = threading.Condition()
-        self._waiting: dict[str, _Takeoff] = {}
+        self._schedule = TakeoffSchedule.of({}, clock())
+        self._names: dict[int, str] = {}
         self._failed: dict[str, str] = {}
         self._checking = self._closed = False
         links.cancel_takeoff = self.cancel
@@ -94,17 +91,20 @@ class Takeoffs:
         """
         starts = self._plans.starts(plan, sortie)
         with self._condition:
-            if self._waiting or self._checking:
+            if self._schedule.waiting or self._checking:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
             self._checking = True
         try:
             whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
             systems = self._ready(plan, sortie, names, override or {})
-            first, now = min(starts.values()), self._clock()
+            first = min(starts.values())
+            delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
+            held = {s: self._links.fleet.vehicles[s].mission for s in delays}
+            airspace = Airspace.of({s: mission for s, mission in held.items() if mission is not None})
             with self._condition:
                 self._failed.clear()
-                for vehicle, start_s in starts.items():
-                    self._waiting[whose[vehicle]] = _Takeoff(systems[vehicle], now + start_s - first)
+                self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
+                self._schedule = TakeoffSchedule.of(delays, self._clock(), airspace)
         finally:
             self._checking = False
         threading.Thread(target=self._run, name="takeoffs", daemon=True).start()
@@ -113,22 +113,24 @@ class Takeoffs:
     def cancel(self, vehicle: str) -> float | None:
         """Forget a takeoff that waits; gives in how many seconds it would have been, None if there was none."""
         with self._condition:
-            takeoff = self._waiting.pop(vehicle, None)
+            system = next((s for s, name in self._names.items() if name == vehicle), None)
+            due = None if system is None else self._schedule.waiting.pop(system, None)
             self._condition.notify_all()
-        return None if takeoff is None else max(0.0, takeoff.due - self._clock())
+        return None if due is None else max(0.0, due - self._clock())
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """Vehicle -> `in_s` of a takeoff that waits, or `failed` with the reason."""
         now = self._clock()
         with self._condition:
-            waiting = {v: {"in_s": round(max(0.0, t.due - now), 1)} for v, t in self._waiting.items()}
+            times = self._schedule.waiting.items()
+            waiting = {self._names[s]: {"in_s": round(max(0.0, due - now), 1)} for s, due in times}
             return {v: {"failed": text} for v, text in self._failed.items()} | waiting
 
     def close(self) -> None:
         """Forget all that wait."""
         with self._condition:
             self._closed = True
-            self._waiting.clear()
+            self._schedule.waiting.clear()
             self._condition.notify_all()
 
     def _ready(
@@ -159,15 +161,15 @@ class Takeoffs:
         """Start each at its time; ends with the last."""
         while True:
             with self._condition:
-                if not self._waiting:
+                due = self._schedule.next_s()
+                if due is None:
                     return
-                vehicle = min(self._waiting, key=lambda name: self._waiting[name].due)
-                takeoff = self._waiting[vehicle]
-                if takeoff.due > self._clock():
-                    self._condition.wait(takeoff.due - self._clock())
+                if due > self._clock():
+                    self._condition.wait(due - self._clock())
                     continue
-                del self._waiting[vehicle]
-            threading.Thread(target=self._start, args=(vehicle, takeoff.system), daemon=True).start()
+                ready = self._schedule.due(self._clock())
+            for system in ready:
+                threading.Thread(target=self._start, args=(self._names[system], system), daemon=True).start()
 
     def _start(self, vehicle: str, system: int) -> None:
         """Start one; where that fails, those that still wait stay on the ground."""
@@ -180,18 +182,24 @@ class Takeoffs:
             if not self._closed:
                 _log.error("starting %s", vehicle, exc_info=error)
             return
-        outcome = order.outcome
-        if outcome is None or outcome.ok or self._closed:
-            return
+        if order.outcome is not None and not self._closed:
+            self._note(vehicle, system, order.outcome)
+
+    def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:
+        """What the outcome of one start means for those that still wait."""
         with self._condition:
-            self._failed[vehicle] = outcome.text
-            held = sorted(self._waiting)
-            for name in held:
-                self._failed[name] = f"held on the ground, because {vehicle} did not take off"
-            self._waiting.clear()
+            if outcome.ok:
+                said = self._schedule.started(system, self._clock())
+            else:
+                self._failed[vehicle] = outcome.text
+                held = [self._names[waiter] for waiter in self._schedule.failed(system)]
+                for name in held:
+                    self._failed[name] = f"held on the ground, because {vehicle} did not take off"
+                also = f"; {', '.join(held)} stay on the ground" if held else ""
+                said = [f"{vehicle} did not take off: {outcome.text}{also}"]
             self._condition.notify_all()
-        also = f"; {', '.join(held)} stay on the ground" if held else ""
-        self._say(f"{vehicle} did not take off: {outcome.text}{also}")
+        for text in said:
+            self._say(text)
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

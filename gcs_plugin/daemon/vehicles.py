@@ -14,6 +14,7 @@ What the HTTP API and the page build on, all in JSON values:
 - `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
+- `alarm` in each row of `rows()`: what is wrong with where it flies, and what to do; empty if nothing is.
 - `clock()` is the monotonic clock by which commands expire: a page that learns it from the event stream can say when
   its command was given, so that one that was held up on the way is not executed late.
 """
@@ -444,7 +445,7 @@ class VehicleLinks:
 
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
         kept = self._keep(vehicle.system)
-        row = vehicle.summary(now) | {"id": kept.id}
+        row = vehicle.summary(now) | {"id": kept.id, "alarm": self.fleet.separation.text(vehicle.system)}
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))
@@ -464,7 +465,7 @@ def _under_way(vehicle: "Vehicle") -> bool:
 def _flies(vehicle: "Vehicle") -> bool:
     from gcs_plugin.mission.completion import Phase
 
-    return vehicle.detector.phase is Phase.ACTIVE and not vehicle.lost
+    return (vehicle.detector.phase is Phase.ACTIVE or vehicle.flying) and not vehicle.lost
 
 
 def completion_rows(journal: Journal) -> list[dict[str, Any]]:

@@ -39,6 +39,7 @@ Handler = Callable[[Vehicle, Message, float], None]
 _LOST_S: Final = 5.0
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
+_ASK_WHY_S: Final = 10.0
 _SURE_S: Final = 2.5  # older news of a vehicle are not believed against a command that ends its flight
 _IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 _HEARTBEAT, _ACK, _TEXT = _IDS["HEARTBEAT"], _IDS["COMMAND_ACK"], _IDS["STATUSTEXT"]
@@ -459,11 +460,21 @@ class Fleet:
             if vehicle.lost:
                 continue
             self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
+            self._ask_why(vehicle, now)
             if now - vehicle.heard > _LOST_S:
                 vehicle.lost = True
                 self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
             if len(vehicle.routes.known) > 1 or vehicle.claimants:
                 self._compare_routes(vehicle, now)
+
+    def _ask_why(self, vehicle: Vehicle, now: float) -> None:
+        """A vehicle that would refuse to arm, and has not said why, is asked for the reasons."""
+        if vehicle.prearm_ok is not False or vehicle.armed or now < vehicle.ask_why_at or vehicle.prearm_texts(now):
+            return
+        vehicle.ask_why_at = now + _ASK_WHY_S
+        to, command = vehicle.address, dialect.MAV_CMD_RUN_PREARM_CHECKS
+        ask = dialect.MAVLink_command_long_message(to.system, to.component, command, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._dialogues.send(vehicle.system, [ask])
 
     def _watch_separation(self, now: float) -> None:
         new, ended = self.separation.look(self.vehicles.values(), now)

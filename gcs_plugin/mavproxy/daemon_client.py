@@ -7,7 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-_USAGE: Final = "usage: orthoswarm status|vehicles|plan|upload|start|pause|rtl|refine|layers|export|web|connect"
+_USAGE: Final = (
+    "usage: orthoswarm status|vehicles|plan|upload|start|pause|resume|rtl|land|refine|layers|export|web|connect"
+)
 _TIMEOUT_S: Final = 240.0
 
 
@@ -68,7 +70,8 @@ def _vehicle(row: dict[str, Any]) -> str:
     counts: dict[str, int] = row.get("frames") or {}
     named = (("fine", "refined"), ("coarse", "coarse"), ("rejected", "rejected"))
     pictures = [f"{counts.get('frames', 0)} pictures", *(f"{counts[k]} {text}" for k, text in named if counts.get(k))]
-    return f"{row['id']}: {row.get('mode') or row['state']}, sortie {row.get('sortie')}, {', '.join(pictures)}"
+    doing = (row.get("flight") or {}).get("text") or row.get("mode") or row["state"]
+    return f"{row['id']}: {doing}, sortie {row.get('sortie')}, {', '.join(pictures)}"
 
 
 class Commands:
@@ -81,9 +84,11 @@ class Commands:
     def __init__(self, client: Client) -> None:
         self.client = client
         self._plan = ""
+        self._said: dict[str, str] = {}
         self._verbs: dict[str, Callable[[list[str]], list[str]]] = {
             "status": self.status, "vehicles": self.vehicles, "plan": self.plan, "upload": self.upload,
-            "start": self.start, "pause": self.command("pause"), "rtl": self.command("rtl"),
+            "start": self.start, "pause": self.command("pause"), "resume": self.command("resume"),
+            "rtl": self.command("rtl"), "land": self.command("land"),
             "refine": self.refine, "layers": self.layers, "export": self.export, "web": self.web,
             "connect": self.connect,
         }  # fmt: skip
@@ -143,7 +148,28 @@ class Commands:
         if not words or not (self._plan or len(words) > 1):
             return ["usage: orthoswarm upload VEHICLE [PLAN]; plan first"]
         plan = words[1] if len(words) > 1 else self._plan
-        return [self.client.ask(f"/api/missions/{words[0]}/upload", {"plan": plan})["text"]]
+        return [self.client.ask(f"/api/missions/{self._named(words[0])}/upload", {"plan": plan})["text"]]
+
+    def _named(self, word: str) -> str:
+        """The daemon's name of a vehicle that was typed as its name or as its system id."""
+        if not word.isdigit():
+            return word
+        rows = self.client.ask("/api/vehicles")
+        return next((str(row["id"]) for row in rows if str(row.get("system")) == word), f"v{word}")
+
+    def news(self) -> list[str]:
+        """What went wrong since the last call: takeoffs that failed or are held, vehicles too near each other."""
+        try:
+            rows = self.client.ask("/api/vehicles")
+        except RuntimeError:
+            return []
+        found = {f"{row['id']} takeoff": (row.get("takeoff") or {}).get("failed") or "" for row in rows}
+        alarms = {row.get("alarm") or "" for row in rows} - {""}
+        found |= {f"alarm {text.split(' are ')[0]}": text for text in alarms}
+        new = [f"{who.split()[0]}: {text}" if not who.startswith("alarm") else text for who, text in found.items()
+               if text and who not in self._said]  # fmt: skip
+        self._said = {who: text for who, text in found.items() if text}
+        return new
 
     def start(self, words: list[str]) -> list[str]:
         """`start VEHICLE` at once, or `start PLAN`: its vehicles at its times."""
@@ -160,7 +186,7 @@ class Commands:
         def run(words: list[str]) -> list[str]:
             if len(words) != 1:
                 return [f"usage: orthoswarm {verb} VEHICLE"]
-            return [self.client.ask(f"/api/missions/{words[0]}/{verb}", {})["text"]]
+            return [self.client.ask(f"/api/missions/{self._named(words[0])}/{verb}", {})["text"]]
 
         return run
 

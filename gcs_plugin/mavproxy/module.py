@@ -21,7 +21,7 @@ from MAVProxy.modules.lib import mp_module
 from gcs_plugin.mavproxy.daemon_client import Client, Commands
 from gcs_plugin.mavproxy.packet_feed import Child, Feed
 
-_VERBS: Final = "<status|vehicles|plan|upload|start|pause|rtl|refine|layers|export|web|connect|serve|feed>"
+_VERBS: Final = "<status|vehicles|plan|upload|start|pause|resume|rtl|land|refine|layers|export|web|connect|serve|feed>"
 _START_ONE: Final = (
     "'orthoswarm serve WORKSPACE [--basemap MAP]' starts one and feeds it, 'orthoswarm connect URL TOKEN' takes another"
 )
@@ -29,6 +29,7 @@ _FEED_IT: Final = (
     "vehicles' packets do not go to it yet: 'orthoswarm feed 127.0.0.1:PORT', where it has --link udpin:127.0.0.1:PORT"
 )
 _DRAW_S: Final = 3.0
+_NEWS_S: Final = 1.0
 
 
 class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
@@ -46,6 +47,8 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
         self._hello = ""
         self._worker = threading.Thread(target=self._work, name="orthoswarm", daemon=True)
         self._worker.start()
+        self._over = threading.Event()
+        threading.Thread(target=self._tell, name="orthoswarm news", daemon=True).start()
         self.add_command("orthoswarm", self.typed, "map with a swarm", [_VERBS])
 
     # -- MAVProxy's hooks, in its main thread -----------------------------------------------------------------------
@@ -77,6 +80,7 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
     def unload(self) -> None:
         """End what was begun."""
         self._typed.put(None)
+        self._over.set()
         if self.feed is not None:
             self.feed.close()
             self.feed = None
@@ -106,6 +110,13 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
                     print(line)
             except (RuntimeError, OSError, ValueError) as error:
                 print(f"orthoswarm: {error}")
+
+    def _tell(self) -> None:
+        """Say at once what goes wrong: a takeoff that is held, vehicles that come too near each other."""
+        while not self._over.wait(_NEWS_S):
+            if self.feed is not None or self.commands.client.token:
+                for line in self.commands.news():
+                    print(f"orthoswarm: {line}")
 
     def _run(self, words: list[str]) -> list[str]:
         if words[:1] == ["serve"]:

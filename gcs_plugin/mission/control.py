@@ -22,6 +22,7 @@ _UNSUPPORTED: Final = int(dialect.MAV_RESULT_UNSUPPORTED)
 _REPEAT_S: Final = 0.5
 _AGAIN_S: Final = 1.0
 _ANSWER_S: Final = 1.0
+_FIRST_S: Final = 2.0  # silence after which the other way is tried
 _AIRBORNE_COMMANDS: Final = frozenset({TAKEOFF, int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)})
 
 
@@ -289,11 +290,19 @@ class InOrder(_Several):
 
 @dataclass(slots=True)
 class Either(_Several):
-    """A way of doing something, and another one where the vehicle refuses the first."""
+    """A way of doing something, and another one where the vehicle refuses the first or does not answer to it."""
+
+    _unsure: str = field(default="", init=False)
 
     def _ended(self, outcome: Outcome, last: bool) -> bool:
-        if outcome.ok or last or outcome.verdict is not Verdict.REFUSED:
-            self._end(outcome.ok, outcome.text, outcome.verdict)
+        if outcome.ok:
+            self._end(True, outcome.text)
+        elif outcome.verdict is Verdict.UNKNOWN and not last:
+            self._unsure = outcome.text
+        elif last and self._unsure:
+            self._end(False, self._unsure, Verdict.UNKNOWN)
+        elif last or outcome.verdict is Verdict.NOT_SENT:
+            self._end(False, outcome.text, outcome.verdict)
         return self.outcome is not None
 
 
@@ -351,13 +360,17 @@ class Pilot:
     def rtl(self) -> Exchange:
         """Fly home and land."""
         home = Command(
-            self.vehicle, self.own, command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, verb="return to launch", insist_s=2.0
+            self.vehicle,
+            self.own,
+            command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+            verb="return to launch",
+            patience_s=_FIRST_S,
         )
         return Either(self.vehicle, self.own, steps=[home, self.set_mode(self.modes.rtl)])
 
     def land(self) -> Exchange:
         """Land where it is."""
-        down = Command(self.vehicle, self.own, command=dialect.MAV_CMD_NAV_LAND, verb="land", insist_s=2.0)
+        down = Command(self.vehicle, self.own, command=dialect.MAV_CMD_NAV_LAND, verb="land", patience_s=_FIRST_S)
         return Either(self.vehicle, self.own, steps=[down, self.set_mode(self.modes.land)])
 
     def _pause_continue(self, go_on: float, verb: str) -> Command:
@@ -367,7 +380,7 @@ class Pilot:
             command=dialect.MAV_CMD_DO_PAUSE_CONTINUE,
             params=(go_on,),
             verb=verb,
-            patience_s=5.0,
+            patience_s=_FIRST_S,
         )
 
     def _flies(self, message: Message) -> bool:

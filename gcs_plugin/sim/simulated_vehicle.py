@@ -46,6 +46,7 @@ class SimVehicle:
         boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
         ready_s: when its filter has a position, so that it lets itself be armed; its receiver has a fix before that.
         seed: of its receiver's errors.
+        arms: False for one that refuses to arm although all its checks pass.
         on_exposure: called at each picture.
     """
 
@@ -56,6 +57,7 @@ class SimVehicle:
     boot_utc_s: float = 1_700_000_000.0
     ready_s: float = 0.0
     seed: int = 0
+    arms: bool = True
     on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
     flight: Flight = field(init=False)
     store: MissionStore = field(init=False)
@@ -186,7 +188,7 @@ class SimVehicle:
         if not self._ready:
             self.flight.texts.append(self._why_not.replace("PreArm", "Arm"))
             return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _REJECTED
-        why = self.flight.arm()
+        why = self.flight.arm() if self.arms else "Arm: Motors: Check frame class and type"
         self.flight.texts += [why] if why else []
         return _FAILED if why else _OK
 

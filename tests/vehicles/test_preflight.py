@@ -1,0 +1,266 @@
+"""Before a start: the check as data, takeoffs that wait for each other, and vehicles in the air that come too near."""
+
+import json
+
+import pytest
+
+from gcs_plugin.cli.main import main
+from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight, preflight_all, red_text
+from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
+from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.memory_link import World
+from gcs_plugin.sim.multirotor import Chart
+from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from tests.vehicles.test_fleet_cli import HOME, fleet, folder, free_port  # noqa: F401
+from tests.vehicles.test_sim import mission
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
+CHART = Chart(47.397742, 8.545594, 488.0)
+
+
+@pytest.fixture
+def make_world():
+    worlds = []
+
+    def make(*vehicles, **faults):
+        worlds.append(World(vehicles, **faults))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.fleet.close()
+
+
+def levels(world, wanted=Wanted()):  # noqa: B008
+    check = preflight(world.fleet.vehicles[1], wanted, world.clock.now)
+    return {item.name: item.level for item in check.items}, {item.name: item.reason for item in check.items}
+
+
+def line(autopilot, east, length, *, home_east=0.0, height=30.0, north=0.0):
+    """A mission along a line northward, `east` metres beside the origin."""
+
+    def at(command, n, e):
+        return MissionItem.at(command, *CHART.to_degrees(n, e), height)
+
+    items = [at(WAYPOINT, 0, 0)] if autopilot is AP else []
+    items += [at(TAKEOFF, 0, home_east), MissionItem.do(CHANGE_SPEED, 1, 8), at(WAYPOINT, north, east)]
+    items += [at(WAYPOINT, north + length, east), MissionItem.do(RTL)]
+    return Mission(autopilot, tuple(items))
+
+
+# -- the check ----------------------------------------------------------------------------------------------------
+
+
+@BOTH
+def test_a_vehicle_that_becomes_ready_turns_green_item_by_item(make_world, autopilot):
+    world = make_world(SimVehicle(1, autopilot, ready_s=40.0))
+    world.wait(8.0)
+    state, why = levels(world)
+    assert tuple(state) == ITEMS
+    assert [state[name] for name in ("gps", "ekf", "pre-arm", "mission")] == [Level.RED] * 4
+    assert "no 3D fix" in why["gps"] and "position filter" in why["ekf"] and "not known" in why["mission"]
+    assert ("GPS 1: Bad fix" if autopilot is AP else "Waiting for estimator") in why["pre-arm"]
+    world.wait(12.0)
+    state, why = levels(world)
+    assert (state["gps"], state["ekf"], state["pre-arm"]) == (Level.OK, Level.RED, Level.RED)
+    world.finish(world.fleet.upload(1, mission(autopilot, MissionItem.do(RTL))))
+    world.wait(42.0 - world.clock.now)
+    state, why = levels(world)
+    assert set(state.values()) == {Level.OK}, why
+
+
+def test_each_item_turns_red_for_its_own_reason(make_world):
+    world = make_world(SimVehicle(1, AP))
+    world.meet()
+    held = mission(AP, MissionItem.do(RTL))
+    world.finish(world.fleet.upload(1, held))
+    world.wait(6.0)
+    vehicle = world.fleet.vehicles[1]
+    assert set(levels(world)[0].values()) == {Level.OK}
+
+    def red(wanted=Wanted()):  # noqa: B008
+        return [item.name for item in preflight(vehicle, wanted, world.clock.now).red()]
+
+    vehicle.battery = 0.0
+    assert red() == ["battery"]
+    vehicle.battery = 1.0
+    vehicle.satellites = 4
+    assert red() == ["gps"]
+    vehicle.satellites = 14
+    assert red(Wanted(mission=line(AP, 10, 50))) == ["mission"]
+    assert red(Wanted(legal_height_m=15.0)) == ["height"]
+    assert red(Wanted(near="comes within 3 m of v2")) == ["separation"]
+    assert red(Wanted(endurance_s=20.0)) == ["battery"]
+    world.link.down.faults = Faults(loss=1.0)
+    world.wait(6.0)
+    assert red() == ["link"]
+    check = preflight(vehicle, Wanted(), world.clock.now)
+    assert check.red(["link"]) == []  # overridden by its name
+    assert red_text([check], {}) == {1: f"link: {check.items[0].reason}"}
+    document = check.document("Falcon")
+    assert document["vehicle"] == "Falcon" and document["state"] == "red"
+    assert document["items"][0].keys() == {"name", "state", "reason"} and json.dumps(document)
+
+
+def test_missions_that_cross_without_a_plan_are_red(make_world):
+    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP))
+    world.wait(8.0)
+    missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0)}
+    checks = preflight_all(dict(world.fleet.vehicles), {}, missions, {}, world.clock.now)
+    assert all(item.name == "separation" for check in checks for item in check.red() if item.level is Level.RED)
+    assert "comes within 0 m from v2" in red_text(checks, {})[1]
+    apart = preflight_all(dict(world.fleet.vehicles), {}, missions, {2: 60.0}, world.clock.now)
+    assert red_text(apart, {}) == {}
+
+
+# -- times --------------------------------------------------------------------------------------------------------
+
+
+def test_a_track_takes_the_planners_time_and_height():
+    one = line(AP, 0, 80.0)
+    assert highest_m(one) == 30.0
+    assert flight_seconds(one) == pytest.approx(30 / 2.5 + 160 / 8 + 30 / 1.5 + 8, abs=8.0)
+
+
+def test_the_next_start_keeps_every_pair_apart():
+    airspace = Airspace.of(
+        {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0), 3: line(AP, 400, 60, home_east=360.0)}
+    )
+    assert airspace.conflicts({1: 0.0, 2: 0.0, 3: 0.0})
+    start = airspace.next_start(2, 0.0, {1: 0.0, 3: 0.0})
+    assert start > 5.0
+    for off in (-3.0, 0.0, 3.0):
+        assert airspace.conflicts({1: 0.0, 2: start + off, 3: 0.0}) == [] or off != 0.0
+    assert airspace.next_start(3, 0.0, {1: 0.0, 2: 0.0}) == 0.0
+
+
+def test_one_that_is_late_moves_those_that_wait():
+    missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0)}
+    apart = Airspace.of(missions).next_start(2, 0.0, {1: 0.0})
+    schedule = TakeoffSchedule.of({1: 0.0, 2: apart}, 100.0, Airspace.of(missions))
+    assert schedule.due(100.0) == [1]
+    assert schedule.started(1, 103.0) == [] and schedule.waiting == {2: 100.0 + apart}  # in time
+    schedule = TakeoffSchedule.of({1: 0.0, 2: apart}, 100.0, Airspace.of(missions))
+    schedule.due(100.0)
+    said = schedule.started(1, 100.0 + 14.0)
+    assert said[0] == "v1 took off 14 s late" and "v2 takes off 14 s later" in said[1]
+    assert schedule.waiting[2] == pytest.approx(100.0 + apart + 14.0, abs=1.0)
+
+
+def test_one_that_does_not_take_off_holds_those_that_wait():
+    schedule = TakeoffSchedule.of({1: 0.0, 2: 5.0, 3: 9.0}, 0.0)
+    assert schedule.due(0.0) == [1]
+    assert schedule.failed(1) == [2, 3] and schedule.due(100.0) == []
+
+
+# -- on the ground and in the air, from the command line -----------------------------------------------------------
+
+
+def swarm_of(vehicles, speed=10.0):
+    port = free_port()
+    return SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=speed), f"udpin:127.0.0.1:{port}"
+
+
+def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys):  # noqa: F811
+    vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
+    vehicles[1].ready_s = 130.0
+    swarm, link = swarm_of(vehicles)
+    with swarm:
+        assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        code = main(["fleet", "start", "--plan", str(folder), "--link", link])
+        said = capsys.readouterr().out.splitlines()
+        assert code == 0, said
+        assert said[0].startswith("waiting: v2 ") and "pre-arm" in said[0]
+        assert [text for text in said if "flies its mission" in text] == [
+            f"vehicle {number} flies its mission" for number in (1, 2, 3)
+        ]
+        assert swarm.now >= 130.0
+
+
+def test_nobody_takes_off_where_one_does_not_become_ready(folder, capsys):  # noqa: F811
+    vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
+    vehicles[1].ready_s = 1e9
+    swarm, link = swarm_of(vehicles)
+    with swarm:
+        assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        code, said = fleet(capsys, "start", "--plan", folder, "--ready", 2, "--link", link, "--json")
+        assert code == 1
+        assert [row["outcome"] for row in said["vehicles"]] == ["not_sent", "refused", "not_sent"]
+        assert "pre-arm" in said["vehicles"][1]["text"]
+        assert not any(vehicle.flight.armed for vehicle in vehicles)
+
+
+def test_one_that_cannot_arm_at_its_time_holds_the_others(folder, capsys):  # noqa: F811
+    vehicles = make_swarm(3, autopilots=(AP,), home=HOME)
+    swarm, link = swarm_of(vehicles)
+    with swarm:
+        assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        vehicles[1].arms = False  # nothing in its checks says so
+        code, said = fleet(capsys, "start", "--plan", folder, "--link", link, "--json")
+        assert code == 1
+        outcomes = [row["outcome"] for row in said["vehicles"]]
+        assert outcomes[1] == "refused" and outcomes[0] == "done"
+        assert "Arm: Motors: Check frame class" in said["vehicles"][1]["text"]
+
+
+def test_a_height_above_the_legal_one_is_asked_about(folder, capsys):  # noqa: F811
+    swarm, link = swarm_of(make_swarm(1, home=HOME))
+    with swarm:
+        path = folder / "high.waypoints"
+        path.write_text((folder / "v1.waypoints").read_text().replace("\t60.000\t", "\t400.000\t"))
+        assert fleet(capsys, "upload", path, "--vehicle", 1, "--link", link)[0] == 0
+        code, said = fleet(capsys, "start", "--vehicle", 1, "--link", link, "--json")
+        assert code == 1 and "above 120 m" in said["vehicles"][0]["text"]
+        assert fleet(capsys, "check", "--vehicle", 1, "--link", link)[0] == 1
+        assert fleet(capsys, "check", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
+        assert fleet(capsys, "start", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
+
+
+def test_what_is_overridden_must_be_named(folder, capsys):  # noqa: F811
+    swarm, link = swarm_of(make_swarm(1, home=HOME))
+    with swarm:
+        assert main(["fleet", "start", "--override", "everything", "--link", link]) == 2
+        assert "choose from link, gps" in capsys.readouterr().err
+
+
+def test_the_list_fits_a_terminal_of_80_columns(folder, capsys, monkeypatch):  # noqa: F811
+    monkeypatch.setenv("COLUMNS", "80")
+    one, first = swarm_of(make_swarm(1, home=HOME))
+    vehicles = make_swarm(2, autopilots=(AP, PX4), home=HOME)
+    two, second = swarm_of(vehicles[1:])
+    with one, two:
+        assert fleet(capsys, "upload", folder, "--link", first, "--link", second, "--vehicle", "1,2")[0] == 0
+        _, text = fleet(capsys, "list", "--link", first, "--link", second)
+        rows = text.splitlines()
+        assert all(len(row) <= 80 for row in rows[:3]) and "…" not in text
+        assert "on ground" in rows[1] and rows[1].rstrip().endswith("12 items")
+        assert f"v2 on {second}" in rows[4]
+
+
+def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
+    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP, home=(*CHART.to_degrees(0, 80.0), 488.0)))
+    world.meet()
+    fleet_ = world.fleet
+    for system, home_east in ((1, 0.0), (2, 80.0)):
+        world.finish(fleet_.upload(system, line(AP, 40, 60, home_east=home_east)))
+    world.finish(fleet_.start(1), fleet_.start(2))
+    assert world.until(lambda: any(e.kind == "near" for e in world.events), 100.0)
+    alarm = next(e for e in world.events if e.kind == "near")
+    assert "they should keep 10 m" in alarm.text and "pause v" in alarm.text
+    assert fleet_.separation.text(1) and fleet_.separation.text(2)
+    assert sum(e.kind == "near" for e in world.events) == 1  # said once
+
+
+def test_neighbours_that_take_off_side_by_side_raise_no_alarm(make_world):
+    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP, home=(*CHART.to_degrees(0, 5.0), 488.0)))
+    world.meet()
+    for system, north in ((1, 30.0), (2, -90.0)):
+        world.finish(world.fleet.upload(system, line(AP, 5.0 * system, 60, home_east=5.0 * (system - 1), north=north)))
+    world.finish(world.fleet.start(1), world.fleet.start(2))
+    world.wait(60.0)
+    assert not [e for e in world.events if e.kind == "near"]
