@@ -15,6 +15,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
+    "coverage": "say which ground of an area was seen well, what was missed, and why",
     "inspect": "say what photos, videos and logs hold and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",

@@ -43,6 +43,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
         "time": iso_time(frame.time_s),
         "stage": placed.stage,
         "epsg": grid.epsg,
+        "width": lens.width,
+        "height": lens.height,
         "homography": (h / h[2, 2]).tolist(),
     }
     if not simple.is_pinhole or lens.cx or lens.cy:

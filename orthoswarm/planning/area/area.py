@@ -37,20 +37,22 @@ class Area:
         return float(self.ground.area)
 
 
-def make_area(polygons: Sequence[Polygon], no_fly: Iterable[Ring] = ()) -> Area:
+def make_area(polygons: Sequence[Polygon], no_fly: Iterable[Ring] = (), grid: LocalGrid | None = None) -> Area:
     """The area of polygons on the globe; holes are no-fly zones and win over polygons that overlap them.
 
     Args:
         polygons: at least one; they may overlap.
         no_fly: further zones as rings (n, 2) of latitude and longitude in degrees, inside or outside the area.
+        grid: UTM grid of the result; the area's own zone if None.
 
     Raises:
         InputError: a polygon crosses itself or has no area, a hole lies outside, or nothing is left to map.
     """
     if not polygons:
         raise InputError("no polygon was given; draw the area as a polygon")
-    shells = np.concatenate([p.shell for p in polygons])
-    grid = LocalGrid(area_epsg(shells[:, 0], shells[:, 1]))
+    if grid is None:
+        shells = np.concatenate([p.shell for p in polygons])
+        grid = LocalGrid(area_epsg(shells[:, 0], shells[:, 1]))
     outlines, holes = [], []
     for number, polygon in enumerate(polygons, start=1):
         name = "the polygon" if len(polygons) == 1 else f"polygon {number}"

@@ -1,0 +1,192 @@
+"""Gaps: connected cells that were missed or seen poorly for one cause, as polygons."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.coverage.coverage_grid import CoverageGrid, State
+from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
+from orthoswarm.coverage.painting import UNSEEN
+from orthoswarm.coverage.view import FLAW_NAMES, Flaw
+
+Geometry = Any
+Array = NDArray[np.float64]
+_CAUSES = tuple(Cause)
+_NONE = 255
+_TOLD_FIRST = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE, Flaw.OBLIQUE, Flaw.EDGE)
+SMALLEST_M2 = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFlight:
+    """What was to be flown.
+
+    Attributes:
+        legs: float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres.
+        width_m: ground that the narrowest camera sees across a leg; height_m along it.
+        fov_rad: theta-hat, the horizontal field of view that the plan relies on.
+    """
+
+    legs: Array
+    width_m: float
+    height_m: float
+    fov_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageGap:
+    """A gap.
+
+    Attributes:
+        polygon: shapely Polygon in the grid of the cells. area_m2: its size.
+        cause: why. detail: the flaw, for ground seen poorly; else empty. confidence: how sure the cause is, 0 to 1.
+        vehicle: whose pictures are missing or narrow, empty where that is not known.
+    """
+
+    polygon: Geometry
+    area_m2: float
+    cause: Cause
+    detail: str
+    confidence: float
+    vehicle: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """All gaps, largest first.
+
+    Attributes:
+        gaps: those of at least the smallest size. small: how many smaller ones there are; small_m2: their total size.
+    """
+
+    gaps: list[CoverageGap]
+    small: int
+    small_m2: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Explained:
+    """Per cell: cause (index of Cause, 255 none), confidence, index of the vehicle (-1 unknown)."""
+
+    cause: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    vehicle: NDArray[np.int16]
+
+    def enter(self, where: NDArray[np.bool_], cause: Cause, confidence: float, vehicle: int = -1) -> None:
+        cells = where & (self.cause == _NONE)
+        self.cause[cells], self.confidence[cells], self.vehicle[cells] = _CAUSES.index(cause), confidence, vehicle
+
+
+def find_gaps(
+    cover: CoverageGrid,
+    missing: Sequence[MissingPicture] = (),
+    plan: PlannedFlight | None = None,
+    smallest_m2: float = SMALLEST_M2,
+) -> Gaps:
+    """Gaps of a finished flight and their causes.
+
+    A cause is found by asking what would have seen a cell: a picture that is missing; else the same pictures through
+    the lens that the plan relies on; else a leg of the plan, which then was not flown (or none, so that the plan itself
+    leaves the ground out). Without a plan, whatever no missing picture explains counts as not flown, with confidence
+    one half.
+
+    Args:
+        cover: with all pictures. missing: of `missing_pictures`. plan: what was to be flown, None if not known.
+        smallest_m2: smaller gaps are only counted.
+    """
+    state = cover.states()
+    vehicles = sorted({v.vehicle for v in cover.views})
+    size = state.shape
+    explained = _Explained(np.full(size, _NONE, np.uint8), np.zeros(size, np.float32), np.full(size, -1, np.int16))
+    explained.enter(state == State.POOR, Cause.POOR, 1.0)
+    missed = state == State.MISSED
+    for vehicle in vehicles:
+        for cause in (Cause.REJECTED, Cause.NOT_ARRIVED, Cause.NOT_TRIGGERED):
+            lacking = [m for m in missing if m.view.vehicle == vehicle and m.cause == cause]
+            if lacking:
+                seen = _would_see(cover, [m.view for m in lacking])
+                explained.enter(
+                    missed & seen, cause, float(np.mean([m.confidence for m in lacking])), vehicles.index(vehicle)
+                )
+    if plan is not None:
+        for vehicle in vehicles:
+            narrow = [
+                v for v in cover.views if v.vehicle == vehicle and _is_narrow(v.fov_rad, v.focal_sigma, plan.fov_rad)
+            ]
+            if narrow:
+                wide = _would_see(cover, [v.with_fov(plan.fov_rad) for v in narrow])
+                explained.enter(missed & wide, Cause.NARROW_LENS, 0.9, vehicles.index(vehicle))
+        explained.enter(missed & _planned(cover, plan), Cause.NOT_FLOWN, 0.9)
+        explained.enter(missed, Cause.NOT_PLANNED, 0.9)
+    explained.enter(missed, Cause.NOT_FLOWN, 0.5)
+    return _polygons(cover, explained, vehicles, smallest_m2)
+
+
+def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:
+    """Narrower than planned by more than two sigma (and half a percent)."""
+    planned, own = math.tan(0.5 * planned_rad), math.tan(0.5 * fov_rad)
+    return own < planned * (1.0 - max(0.005, 2.0 * focal_sigma))
+
+
+def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> NDArray[np.bool_]:
+    other = CoverageGrid(cover.cells, cover.terrain)
+    other.put(views)
+    return np.asarray(other.best != UNSEEN)
+
+
+def _planned(cover: CoverageGrid, plan: PlannedFlight) -> NDArray[np.bool_]:
+    """Cells below the legs' pictures."""
+    import shapely
+    from rasterio.features import rasterize
+
+    if not len(plan.legs):
+        return np.zeros(cover.best.shape, bool)
+    step = plan.legs[:, 1] - plan.legs[:, 0]
+    along = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+    across = along[:, ::-1] * [-0.5 * plan.width_m, 0.5 * plan.width_m]
+    a, b = plan.legs[:, 0] - 0.5 * plan.height_m * along, plan.legs[:, 1] + 0.5 * plan.height_m * along
+    bands = shapely.polygons(np.stack([a + across, b + across, b - across, a - across], axis=1))
+    grid = cover.cells.grid
+    return np.asarray(rasterize(list(bands), (grid.height, grid.width), transform=grid.affine()) > 0)
+
+
+def _polygons(cover: CoverageGrid, explained: _Explained, vehicles: Sequence[str], smallest_m2: float) -> Gaps:
+    import shapely
+    from rasterio.features import shapes
+
+    flaw = np.where(explained.cause == _CAUSES.index(Cause.POOR), _worst_flaw(cover.best), 0)
+    code = (
+        explained.cause.astype(np.int32)
+        + 256 * flaw.astype(np.int32)
+        + 65536 * (explained.vehicle.astype(np.int32) + 1)
+    )
+    gaps, small, small_m2 = [], 0, 0.0
+    grid = cover.cells.grid
+    for geometry, value in shapes(code, mask=explained.cause != _NONE, connectivity=4, transform=grid.affine()):
+        polygon = shapely.geometry.shape(geometry)
+        area = float(polygon.area)
+        if area < smallest_m2:
+            small, small_m2 = small + 1, small_m2 + area
+            continue
+        number = int(value)
+        cause = _CAUSES[number & 255]
+        detail = FLAW_NAMES[Flaw((number >> 8) & 255)] if cause is Cause.POOR else ""
+        vehicle = number >> 16
+        point = shapely.point_on_surface(polygon)
+        c, r = np.round(grid.to_pixel([point.x, point.y])).astype(int)
+        confidence = float(explained.confidence[min(max(r, 0), grid.height - 1), min(max(c, 0), grid.width - 1)])
+        gaps.append(CoverageGap(polygon, area, cause, detail, confidence, vehicles[vehicle - 1] if vehicle else ""))
+    gaps.sort(key=lambda g: -g.area_m2)
+    return Gaps(gaps, small, small_m2)
+
+
+def _worst_flaw(best: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The one flaw of each cell that is told: of several, the one of the whole picture."""
+    worst = np.zeros(best.shape, np.uint8)
+    for flaw in _TOLD_FIRST:
+        worst[(worst == 0) & (best != UNSEEN) & ((best & int(flaw)) > 0)] = int(flaw)
+    return worst

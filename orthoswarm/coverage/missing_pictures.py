@@ -1,0 +1,132 @@
+"""Pictures that should be there and are not: holes in the even row of pictures on a straight leg."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from orthoswarm.coverage.view import View
+
+_HOLE = 1.6
+"""Steps to the next picture from which on one is missing."""
+_STRAIGHT_COS = float(np.cos(np.radians(20.0)))
+_MOST = 400
+_SLACK_S = 0.05
+
+
+class Cause(StrEnum):
+    """Why ground was not seen, or not well."""
+
+    NOT_FLOWN = "not flown"
+    NOT_TRIGGERED = "not triggered"
+    NOT_ARRIVED = "pictures not arrived"
+    REJECTED = "pictures rejected"
+    NARROW_LENS = "lens narrower than planned"
+    NOT_PLANNED = "outside the plan"
+    POOR = "seen poorly"
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """An event of a camera as the vehicle recorded it, or a picture file that could not be used.
+
+    Attributes:
+        vehicle: whose. time_s: UTC epoch seconds. image: name of the file, empty for an event without one.
+    """
+
+    vehicle: str
+    time_s: float
+    image: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MissingPicture:
+    """A picture that is not there.
+
+    Attributes:
+        view: what it would have seen; its image is the name of the file where that is known.
+        after: name of the picture before the hole. cause: why it is missing. confidence: 0 to 1.
+    """
+
+    view: View
+    after: str
+    cause: Cause
+    confidence: float
+
+
+def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) -> list[MissingPicture]:
+    """Holes in the rows of pictures.
+
+    Between two pictures in line with the flight before or after them, a distance of 1.6 or more usual steps of the
+    vehicle (their median) is a hole. What is known about it says why: exposures with a file were rejected, exposures
+    without one have not arrived; without a record of exposures, numbers in the file names that were left out have not
+    arrived, and numbers that go on mean that the camera was not triggered.
+
+    Args:
+        views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
+    """
+    known = {(v.vehicle, v.image) for v in views}
+    lost: dict[str, list[Exposure]] = defaultdict(list)
+    for exposure in exposures:
+        if not exposure.image or (exposure.vehicle, exposure.image) not in known:
+            lost[exposure.vehicle].append(exposure)
+    rows: dict[str, list[View]] = defaultdict(list)
+    for view in views:
+        rows[view.vehicle].append(view)
+    found: list[MissingPicture] = []
+    for vehicle, row in rows.items():
+        row.sort(key=lambda v: (v.time_s if v.time_s is not None else 0.0, v.image))
+        found += _holes(row, lost[vehicle])
+    return found
+
+
+def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture]:
+    if len(row) < 4:
+        return []
+    at = np.array([v.position[:2] for v in row])
+    way = np.diff(at, axis=0)
+    step = np.hypot(*way.T)
+    moving = step[step > 0.2]
+    if not len(moving):
+        return []
+    usual = float(np.median(moving))
+    heading = way / np.maximum(step, 1e-9)[:, None]
+    found = []
+    for i in np.flatnonzero(step > _HOLE * usual).tolist():
+        near = [k for k in (i - 1, i + 1) if 0 <= k < len(step) and step[k] > 0.2]
+        if not any(float(heading[k] @ heading[i]) > _STRAIGHT_COS for k in near):
+            continue
+        count = min(_MOST, max(1, round(step[i] / usual) - 1))
+        cause, confidence, names = _why(row[i], row[i + 1], count, lost)
+        for k in range(count):
+            share = (k + 1) / (count + 1)
+            position = (1.0 - share) * row[i].position + share * row[i + 1].position
+            name = names[k] if k < len(names) else f"{row[i].image}+{k + 1}"
+            found.append(MissingPicture(row[i].moved_to(position, name), row[i].image, cause, confidence))
+    return found
+
+
+def _why(before: View, after: View, count: int, lost: Sequence[Exposure]) -> tuple[Cause, float, list[str]]:
+    """Cause of a hole, how sure, and names of its pictures where they are known."""
+    if before.time_s is not None and after.time_s is not None:
+        times = (before.time_s + _SLACK_S, after.time_s - _SLACK_S)
+        within = [e for e in lost if times[0] < e.time_s < times[1]]
+        files = [e.image for e in within if e.image]
+        if within:
+            return (Cause.REJECTED if files else Cause.NOT_ARRIVED), min(0.95, len(within) / count), files
+    numbers = _number(before.image), _number(after.image)
+    if numbers[0] is not None and numbers[1] is not None:
+        left_out = numbers[1] - numbers[0] - 1
+        if 0.5 * count <= left_out <= 2 * count:
+            return Cause.NOT_ARRIVED, 0.8, []
+        if left_out == 0:
+            return Cause.NOT_TRIGGERED, 0.8, []
+    return Cause.NOT_TRIGGERED, 0.5, []
+
+
+def _number(image: str) -> int | None:
+    digits = re.findall(r"\d+", image.rpartition("/")[2])
+    return int(digits[-1]) if digits else None

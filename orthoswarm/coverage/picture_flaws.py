@@ -1,0 +1,42 @@
+"""Which pictures are blurred, damaged or without contrast, by comparison with their neighbours in flight."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.coverage.view import Flaw
+from orthoswarm.raster.picture_quality import PictureQuality
+
+_NEIGHBOURS = 15
+_BLURRED, _FAINT = 0.5, 0.25
+_FLAT_SHARE, _SATURATED_SHARE, _LEAST_CONTRAST = 0.10, 0.5, 4.0
+
+
+def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
+    """Flaws of one camera's pictures, in flying order; none for a picture that was not measured.
+
+    Blurred: less than half as sharp as the median of the 15 pictures before and after. Haze: less than a quarter of
+    their contrast, or less than 4 grey levels, or half of the pixels saturated. Damaged: a tenth of the blocks more
+    than usual is of one single value. The thresholds are ours; sharpness over a wood and over a lake differ by less.
+    """
+    flaws = [Flaw(0)] * len(qualities)
+    measured = [i for i, q in enumerate(qualities) if q is not None]
+    if not measured:
+        return flaws
+    rows = [(q.sharpness, q.contrast, q.flat_share, q.saturated_share) for q in qualities if q is not None]
+    sharp, contrast, flat, bright = np.array(rows, float).T
+    usual_sharp, usual_contrast, usual_flat = (_running_median(v) for v in (sharp, contrast, flat))
+    for k, i in enumerate(measured):
+        if sharp[k] < _BLURRED * usual_sharp[k]:
+            flaws[i] |= Flaw.BLURRED
+        if contrast[k] < max(_LEAST_CONTRAST, _FAINT * usual_contrast[k]) or bright[k] > _SATURATED_SHARE:
+            flaws[i] |= Flaw.HAZE
+        if flat[k] > usual_flat[k] + _FLAT_SHARE:
+            flaws[i] |= Flaw.DAMAGED
+    return flaws
+
+
+def _running_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    n = _NEIGHBOURS
+    return np.array([np.median(values[max(0, i - n) : i + n + 1]) for i in range(len(values))])

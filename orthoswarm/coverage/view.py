@@ -1,0 +1,151 @@
+"""What one picture sees of the ground: its camera, how sure its place is, and what is wrong with the picture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import IntFlag
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import Camera, Lens, focal_px
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame
+
+Array = NDArray[np.float64]
+
+
+class Flaw(IntFlag):
+    """Why a view of a cell does not count as well seen; a view may have several flaws."""
+
+    EDGE = 1
+    """Within two sigma of the footprint's edge: it may lie outside."""
+    OBLIQUE = 2
+    """More than 45 degrees off nadir."""
+    BLURRED = 4
+    DAMAGED = 8
+    HAZE = 16
+    """Glare or haze: too little contrast to be matched."""
+    POSITION = 32
+    """The picture's own sigma is larger than asked for."""
+    COARSE = 64
+    """The ground pixel is larger than asked for."""
+
+
+NO_FLAW = Flaw(0)
+FLAW_NAMES = {
+    Flaw.EDGE: "edge of a picture",
+    Flaw.OBLIQUE: "oblique",
+    Flaw.BLURRED: "blurred",
+    Flaw.DAMAGED: "damaged",
+    Flaw.HAZE: "haze or glare",
+    Flaw.POSITION: "position uncertain",
+    Flaw.COARSE: "too coarse",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A picture as the coverage needs it.
+
+    Attributes:
+        image: its name. vehicle: who took it. time_s: UTC epoch seconds, None if unknown.
+        position: float64 (3,), east, north, height, metres (heights share the datum of the ground).
+        to_camera: float64 (3, 3), from ground point minus position to camera axes (x right, y down, z = depth, m).
+        lens: its lens.
+        sigma_m: horizontal error of its place on the ground, one sigma per axis.
+        focal_sigma: relative error of the focal length, one sigma.
+        flaws: what is wrong with the whole picture.
+        placed: True where the map or neighbours hold it, False for a recorded pose.
+    """
+
+    image: str
+    vehicle: str
+    time_s: float | None
+    position: Array
+    to_camera: Array
+    lens: Lens
+    sigma_m: float
+    focal_sigma: float = 0.0
+    flaws: Flaw = NO_FLAW
+    placed: bool = True
+
+    @classmethod
+    def of_camera(
+        cls, camera: Camera, image: str, vehicle: str, sigma_m: float, time_s: float | None = None, **more: Any
+    ) -> "View":
+        """The view of a camera; `more` are further attributes."""
+        return cls(image, vehicle, time_s, camera.position, camera.rotation.T.copy(), camera.lens, sigma_m, **more)
+
+    @classmethod
+    def of_frame(cls, placed: PlacedFrame, flaws: Flaw = NO_FLAW, focal_sigma: float = 0.0) -> "View":
+        """The view of a placed frame."""
+        frame = placed.frame
+        return cls.of_camera(
+            placed.camera, frame.image, frame.vehicle, placed.sigma_m, frame.time_s, flaws=flaws,
+            focal_sigma=focal_sigma, placed=placed.stage != "realtime",
+        )  # fmt: skip
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any], ground_z_m: float, grid: LocalGrid) -> "View":
+        """The view of a placed line of frames.jsonl.
+
+        Args:
+            row: the line; needs `homography`, `camera`, `fov_deg`, `width` and `height`.
+            ground_z_m: height of the plane of its homography.
+            grid: the grid of its homography.
+
+        Raises:
+            InputError: something in the line is missing or no number.
+        """
+        try:
+            width, height = int(row["width"]), int(row["height"])
+            place = row["camera"]
+            position = np.array([*grid.to_grid(place["lat_deg"], place["lon_deg"]), place["height_m"]], float)
+            homography = np.array(row["homography"], float).reshape(3, 3)
+            lens = Lens(
+                width, height, focal_px(np.radians(row["fov_deg"]), width), row.get("k1", 0.0), row.get("k2", 0.0)
+            )
+            sigma = float("nan") if row["sigma_m"] is None else float(row["sigma_m"])
+            to_camera = _to_camera(homography, position, lens, ground_z_m)
+        except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+            raise InputError(
+                f"the line of {row.get('image')} in frames.jsonl has no usable {error}; make the map again with "
+                "this version of `orthoswarm mosaic`"
+            ) from None
+        when = row.get("time")
+        time_s = None if when is None else datetime.fromisoformat(when).timestamp()
+        return cls(
+            str(row["image"]), str(row["vehicle"]), time_s, position, to_camera, lens, sigma,
+            placed=row["stage"] != "realtime",
+        )  # fmt: skip
+
+    def moved_to(self, position: Array, image: str, time_s: float | None = None) -> "View":
+        """The same camera somewhere else: a picture that was not taken, or has not arrived."""
+        return replace(self, position=position, image=image, time_s=time_s)
+
+    def with_fov(self, fov_rad: float) -> "View":
+        """The same view through a lens without distortion of another horizontal field of view."""
+        lens = self.lens
+        return replace(self, lens=Lens(lens.width, lens.height, focal_px(fov_rad, lens.width)))
+
+    @property
+    def fov_rad(self) -> float:
+        """Horizontal field of view, radians."""
+        return self.lens.fov_rad
+
+
+def _to_camera(homography: Array, position: Array, lens: Lens, ground_z_m: float) -> Array:
+    """The matrix of `View.to_camera` from a homography (pixel, distortion removed -> east, north on a plane).
+
+    A ground point minus the position, d, lies on the plane for d_z = drop; (east, north, 1) is then linear in d, and
+    since all of it is homogeneous in d the matrix holds for points of every height.
+    """
+    drop = ground_z_m - position[2]
+    from_offset = np.array([[1.0, 0.0, position[0] / drop], [0.0, 1.0, position[1] / drop], [0.0, 0.0, 1.0 / drop]])
+    centred = Lens(lens.width, lens.height, lens.focal_px)
+    matrix = np.linalg.inv(centred.matrix()) @ np.linalg.inv(homography) @ from_offset
+    matrix /= np.linalg.norm(matrix[2])
+    return np.asarray(matrix if matrix[2, 2] * drop > 0.0 else -matrix)
