@@ -2,6 +2,7 @@
 
 import math
 import os
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.video.extraction_cache import Kept, Taken, key_of, recall, remember
+from telemetry.video.packet_loss import Damage, transport_gaps
 from telemetry.video.picture_choice import Candidate, Picker
 from telemetry.video.picture_poses import Pose, Poses
 from telemetry.video.video_file import VideoScan, demux, open_video, parked, scan
@@ -54,11 +56,14 @@ class Extraction:
     damaged: int = 0
 
 
-def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tuple[int, int | None, Any]]:
+def decoded(
+    found: VideoScan, counter: list[int] | None = None, damage: Damage | None = None
+) -> Iterator[tuple[int, int | None, Any]]:
     """Every picture of a file in order of presentation: number, index of its packet, decoded frame.
 
     The packet's index travels through the decoder with the picture; where a decoder does not carry it the
-    presentation time tells. Pictures that cannot be decoded are left out, and counted in counter[0].
+    presentation time tells. Pictures that cannot be decoded are left out, and counted in counter[0]; what was lost is
+    noted in `damage`.
     """
     import av
     from av.codec.context import Flags
@@ -73,13 +78,18 @@ def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tupl
         context.flags |= int(Flags.copy_opaque)
         with parked(context):
             number, index = 0, 0
+            damage = damage if damage is not None else Damage()
+            lost = _lost_packets(found, stream)
             for packet in demux(container, [stream]):
                 if packet.size:
                     packet.opaque = index
+                    is_lost = packet.is_corrupt or index in lost
+                    damage.packet(index, is_key=packet.is_keyframe, is_lost=is_lost)
                     index += 1
                 try:
                     frames = packet.decode()
                 except (av.error.FFmpegError, ValueError):
+                    damage.lost(max(0, index - 1))
                     if counter is not None:
                         counter[0] += 1
                     continue
@@ -89,8 +99,26 @@ def decoded(found: VideoScan, counter: list[int] | None = None) -> Iterator[tupl
                         own = by_time.get(round(float((frame.pts - start) * stream.time_base), 6))
                     if own is not None and rank is not None and own < len(rank):
                         number = max(number, rank[own])  # pictures that were lost keep their numbers
+                    if own is not None and frame.is_corrupt:
+                        damage.lost(own)
                     yield number, own, frame
                     number += 1
+
+
+def _lost_packets(found: VideoScan, stream: Any) -> set[int]:
+    """Indices of packets with a gap in or before them, in MPEG-TS."""
+    starts = [note.position for note in found.pictures]
+    if not _is_transport(found.path) or any(start is None for start in starts):
+        return set()
+    known = [start for start in starts if start is not None]
+    lost: set[int] = set()
+    for before, after in transport_gaps(found.path, stream.id):
+        lost.update(range(max(0, bisect_right(known, before) - 1), min(bisect_right(known, after), len(known))))
+    return lost
+
+
+def _is_transport(path: Path) -> bool:
+    return path.suffix.lower() in (".ts", ".mts", ".m2ts")
 
 
 def _presentation_rank(found: VideoScan) -> list[int] | None:
@@ -124,14 +152,14 @@ def pictures(
     """
     picker = Picker(every_m, every_s)
     result = result if result is not None else Extraction()
-    damaged = [0]
+    damaged, damage = [0], Damage()
     total = len(found.pictures)
     placed_only = poses.has_positions
-    for number, index, frame in decoded(found, damaged):
+    for number, index, frame in decoded(found, damaged, damage):
         result.pictures += 1
         if progress is not None and number % 25 == 0:
             progress(number, total)
-        if frame.is_corrupt:
+        if frame.is_corrupt or (index is not None and damage.is_damaged(index)):
             damaged[0] += 1
             continue
         pose = None if index is None or index >= total else poses.of(index)
@@ -224,7 +252,7 @@ def extract(
         result.names[photo.path] = one.number
     if result.damaged:
         result.findings.append(
-            Finding("video-damaged", f"{plural(result.damaged, 'picture')} of {path.name} cannot be decoded")
+            Finding("video-damaged", f"{plural(result.damaged, 'picture')} of {path.name} are damaged by losses")
         )
     result.findings += poses.findings
     if result.without_pose:

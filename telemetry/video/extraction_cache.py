@@ -11,7 +11,7 @@ from typing import Any
 from telemetry.video.picture_poses import Poses
 
 _LIST = "pictures.json"
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,11 +24,17 @@ class NotAVideo(Unreadable):
 
 @dataclass(slots=True)
 class PictureNote:
-    """What was found with one picture's packet: its time in the video, its own sample, and who understood it."""
+    """What was found with one picture's packet.
+
+    Attributes:
+        video_s: its time in the video. sample: its own pose. decoders: who understood it.
+        position: byte in the file where the packet begins, None where the container does not say.
+    """
 
     video_s: float | None
     sample: Sample | None = None
     decoders: tuple[str, ...] = ()
+    position: int | None = None
 
 
 @dataclass(slots=True)
@@ -160,7 +166,9 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
             if len(result.pictures) >= _MAX_PICTURES:
                 break
             seconds = None if packet.pts is None else float((packet.pts - start) * packet.time_base)
-            result.pictures.append(_note(bytes(packet), form, seconds))
+            note = _note(bytes(packet), form, seconds)
+            note.position = packet.pos
+            result.pictures.append(note)
         elif packet.stream.type == "subtitle":
             if seconds is not None:
                 length = float((packet.duration or 0) * packet.time_base)
