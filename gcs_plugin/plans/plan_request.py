@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -11,14 +11,15 @@ import shapely
 
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import End, Plan
 from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.area.shape_files import Polygon, Ring
 from orthoswarm.planning.lines.candidates import Method
-from orthoswarm.planning.lines.line_spacing import footprint
-from orthoswarm.planning.planner import plan_area, plan_lines
+from orthoswarm.planning.lines.line_spacing import Footprint, footprint
+from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_time import Motion
@@ -47,6 +48,8 @@ class PlanRequest:
         height_step_m: between the heights of ways out and home. ceiling_m: the highest of them, None for four steps
             above the lines.
         follow: follow the lines of a file that has polygons, too.
+        gaps: the area is a file of gaps as `orthoswarm coverage` writes it. fly_not_arrived: fly gaps, too, whose
+            pictures were taken but have not arrived.
     """
 
     area: Path
@@ -70,6 +73,8 @@ class PlanRequest:
     height_step_m: float = 5.0
     ceiling_m: float | None = None
     follow: bool = False
+    gaps: bool = False
+    fly_not_arrived: bool = False
 
     def flight_options(self) -> Options:
         """How the flights are to be.
@@ -109,12 +114,10 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     foot = footprint(request.altitude_m, fov, request.aspect, request.side_overlap, request.forward_overlap)
     options = request.flight_options()
     progress("area")
+    if request.gaps:
+        return _gap_plan(request, foot, options, progress)
     shapes, no_fly = read_shapes(request.area)
-    for path in request.no_fly:
-        further, fences = read_shapes(path)
-        if not further.polygons and not fences:
-            raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
-        no_fly += [*(p.shell for p in further.polygons), *fences]
+    no_fly += _no_fly_rings(request.no_fly)
     if shapes.polygons and not request.follow:
         area = make_area(shapes.polygons, no_fly)
         plan = plan_area(area, request.vehicles, request.altitude_m, foot, request.method, options, progress)
@@ -124,6 +127,29 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         raise InputError(f"{request.area} holds no {what}; draw one in it")
     zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
     return plan_lines(shapes.lines, request.vehicles, request.altitude_m, foot, zones, options, progress), zones
+
+
+def _gap_plan(
+    request: PlanRequest, foot: Footprint, options: Options, progress: Callable[[str], None]
+) -> tuple[Plan, Area]:
+    """A plan over the gaps of a coverage, and the ground that it aims at."""
+    if request.endurance_min is None:
+        raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")
+    no_fly = _no_fly_rings(request.no_fly)
+    target = gap_area(read_gaps(request.area), no_fly, foot, request.fly_not_arrived)
+    plan = plan_gaps(target.area, request.vehicles, request.altitude_m, foot, options, progress)
+    return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area
+
+
+def _no_fly_rings(paths: Sequence[Path]) -> list[Ring]:
+    """Rings of all no-fly files: their polygons' outlines and exclusion fences."""
+    rings: list[Ring] = []
+    for path in paths:
+        further, fences = read_shapes(path)
+        if not further.polygons and not fences:
+            raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
+        rings += [*(p.shell for p in further.polygons), *fences]
+    return rings
 
 
 def _zones_only(lines: tuple[Ring, ...], no_fly: list[Ring]) -> Area:

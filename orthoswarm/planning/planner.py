@@ -1,6 +1,7 @@
 """From an area, or given lines, to a plan for a swarm (paper III.A)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -16,12 +17,13 @@ from orthoswarm.planning.lines.candidates import METHODS, Method, candidates
 from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, stretches
+from orthoswarm.planning.lines.visiting_order import shorten
 from orthoswarm.planning.sorties.assignment import Crew, Options, Work
 from orthoswarm.planning.sorties.deconfliction import Separation, Slot
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
 
-__all__ = ["METHODS", "Method", "Options", "plan_area", "plan_lines"]
+__all__ = ["METHODS", "Method", "Options", "plan_area", "plan_gaps", "plan_lines"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -98,6 +100,64 @@ def _best_work(
         f"{crew.vehicles} vehicles are more than this area has lines for; "
         f"use {most} or fewer, or fly lower so that lines lie closer"
     )
+
+
+def plan_gaps(
+    area: Area,
+    vehicles: int,
+    altitude_m: float,
+    foot: Footprint,
+    options: Options | None = None,
+    progress: Progress = lambda _: None,
+) -> Plan:
+    """Missions that cover separate pieces of ground, each by the shortest parallel legs that see it.
+
+    Args:
+        area: the pieces, grown by the margin that they need, and no-fly zones.
+        vehicles: how many there are; fewer are used where there are fewer legs.
+        altitude_m: height of the legs above takeoff, metres.
+        foot: footprint of the narrowest camera at that height.
+        options: the rest.
+        progress: called with what is being done.
+
+    Raises:
+        InputError: no piece can be reached, a start in a no-fly zone, an endurance too short.
+    """
+    options = options or Options()
+    options.check()
+    clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
+    router = Router(make_obstacles(area.no_fly, clearance))
+    progress("lines")
+    found = [_gap_legs(piece, router, foot) for piece in planned_coverage.pieces(area.ground)]
+    legs = np.concatenate([np.empty((0, 2, 2)), *found])
+    if not len(legs):
+        raise InputError("all of the gaps lie within the clearance of no-fly zones; reduce the clearance")
+    most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
+    crew = Crew(min(vehicles, most), altitude_m, foot, area.grid, router, options)
+    work = crew.share(shorten(legs, router, None if crew.starts is None else crew.starts[0]), True)
+    progress("separation")
+    slots = crew.schedule(work)
+    progress("coverage")
+    flown = np.concatenate([_legs_of(s.flight) for row in slots for s in row])
+    left = planned_coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
+    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
+    warnings = _warnings(slots, work, foot, options)
+    if most < vehicles:
+        warnings.append(f"{most} of the {vehicles} vehicles are enough for these gaps")
+    if gaps:
+        warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
+    share = 1.0 - float(left.area) / area.size_m2
+    return _plan("gaps", slots, altitude_m, foot, area.grid, options, warnings, (area.size_m2, share, gaps))
+
+
+def _gap_legs(piece: planned_coverage.Geometry, router: Router, foot: Footprint) -> Array:
+    """Legs over one gap: a single one where a picture is as wide as the gap, else with the usual overlap."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(piece))
+    sides = np.hypot(*np.diff(corners, axis=0).T)
+    apart = foot if sides.min() <= foot.width_m else replace(foot, width_m=foot.spacing_m)
+    edge = corners[1] - corners[0] if sides[0] >= sides[1] else corners[2] - corners[1]
+    angle = float(np.arctan2(edge[1], edge[0]) - np.pi / 2)
+    return planned_coverage.legs_for(piece, router.obstacles, apart, foot.reach_m, angle)[0]
 
 
 def plan_lines(

@@ -76,7 +76,10 @@ class FlownArea:
         out.mkdir(parents=True, exist_ok=True)
         placed = self.placed()
         write_frames(out, placed, rejected or [], self.grid, 0.0)
-        vehicles = [{"id": f"v{k + 1}", "fov_deg": self.fov_deg, "fov_sigma_deg": 0.05} for k in range(self.vehicles)]
+        vehicles = [
+            {"id": f"v{k + 1}", "fov_deg": self.fov_deg, "fov_sigma_deg": 0.05, "frames": 9}
+            for k in range(self.vehicles)
+        ]
         write_json(out / "report.json", {"ground_z_m": 0.0, "vehicles": vehicles})
         return out
 

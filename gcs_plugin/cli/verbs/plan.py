@@ -22,10 +22,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "      --start 48.1371,11.5754 --out missions"
     )
     add = parser.add_argument
-    add("area", type=Path, metavar="AREA", help="polygon to cover, or line to follow")
+    add("area", type=Path, nargs="?", metavar="AREA", help="polygon to cover, or line to follow")
+    add("--gaps", type=Path, metavar="GAPS", help="instead of AREA: gaps.geojson of `orthoswarm coverage`, flown again")
+    add("--map", type=Path, metavar="OUT", help="take the field of view from this map, as solved, two sigma narrower")
+    add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
     add("--altitude", type=float, required=True, metavar="M", help="height of the lines above takeoff, metres")
-    add("--fov-min", type=float, required=True, metavar="DEG", help="smallest horizontal field of view in the swarm")
+    add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
     add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
@@ -91,11 +94,17 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
     """The arguments as a value."""
     from gcs_plugin.plans.plan_request import PlanRequest
 
+    if (args.area is None) == (args.gaps is None):
+        raise InputError("give either an AREA or --gaps GAPS.geojson")
+    if (args.fov_min is None) == (args.map is None):
+        raise InputError("give the smallest field of view with --fov-min, or with --map the map that it was solved in")
     return PlanRequest(
-        area=args.area,
+        area=args.area or args.gaps,
+        gaps=args.gaps is not None,
+        fly_not_arrived=args.fly_not_arrived,
         vehicles=args.vehicles,
         altitude_m=args.altitude,
-        fov_min_deg=args.fov_min,
+        fov_min_deg=args.fov_min if args.map is None else _solved_fov(args.map),
         no_fly=args.no_fly,
         method=args.method,
         autopilot=args.autopilot,
@@ -114,6 +123,18 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         ceiling_m=args.ceiling,
         follow=args.follow,
     )
+
+
+def _solved_fov(folder: Path) -> float:
+    """The smallest field of view of a map's vehicles, less two sigma, degrees."""
+    try:
+        rows = json.loads((folder / "report.json").read_text(encoding="utf-8"))["vehicles"]
+        fov = [float(r["fov_deg"]) - 2.0 * float(r["fov_sigma_deg"] or 0.0) for r in rows if r["frames"]]
+        return min(fov)
+    except OSError as error:
+        raise InputError(f"{folder} has no report.json ({error.strerror}); give a map's folder with --map") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{folder / 'report.json'} has no field of view; give it with --fov-min") from None
 
 
 def _aspect(text: str) -> float:

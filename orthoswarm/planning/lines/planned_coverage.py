@@ -87,7 +87,7 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
         for gap in pieces(left):
             if excess <= 0.0 or any(h.contains(gap.centroid) for h in hopeless):
                 continue
-            more, gained = _legs_for(gap, field.obstacles, foot, reach_m, angle_rad)
+            more, gained = legs_for(gap, field.obstacles, foot, reach_m, angle_rad)
             if gained < 0.2 * gap.area:
                 hopeless.append(gap)
                 continue
@@ -100,8 +100,14 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
     return legs
 
 
-def _legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float, angle: float) -> tuple[Array, float]:
-    """The legs that see most of a gap for their length, and what they see in square metres."""
+def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float, angle: float) -> tuple[Array, float]:
+    """The parallel legs that see most of a gap for their length, float64 (n, 2, 2), and what they see, square metres.
+
+    Args:
+        gap: shapely Polygon, grid metres. obstacles: what no leg may cross. foot: footprint of the narrowest camera,
+            its width is the distance of the legs. reach_m: how far pictures count beyond a leg's ends.
+        angle: a direction that is tried besides those of the gap and of the obstacles around it, radians.
+    """
     around = gap.buffer(2.0 * foot.width_m)
     obstacles = shapely.MultiPolygon([p for p in shapely.get_parts(obstacles) if p.intersects(around)])
     near = obstacles.intersection(gap.buffer(foot.width_m))
