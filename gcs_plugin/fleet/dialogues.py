@@ -43,6 +43,8 @@ class Dialogues:
     def begin(self, job: "Exchange") -> None:
         """Start one."""
         self.jobs.append(job)
+        vehicle = self._vehicles.get(job.vehicle.system)
+        job.pace = vehicle.pace if vehicle is not None else 1.0
         self._drive(job, job.start(self._clock()))
         self._reap()
 
@@ -133,7 +135,7 @@ class Dialogues:
         if vehicle is None:
             return
         if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
-            vehicle.mission = job.mission
+            vehicle.mission, vehicle.mission_seq = job.mission, 0
             vehicle.detector.uploaded(job.mission)
             return
         mission = None

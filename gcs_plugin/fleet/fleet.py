@@ -431,6 +431,7 @@ class Fleet:
     def _watch_clock(self, vehicle: Vehicle, route: Route, time_boot_s: float, now: float) -> None:
         verdict = route.clock.feed(time_boot_s, now)
         route.boot, route.boot_at = now - time_boot_s, now
+        vehicle.pace = route.pace(time_boot_s, now) or vehicle.pace
         if verdict == "mixed":
             vehicle.routes.mixed(now)
             self._compare_routes(vehicle, now)

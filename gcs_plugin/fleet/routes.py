@@ -19,6 +19,7 @@ _BETTER: Final = 0.2
 _SMOOTHING: Final = 0.02
 _CLOCK_S: Final = 1.5
 _ASK_CLOCK_S: Final = 3.0
+_PACE_S: Final = 2.0
 
 
 @dataclass(slots=True)
@@ -68,6 +69,19 @@ class Route:
     boot_at: float = 0.0
     asked_at: float = 0.0
     clock: BootClock = field(default_factory=BootClock)
+    _mark: tuple[float, float] | None = None
+
+    def pace(self, time_boot_s: float, now: float) -> float | None:
+        """Seconds of the vehicle's clock in one of ours over the last few; None while that is not known."""
+        if self._mark is None or time_boot_s < self._mark[1] or now - self._mark[0] > 2.0 * _PACE_S:
+            self._mark = now, time_boot_s
+            return None
+        seconds = now - self._mark[0]
+        if seconds < _PACE_S:
+            return None
+        pace = (time_boot_s - self._mark[1]) / seconds
+        self._mark = now, time_boot_s
+        return pace
 
     @property
     def address(self) -> str:

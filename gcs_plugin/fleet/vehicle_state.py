@@ -53,6 +53,7 @@ class Vehicle:
         prearm_ok: whether its own checks before arming have passed; None where it does not say.
         home: latitude and longitude of its home in degrees, None before it is set.
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
+        pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
     """
 
@@ -97,6 +98,7 @@ class Vehicle:
     home: tuple[float, float] | None = None
     launch: tuple[float, float] | None = None
     ask_why_at: float = 0.0
+    pace: float = 1.0
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None

@@ -28,11 +28,14 @@ class MissionDownload(Exchange):
     _asked_at: float = field(default=0.0, init=False)
     _asked_again: bool = field(default=False, init=False)
     _heard_at: float = field(default=0.0, init=False)
+    _asks_list: bool = field(default=True, init=False)
     _refused: int = field(default=ACCEPTED, init=False)
 
     def start(self, now: float) -> list[Message]:
         """Ask for the list."""
         self._heard_at = now
+        self._trip.longest_s = 2.0 / max(1.0, self.pace)
+        self._trip.wait_s = min(self._trip.wait_s, self._trip.longest_s)
         return self._restart(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
@@ -43,9 +46,10 @@ class MissionDownload(Exchange):
         if kind in ("MISSION_ITEM_INT", "MISSION_ITEM"):
             return self._received(message, now)
         if kind == "MISSION_ACK" and message.type != ACCEPTED:
-            # Busy with an upload, or it has forgotten that we are reading: begin again a little later.
-            self._refused, self._count = int(message.type), None
-            self.deadline = now + _BUSY_S
+            # Busy with an upload, or it has forgotten that we are reading: begin again a little later, and go on
+            # with the items that are not here yet.
+            self._refused, self._asks_list = int(message.type), True
+            self.deadline = now + (_BUSY_S if message.type == DENIED else _BUSY_S / max(1.0, self.pace))
         return []
 
     def tick(self, now: float) -> list[Message]:
@@ -77,13 +81,14 @@ class MissionDownload(Exchange):
     def _restart(self, now: float) -> list[Message]:
         self._count = None
         self._got.clear()
+        self._asks_list = True
         return self._ask(now, again=False)
 
     def _ask(self, now: float, *, again: bool) -> list[Message]:
         self._asked_at, self._asked_again = now, again
         self.deadline = now + self._trip.wait_s
         to = self.vehicle
-        if self._count is None:
+        if self._count is None or self._asks_list:
             return [dialect.MAVLink_mission_request_list_message(to.system, to.component, MISSION)]
         seq = next(seq for seq in range(self._count) if seq not in self._got)
         return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, MISSION)]
@@ -93,11 +98,12 @@ class MissionDownload(Exchange):
         self._trip.answered(now - self._asked_at, asked_again=self._asked_again)
 
     def _counted(self, count: int, now: float) -> list[Message]:
-        if self._count == count and self._got:  # a copy of the first answer
+        if self._count == count and self._got and not self._asks_list:  # a copy of the first answer
             return []
         self._heard(now)
-        self._count = count
-        self._got.clear()
+        if self._count != count:
+            self._got.clear()
+        self._count, self._asks_list = count, False
         return self._ask(now, again=False) if count else self._finish()
 
     def _received(self, message: Message, now: float) -> list[Message]:

@@ -79,6 +79,7 @@ class Exchange(abc.ABC):
         outcome: None until it has ended.
         deadline: when `tick` wants to be called next.
         expires: after this time nothing that begins the command may be sent.
+        pace: seconds of the vehicle's clock in one of ours (a simulation may run fast); its time-outs are its own.
         delivered: messages that a link took; counted by whoever drives the exchange.
     """
 
@@ -87,6 +88,7 @@ class Exchange(abc.ABC):
     outcome: Outcome | None = field(default=None, init=False)
     deadline: float = field(default=NEVER, init=False)
     expires: float = field(default=NEVER, init=False)
+    pace: float = field(default=1.0, init=False)
     delivered: int = field(default=0, init=False)
 
     @abc.abstractmethod
@@ -145,9 +147,11 @@ class RoundTrip:
 
     Attributes:
         wait_s: the time to wait now.
+        longest_s: the longest wait; a vehicle gives a dialogue up after a few seconds of its own clock.
     """
 
     wait_s: float = 0.7
+    longest_s: float = 2.0
     _usual_s: float = 0.7
     _smooth_s: float | None = None
 
@@ -155,9 +159,9 @@ class RoundTrip:
         """An answer came. Which of several equal questions it answers is not known, so those tell nothing."""
         if not asked_again:
             self._smooth_s = took_s if self._smooth_s is None else 0.8 * self._smooth_s + 0.2 * took_s
-            self._usual_s = min(2.0, max(0.2, 4.0 * self._smooth_s))
-        self.wait_s = self._usual_s
+            self._usual_s = max(0.2, 4.0 * self._smooth_s)
+        self.wait_s = min(self.longest_s, self._usual_s)
 
     def missed(self) -> None:
         """No answer came in time."""
-        self.wait_s = min(2.0, 1.4 * self.wait_s)
+        self.wait_s = min(self.longest_s, 1.4 * self.wait_s)

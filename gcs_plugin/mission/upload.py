@@ -19,7 +19,7 @@ from typing import Final
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip
+from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip, Verdict
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.refusal import ACCEPTED, CANCELLED, DENIED, ERROR, INVALID_SEQUENCE, NO_SPACE, Refusal, explain
 
@@ -30,6 +30,7 @@ _LAST_SILENCE_S: Final = 3.0
 _AFTER_REFUSAL_S: Final = 0.3
 _DENIED_AGAIN_S: Final = 1.5
 _DOUBT_S: Final = 1.5
+_CLEARS: Final = 6
 # How often a store may differ after a whole upload before that is reported.
 _MIXTURES: Final = 4
 # Copies of one request within this time are the network's; a vehicle that misses an item waits longer.
@@ -43,6 +44,7 @@ class Stage(enum.Enum):
     ITEMS = "sending"
     PAUSE = "waiting"
     VERIFY = "reading back"
+    CLEAR = "clearing"
     DONE = "done"
 
 
@@ -78,15 +80,21 @@ class MissionUpload(Exchange):
     _mixtures: int = field(default=0, init=False)
     _touched: bool = field(default=False, init=False)
     _reading: MissionDownload | None = field(default=None, init=False)
+    _clears: int = field(default=0, init=False)
 
     def start(self, now: float) -> list[Message]:
         """Announce the mission."""
         self._heard_at = now
+        self._trip.longest_s = 2.0 / max(1.0, self.pace)
         return self._announce(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Take requests, acknowledgements and, while reading back, items."""
         kind = self._mission_kind(message)
+        if self.stage is Stage.CLEAR:
+            if kind == "MISSION_ACK" and message.type == ACCEPTED:
+                self._unknown("was cleared")
+            return []
         if kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
             return self._requested(int(message.seq), now)
         if kind == "MISSION_ACK":
@@ -99,6 +107,8 @@ class MissionUpload(Exchange):
         """Repeat, begin anew, or give up."""
         if self.outcome is not None or now < self.deadline:
             return []
+        if self.stage is Stage.CLEAR:
+            return self._clear(now)
         if self._reading is not None:
             return self._read(self._reading.tick(now), now)
         if now - self._heard_at > self.patience_s:
@@ -106,7 +116,7 @@ class MissionUpload(Exchange):
             if self._denied:
                 self._fail(f"denied the upload: {self._denied.reason}")
             else:
-                self._fail("did not answer; check the link and its system id")
+                self._fail("did not answer; check the link and its system id", Verdict.UNKNOWN)
             return []
         if self._doubt is not None:
             return self._nack(self._doubt, now)
@@ -239,6 +249,7 @@ class MissionUpload(Exchange):
     def _verify(self, now: float) -> list[Message]:
         self.stage = Stage.VERIFY
         self._reading = MissionDownload(self.vehicle, self.own, patience_s=self.patience_s)
+        self._reading.pace = self.pace
         return self._read(self._reading.start(now), now)
 
     def _read(self, messages: list[Message], now: float) -> list[Message]:
@@ -249,8 +260,8 @@ class MissionUpload(Exchange):
             return messages
         self._heard_at = now
         if reading.items is None:
-            self._fail("has the mission, perhaps: it could not be read back; upload again before flying")
-            return messages
+            self._reading, self.stage, self._clears = None, Stage.CLEAR, 0
+            return messages + self._clear(now)
         wrong = difference(self.mission, reading.items)
         if wrong is None:
             self.stage = Stage.DONE
@@ -266,11 +277,27 @@ class MissionUpload(Exchange):
             self._pause(now, _AFTER_REFUSAL_S)
         return messages
 
-    def _fail(self, text: str) -> None:
+    def _clear(self, now: float) -> list[Message]:
+        """A mission that cannot be read back must not be flown: clear it."""
+        self._clears += 1
+        if self._clears > _CLEARS:
+            self._unknown("was told to clear it, and did not answer")
+            return []
+        self.deadline = now + _COUNT_AGAIN_S
+        to = self.vehicle
+        return [dialect.MAVLink_mission_clear_all_message(to.system, to.component, MISSION)]
+
+    def _unknown(self, what: str) -> None:
+        self.stage = Stage.DONE
+        name = f"vehicle {self.vehicle.system}"
+        text = f"{name}: its mission could not be read back and {what}; what it holds is not known: upload again"
+        self._end(False, text, Verdict.UNKNOWN)
+
+    def _fail(self, text: str, failure: Verdict = Verdict.REFUSED) -> None:
         self.stage = Stage.DONE
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and "upload again" not in text
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
-        self._end(False, f"vehicle {self.vehicle.system} {text}{warning}")
+        self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
         if self.refusal is not None and self.outcome is not None:
             refusal = self.refusal
             self.outcome = Outcome(False, self.outcome.text, refusal.item, refusal.field, refusal.code)

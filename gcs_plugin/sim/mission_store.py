@@ -55,6 +55,8 @@ class MissionStore:
     items: list[MissionItem] = field(default_factory=list)
     generation: int = 0
     _transfer: _Transfer | None = None
+    _sent_to: Address | None = None
+    _sent_at: float = 0.0
 
     def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
         """Take a message of the mission protocol that is meant for this vehicle; returns the answers."""
@@ -68,13 +70,18 @@ class MissionStore:
             case "MISSION_REQUEST_LIST":
                 if self._transfer is not None:
                     return [self._ack(sender, DENIED if self.autopilot is Autopilot.ARDUPILOT else ERROR)]
+                if self.autopilot is Autopilot.PX4:
+                    self._sent_to, self._sent_at = sender, now
                 return [
                     dialect.MAVLink_mission_count_message(sender.system, sender.component, len(self.items), _MISSION)
                 ]
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
-                if message.seq >= len(self.items) or self._transfer is not None:
+                if message.seq >= len(self.items) or self._transfer is not None or not self._sends(sender, now):
                     return [self._ack(sender, ERROR)]
+                self._sent_at = now
                 return [self.items[message.seq].message(message.seq, sender.system, sender.component)]
+            case "MISSION_ACK":
+                self._sent_to = None
             case "MISSION_CLEAR_ALL":
                 self.items, self._transfer = [self.home] if self.autopilot is Autopilot.ARDUPILOT else [], None
                 self.generation += 1
@@ -94,7 +101,13 @@ class MissionStore:
 
     def rebooted(self) -> None:
         """Forget the dialogue; what was stored stays."""
-        self._transfer = None
+        self._transfer = self._sent_to = None
+
+    def _sends(self, to: Address, now: float) -> bool:
+        """PX4 gives items out only after a request for the list, and forgets it when it hears nothing for a while."""
+        if self.autopilot is Autopilot.ARDUPILOT:
+            return True
+        return self._sent_to == to and now - self._sent_at < _TIMING[Autopilot.PX4][1]
 
     @property
     def receiving(self) -> bool:
@@ -107,6 +120,8 @@ class MissionStore:
             return [self._ack(sender, DENIED)]
         if transfer is not None and self.autopilot is Autopilot.PX4:
             return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, ERROR)]
+        if self._sent_to is not None and now - self._sent_at < _TIMING[Autopilot.PX4][1]:
+            return [self._ack(sender, ERROR)]  # PX4 is still handing its mission out
         if count > _CAPACITY:
             return [self._ack(sender, NO_SPACE)]
         if count == 0:

@@ -269,6 +269,7 @@ def test_a_new_upload_after_a_flight_is_not_complete(make_site):
 def test_pause_and_resume(make_site):
     site = make_site()
     site.fly(MissionItem(RTL))
+    site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 100.0)
     site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 100.0)
     assert site.finish(site.fleet.pause(site.system)).ok
     site.place.until(lambda: False, 12.0)

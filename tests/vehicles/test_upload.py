@@ -9,7 +9,7 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import GROUND_STATION, Address
+from gcs_plugin.mission.exchange import GROUND_STATION, Address, Verdict
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     JUMP,
@@ -51,7 +51,8 @@ def make_mission(autopilot, legs=3, height=60.0):
 class Rig:
     """A vehicle's store and any number of ground stations, joined by bad links, stepped in virtual time."""
 
-    def __init__(self, autopilot, up=None, down=None):
+    def __init__(self, autopilot, up=None, down=None, pace=1.0):
+        self.pace = pace  # seconds of the vehicle's clock in one of the station's
         self.store = MissionStore(autopilot, HOME, [HOME] if autopilot is AP else [])
         self.up, self.down = Channel(up or Faults()), Channel(down or Faults())
         self.now = 100.0
@@ -86,9 +87,9 @@ class Rig:
             for packet in Framer().feed(raw):
                 if self.now >= self.off_until:
                     sender = Address(packet.system, packet.component)
-                    self.answer(self.store.feed(packet.message, sender, self.now))
+                    self.answer(self.store.feed(packet.message, sender, self.pace * self.now))
         if self.now >= self.off_until:
-            self.answer(self.store.tick(self.now))
+            self.answer(self.store.tick(self.pace * self.now))
         for raw in self.down.take(self.now):
             for packet in Framer().feed(raw):
                 for exchange, _ in self.stations.values():
@@ -311,8 +312,33 @@ def test_an_acknowledged_upload_that_cannot_be_read_back_is_no_success():
     rig.down = Channel(Faults(loss=1.0))
     (outcome,) = rig.run(uploading)
     assert not outcome.ok
-    assert "read back" in outcome.text or "did not answer" in outcome.text
-    assert holds(rig, mission)  # it is there, but nobody knows
+    assert outcome.verdict is Verdict.UNKNOWN
+    assert "was told to clear it" in outcome.text and "what it holds is not known" in outcome.text
+    assert rig.store.items == []
+
+
+@pytest.mark.parametrize("autopilot", [AP, PX4])
+def test_a_mission_that_cannot_be_read_back_is_cleared(autopilot):
+    rig, mission = Rig(autopilot), make_mission(autopilot)
+    uploading = upload(rig, mission, patience_s=5.0)
+    while not rig.acks:
+        rig.step()
+    rig.down = Channel(Faults(silent=((0.0, rig.now + 8.0),)))
+    (outcome,) = rig.run(uploading)
+    assert outcome.verdict is Verdict.UNKNOWN and "was cleared" in outcome.text
+    assert len(rig.store.items) == mission.first_seq
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("autopilot", [AP, PX4])
+def test_time_outs_are_the_vehicles_own_at_three_times_its_speed(autopilot, seed):
+    faults = Faults(loss=0.3, duplicate=0.1, seed=seed)
+    rig, mission = Rig(autopilot, faults, Faults(loss=0.3, seed=seed + 30), pace=3.0), make_mission(autopilot, legs=8)
+    uploading = MissionUpload(VEHICLE, GROUND_STATION, mission=mission)
+    uploading.pace = 3.0
+    (outcome,) = rig.run(rig.join(uploading))
+    assert outcome.ok, outcome
+    assert holds(rig, mission)
 
 
 def test_a_silent_vehicle_is_given_up():
