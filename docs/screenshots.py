@@ -1,4 +1,4 @@
-"""Take the pictures of the daemon's page in docs/images anew: the real daemon, headless Chromium, the demonstration.
+"""Take the pictures of the console in docs/images anew: the real daemon, headless Chromium, the demonstration.
 
     python docs/screenshots.py [--out docs/images] [--keep FOLDER]
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"]
-DESK, TABLET = {"width": 1280, "height": 800}, {"width": 768, "height": 1024}
+DESK, TABLET, PHONE = (1440, 900), (1024, 768), (390, 844)
 LIMIT_MS = 600_000
 DRAWN_MS = 4000
 
@@ -49,52 +49,68 @@ class Program:
         self.process.wait(60)
 
 
+def opened(browser: Any, url: str, size: tuple[int, int], theme: str = "dark") -> Any:
+    """The console in a window of a size and a theme."""
+    page = browser.new_context(viewport={"width": size[0], "height": size[1]}).new_page()
+    page.add_init_script(
+        f"localStorage.getItem('orthoswarm-settings') || "
+        f"localStorage.setItem('orthoswarm-settings', JSON.stringify({{theme: '{theme}', sound: false}}))"
+    )
+    page.goto(url)
+    page.wait_for_function("() => window.orthoswarm", timeout=LIMIT_MS)
+    return page
+
+
 def flight(browser: Any, demo: Program, out: Path) -> None:
     """While vehicles fly: some legs are over, no vehicle is complete."""
-    page = browser.new_page(viewport=DESK)
-    page.goto(demo.url)
-    page.wait_for_selector("#leg-count:text-matches('^([3-9]|[1-9][0-9]) legs')", timeout=LIMIT_MS)
-    page.wait_for_timeout(DRAWN_MS)
+    page = opened(browser, demo.url, DESK)
+    phone = opened(browser, demo.url, PHONE, "sunlight")
+    legs = (
+        "() => document.querySelectorAll('.leg b').length && /[1-9]/.test(document.querySelector('.leg b').textContent)"
+    )
+    page.wait_for_function(legs, timeout=LIMIT_MS)
+    page.click(".tile >> nth=1")
     shoot(page, out / "daemon-flight.jpg")
-    page.close()
+    shoot(phone, out / "daemon-phone.jpg")
+    page.context.close()
+    phone.context.close()
 
 
 def afterwards(browser: Any, served: Program, token: str, out: Path) -> None:
     """The refined map, the swipe, a tablet, a plan."""
-    page = browser.new_page(viewport=DESK)
-    page.goto(f"{served.url}/#token={token}")
-    page.wait_for_selector("#vehicles .card >> nth=2", timeout=LIMIT_MS)
-    page.wait_for_timeout(DRAWN_MS)
+    page = opened(browser, f"{served.url}/#token={token}", DESK)
+    page.wait_for_selector(".tile >> nth=2", timeout=LIMIT_MS)
+    page.click("#tab-map")
     shoot(page, out / "daemon-page.jpg")
     page.check("#swipe-on")
     page.wait_for_timeout(DRAWN_MS)
     shoot(page, out / "daemon-swipe.jpg")
     page.uncheck("#swipe-on")
     plan(page, out / "daemon-plan.jpg")
-    page.close()
-    page = browser.new_page(viewport=TABLET, has_touch=True, device_scale_factor=1)
-    page.goto(served.url)
-    page.wait_for_selector("#vehicles .card >> nth=2", timeout=LIMIT_MS)
-    page.wait_for_timeout(DRAWN_MS)
+    page.context.close()
+    page = opened(browser, served.url, TABLET, "sunlight")
+    page.wait_for_selector(".tile >> nth=2", timeout=LIMIT_MS)
+    page.click("#tab-map")
     shoot(page, out / "daemon-tablet.jpg")
-    page.close()
+    page.context.close()
 
 
 def plan(page: Any, path: Path) -> None:
-    """Draw an area beside the one that was flown, plan it, and ask to upload it."""
-    page.click("#draw")
-    for x, y in ((180, 170), (700, 130), (780, 620), (250, 660)):
+    """Draw an area over the one that was flown, and plan it."""
+    page.click("#tab-plan")
+    page.click("text=Draw area")
+    for x, y in ((560, 200), (1180, 170), (1260, 640), (620, 690)):
         page.mouse.click(x, y)
         page.wait_for_timeout(400)
-    page.click("#make")
-    page.wait_for_selector("#plan-result >> text=covered in", timeout=LIMIT_MS)
-    page.locator("#plan-result").scroll_into_view_if_needed()
-    page.wait_for_timeout(DRAWN_MS)
+    page.click("text=Make plan")
+    page.wait_for_selector(".plan-result:not([hidden])", timeout=LIMIT_MS)
+    page.locator(".plan-result").scroll_into_view_if_needed()
     shoot(page, path)
 
 
 def shoot(page: Any, path: Path) -> None:
     """Take a picture of what the page shows, once all tiles are there."""
+    page.wait_for_timeout(DRAWN_MS)
     for _ in range(60):
         if page.evaluate("orthoswarm.map.areTilesLoaded()"):
             break

@@ -30,6 +30,7 @@ byId("bottom").replaceWith(commandBar());
 const { stripOf } = await import("/static/fly/tiles.js");
 const { alarmList } = await import("/static/fly/alarms.js");
 const panels = Object.fromEntries(MODES.map((mode) => [mode, make("div", { class: "panel", role: "tabpanel", id: `panel-${mode}`, "aria-labelledby": `tab-${mode}`, tabindex: "0" })]));
+setAttribute(byId("side"), "aria-label", t("panel.title"));
 byId("side").append(fold, ...Object.values(panels));
 panels.fly.append(stripOf());
 byId("stage").append(make("div", { class: "corner" }, alarmList(), noticeBox()));

@@ -3,7 +3,7 @@
 export const english = {
   "app.title": "OrthoSwarm", "app.nomap": "The map cannot be shown ({why}); commands to vehicles work. Use a browser with WebGL.",
   "app.token": "The token is missing or wrong: open Settings and enter the one that `orthoswarm serve --show-token` prints.",
-  "mode.title": "Mode", "mode.plan": "Plan", "mode.fly": "Fly", "mode.map": "Map", "panel.fold": "Hide the panel", "panel.open": "Show the panel",
+  "mode.title": "Mode", "mode.plan": "Plan", "mode.fly": "Fly", "mode.map": "Map", "panel.title": "Panel", "panel.fold": "Hide the panel", "panel.open": "Show the panel",
   "link.connecting": "Connecting", "link.live": "Live", "link.late": "Late: {age}", "link.lost": "No link",
   "link.banner": "No word from the ground station for {age}. What you see is old, and commands may not arrive. Use each vehicle's own remote control.",
   "link.banner.short": "No word from the ground station",

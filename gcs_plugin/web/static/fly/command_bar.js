@@ -17,7 +17,7 @@ export function commandBar() {
   const more = button(t("all.resume"), () => askAll("resume"), { class: "command", dataset: { tone: "go", verb: "resume" } });
   more.dataset.tone = "go";
   more.dataset.verb = "resume";
-  return make("footer", { class: "command-bar", "aria-label": t("all.bar") }, commandLog(), confirm.box,
+  return make("footer", { class: "command-bar", "aria-label": t("all.bar") }, make("div", { class: "above" }, confirm.box, commandLog()),
     make("div", { class: "commands", role: "group", "aria-label": t("all.bar") }, all("pause", "❚❚"), all("rtl", "⤺"), all("land", "⤓"), more));
 }
 

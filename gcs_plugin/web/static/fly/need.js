@@ -16,7 +16,7 @@ export const inAir = (row) => (row.flight.state ? !GROUND.has(row.flight.state) 
   : row.linked && row.armed && row.flight.text !== "on ground");
 
 export function need(row, now) {
-  if (!row.linked) return { level: "ok", why: [], age_s: null, weight: 0 };
+  if (!row.linked) return { level: "ok", why: [], age_s: null, weight: 0, old: state.link !== "live" };
   const age_s = age(row, now);
   const why = [];
   const add = (level, key, words) => why.push({ level, key, words });
@@ -28,5 +28,5 @@ export function need(row, now) {
   if (row.gps_fix != null && row.gps_fix < 3) add(inAir(row) ? "bad" : "warn", "gps", t("need.gps"));
   if (row.takeoff?.failed) add("warn", "takeoff", row.takeoff.failed);
   const level = why.reduce((worst, item) => (WEIGHT[item.level] > WEIGHT[worst] ? item.level : worst), "ok");
-  return { level, why, age_s, weight: WEIGHT[level] };
+  return { level, why, age_s, weight: WEIGHT[level], old: age_s > STALE_S || state.link !== "live" };
 }

@@ -48,7 +48,7 @@ export function wordOf(row) {
 
 const update = (row, now) => {
   const tile = tiles.get(row.id) ?? create(row);
-  const { level, why, age_s } = need(row, now);
+  const { level, why, age_s, old } = need(row, now);
   setText(tile.name, row.name);
   setText(tile.word, wordOf(row));
   setText(tile.cells.height, units.height(row.height_m));
@@ -61,6 +61,7 @@ const update = (row, now) => {
   const share = row.phase === "complete" ? 1 : row.flight.items ? row.flight.item / row.flight.items : 0;
   setStyle(tile.bar, "transform", `scaleX(${Math.min(1, share).toFixed(3)})`);
   setAttribute(tile.press, "data-level", level);
+  setAttribute(tile.press, "data-old", old);
   setAttribute(tile.press, "aria-pressed", state.selected === row.id ? "true" : "false");
 };
 

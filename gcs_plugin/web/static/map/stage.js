@@ -31,8 +31,9 @@ function showAll() {
 
 // Before anything is mapped the map goes once to where the vehicles are.
 let went = false;
+let isReady = false;
 subscribe("vehicles ready", "first look", () => {
-  if (went || !map.loaded() || mappedBounds() || ![...state.vehicles.values()].some((row) => row.position)) return;
+  if (went || !isReady || mappedBounds() || ![...state.vehicles.values()].some((row) => row.position)) return;
   went = true;
   showAll();
 });
@@ -44,6 +45,7 @@ export async function withMap(panels) {
   panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog());
   await ready;
+  isReady = true;
   subscribe("plan", "the shared plan", () => loadPlan());
   subscribe("finds-changed", "finds of others", () => loadFinds());
   guarded("the plan", loadPlan)();

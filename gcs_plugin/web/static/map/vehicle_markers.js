@@ -32,7 +32,9 @@ const place = (row, now) => {
   setStyle(element.firstChild, "transform", `rotate(${Math.round(row.heading_deg ?? 0)}deg)`);
   setText(element.lastChild, row.name);
   setAttribute(element, "aria-label", t("map.vehicle", { name: row.name }));
-  setAttribute(element, "data-level", need(row, now).level);
+  const { level, old } = need(row, now);
+  setAttribute(element, "data-level", level);
+  setAttribute(element, "data-old", old);
   setAttribute(element, "data-selected", state.selected === row.id);
 };
 

@@ -1,0 +1,33 @@
+"""axe-core finds nothing on any mode, in both themes; what is pressed is at least 44 px large."""
+
+import pytest
+
+from tests.kit.page_kit import DESK, PHONE, ok_for_all, opened, standing, vehicle
+
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+SMALL = """() => [...document.querySelectorAll("button, select, summary, input:not([type=checkbox])")]
+  .filter((e) => e.checkVisibility() && !e.closest(".maplibregl-ctrl-attrib") && !e.classList.contains("hidden-file"))
+  .map((e) => [e.outerHTML.slice(0, 80), e.getBoundingClientRect()])
+  .filter(([, box]) => box.height < 43.5 || box.width < 43.5).map(([html]) => html)"""
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+@pytest.mark.parametrize("theme", ["dark", "sunlight"])
+def test_nothing_stands_in_the_way(browser, theme, size):
+    rows = [vehicle(1, name="Falcon", battery=0.05), vehicle(2, silent_s=30), vehicle(3, battery=0.2)]
+    with standing(*rows) as station, opened(browser, station.url, size) as page:
+        ok_for_all(station, "refused", "the battery is empty")
+        page.click("button[aria-label=Settings]")
+        page.select_option(".settings select >> nth=0", theme)
+        assert axe.Axe().run(page).violations_count == 0
+        page.click(".settings >> text=Close")
+        page.click(".tile:has-text('Falcon')")
+        page.click(".details [data-verb=rtl]")
+        page.wait_for_timeout(400)
+        page.click(".confirm-yes")
+        page.click(".command[data-verb=rtl]")
+        for mode in ("fly", "plan", "map"):
+            page.click(f"#tab-{mode}")
+            report = axe.Axe().run(page)
+            assert report.violations_count == 0, report.generate_report()
+            assert page.evaluate(SMALL) == []

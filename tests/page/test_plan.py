@@ -1,0 +1,107 @@
+"""Plan mode: an area is drawn, changed, taken back and dropped; errors say what to change."""
+
+import json
+
+from tests.kit.page_kit import opened, standing, vehicle
+
+HERE = "orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 16 })"
+KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>
+8.544,47.397,0 8.547,47.397,0 8.547,47.399,0 8.544,47.399,0 8.544,47.397,0</coordinates></LinearRing></outerBoundaryIs>
+<innerBoundaryIs><LinearRing><coordinates>8.545,47.3975 8.546,47.3975 8.546,47.398 8.545,47.3975</coordinates>
+</LinearRing></innerBoundaryIs></Polygon></Placemark></kml>"""
+
+
+def planning(page):
+    page.click("#tab-plan")
+    page.evaluate(HERE)
+
+
+def draw(page, *corners):
+    page.click("text=Draw area")
+    for x, y in corners:
+        page.mouse.click(x, y)
+        page.wait_for_timeout(350)
+    page.click("button:text-is('Done')")
+
+
+def corners(page) -> int:
+    return page.locator(".handle:not(.middle)").count()
+
+
+def test_corners_are_drawn_inserted_moved_deleted_and_taken_back(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        planning(page)
+        draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+        assert corners(page) == 4
+        hint = page.inner_text(".hint")
+        assert "ha" in hint
+        page.locator(".handle.middle").first.focus()
+        page.keyboard.press("Enter")
+        assert corners(page) == 5
+        page.keyboard.press("ArrowUp")
+        assert page.inner_text(".hint") != hint
+        page.keyboard.press("Delete")
+        assert corners(page) == 4
+        for _ in range(3):
+            page.click("text=Undo")
+        assert page.inner_text(".hint") == hint
+        page.click("text=Redo")
+        assert corners(page) == 5
+        page.click("text=Undo")
+        box = page.locator(".handle:not(.middle)").first.bounding_box()
+        page.mouse.move(box["x"] + 22, box["y"] + 22)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 82, box["y"] + 82, steps=5)
+        page.mouse.up()
+        assert page.inner_text(".hint") != hint
+        page.click("text=Undo")
+        assert page.inner_text(".hint") == hint
+
+
+def test_an_outline_that_crosses_itself_says_what_to_change(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        planning(page)
+        draw(page, (600, 250), (900, 550), (900, 250), (600, 550))
+        assert "crosses itself: drag a corner" in page.inner_text(".hint")
+        page.click("text=Make plan")
+        assert "crosses itself" in page.inner_text(".notices")
+        assert [path for _, path, _ in station.heard if path == "/api/plans"] == []
+
+
+def test_files_bring_an_area_or_say_what_is_wrong(browser):
+    square = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
+    good = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [square]}}
+    wrong = {"type": "Polygon", "coordinates": [[[x * 1e5, y] for x, y in square]]}
+    files = [("a.geojson", json.dumps(good), 3, "ha"), ("b.kml", KML, 7, "ha"), ("c.json", "{", 7, "valid JSON"),
+             ("d.geojson", json.dumps(wrong), 7, "out of range"), ("e.geojson", "{}", 7, "no polygon")]  # fmt: skip
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        planning(page)
+        for name, text, count, words in files:
+            file = {"name": name, "mimeType": "text/plain", "buffer": text.encode()}
+            page.set_input_files("input[type=file]", files=[file])
+            page.wait_for_selector(f".notice:has-text('{name}')")
+            assert words in page.inner_text(f".notice:has-text('{name}')")
+            assert corners(page) == count
+
+
+def test_a_field_out_of_range_names_its_range(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        planning(page)
+        draw(page, (600, 250), (900, 250), (900, 550))
+        page.fill("[name=altitude_m]", "5000")
+        page.click("text=Make plan")
+        assert "give a number from 5 to 1000" in page.inner_text(".notices")
+
+
+def test_units_and_coordinates_are_the_persons(browser):
+    with standing(vehicle(1, height_m=100.0)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile")
+        page.click(".tile")
+        page.click("button[aria-label=Settings]")
+        page.select_option(".settings select >> nth=1", "us")
+        page.select_option(".settings select >> nth=2", "mgrs")
+        page.click(".settings >> text=Close")
+        page.wait_for_selector(".tile:has-text('328 ft')")
+        page.wait_for_selector(".details:has-text('32T MT 65741 49460')")
+        planning(page)
+        assert "262" in page.input_value("[name=altitude_m]")
