@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 
@@ -55,7 +56,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     floor = config.map_floor_px * gsd_m
     if len(residual) == 0:
         return floor
-    scatter = 1.4826 * float(np.median(np.abs(residual)))
+    scatter = mad_sigma(residual)
     if len(residual) < config.scatter_least_ties:  # the adjustment follows so few: their residuals are too small
         scatter = max(scatter, float(np.median(sigma_m)))
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
@@ -87,7 +88,7 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
         if len(mine) < config.systematic_least_ties:
             continue
         middle = np.median(mine, axis=0)
-        spread = 1.4826 * float(np.median(np.abs(mine - middle)))
+        spread = mad_sigma(mine - middle)
         out[i] = max(
             0.0, float(np.hypot(*middle)) - config.systematic_sigmas * _MEDIAN_SIGMA * spread / np.sqrt(len(mine))
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import FlightRecords
 
 Array = NDArray[np.float64]
@@ -83,12 +84,12 @@ def calibrate(
     offset, warnings = _heading(records, leg, r, owner)
     factor = np.abs(r)
     scale = float(np.median(factor))
-    found = _with_scale(f0, h0, scale, usable, width, offset, len(r), warnings)
-    return replace(found, spread=1.4826 * float(np.median(np.abs(factor / scale - 1.0))))
+    found = _with_scale(f0, h0, scale, usable=usable, width=width, offset=offset, pairs=len(r), warnings=warnings)
+    return replace(found, spread=mad_sigma(factor / scale - 1.0))
 
 
 def _with_scale(
-    f0: float, h0: float, scale: float, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
+    f0: float, h0: float, scale: float, *, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
 ) -> Calibration:
     """Attribute the scale to the lens where that gives a possible one, else to the height."""
     focal = f0 * scale

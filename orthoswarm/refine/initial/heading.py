@@ -123,6 +123,7 @@ def solve_headings(
 
 
 def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Array, c: float) -> Array:
+    """Gauss-Newton step of all headings, float64 (N,), with robust scale c."""
     count, pairs = len(yaw), len(graph)
     i, j = graph.first, graph.second
     turn_sigma = graph.turn_sigma
@@ -130,6 +131,7 @@ def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Arr
     finite = np.isfinite(course_sigma)
     sigma = np.where(finite, course_sigma, 1.0)
     absolute = np.where(finite, wrap_rad(course - yaw[i]) / sigma, 0.0)
+    # rows are multiplied by the square root of the Geman-McClure weight, on both sides
     w = np.concatenate([1.0 / (1.0 + relative**2 / c), finite / (1.0 + absolute**2 / c)])
     row = np.arange(pairs)
     pull = w[:pairs] / turn_sigma

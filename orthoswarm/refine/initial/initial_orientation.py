@@ -24,7 +24,7 @@ from orthoswarm.refine.initial.heading import (
     tag_heading,
     tag_yaw,
 )
-from orthoswarm.refine.initial.planar_network import NetworkPriors, solve_network
+from orthoswarm.refine.initial.planar_network import Network, NetworkPriors, solve_network
 from orthoswarm.refine.initial.planar_similarity import (
     Array,
     Complex,
@@ -108,11 +108,65 @@ def find_initial_orientation(
         pairs: verified matches.
         features: of each photo.
     """
-    config = active().initial
-    tilt_floor = float(np.radians(config.tilt_floor_deg))
     count, segments = len(records), int(records.segment.max()) + 1
     lens_of = np.asarray(first_of(records.segment, records.lens, segments), np.int32)
     matches = Matches.of(pairs, features)
+    solved = _solve(matches, records, lens_of)
+    network, shape = solved.network, solved.shape
+    focal = np.exp(shape.log_focal)
+    level = shape.level.copy()
+    for s in range(segments):
+        turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
+        level[records.segment == s] = turn @ level[records.segment == s]
+    vehicles = [
+        np.flatnonzero(solved.yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)
+    ]
+    tags = tuple(tag_heading(records, rows, solved.yaw) for rows in vehicles)
+    component = components(solved.graph, count)
+    metres = network.metres[records.segment] * solved.relative
+    return InitialOrientation(
+        position=network.position,
+        yaw=_fill_headings(records, solved.yaw, solved.yaw_known, component, tags),
+        level=level,
+        metres=metres,
+        height=metres * focal[records.lens],
+        focal=focal,
+        focal_sigma=shape.log_focal_sigma,
+        k1=shape.k1,
+        tilt_sigma=np.minimum(shape.tilt_sigma, network.offset_sigma / focal[lens_of]),
+        component=component,
+        pair_ok=network.pair_ok,
+        gps_ok=network.gps_ok,
+        gps_residual=network.gps_residual,
+        lag=network.lag,
+        yaw_known=solved.yaw_known,
+        scale_known=solved.scale_known,
+        recorded_focal=focal_by_height(records, solved.heights, network.metres, lens_of),
+        tags=tags,
+        graph=solved.graph,
+        misfit=shape.misfit,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """Results of the last round (see InitialOrientation); relative: float64 (N,), scale over the segment's."""
+
+    shape: TiltAndLens
+    graph: PairGraph
+    heights: RecordedHeights
+    relative: Array
+    yaw: Array
+    yaw_known: Flags
+    scale_known: Flags
+    network: Network
+
+
+def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
+    """Rounds of tilt and lens, relative scales, headings and network; lens_of: int32 (S,)."""
+    config = active().initial
+    tilt_floor = float(np.radians(config.tilt_floor_deg))
+    count = len(records)
     hint, hint_sigma = focal_by_hint(records)
     shape = _shape(matches, records, hint, hint_sigma)
     graph = similarities(matches, records, shape)
@@ -120,7 +174,7 @@ def find_initial_orientation(
     component = components(graph, count)
     yaw = chain_headings(graph, count)
     no_offset = np.zeros(count, np.complex128)
-    for round_ in range(config.rounds):
+    for round_ in range(max(config.rounds, 1)):
         focal = np.exp(shape.log_focal)
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
@@ -134,39 +188,10 @@ def find_initial_orientation(
             graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
         )
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
-        network = solve_network(
-            graph, records, yaw, _network_priors(records, heights, relative, metres, lens_of, tilt_px, by_height, focal)
-        )
+        priors = _network_priors(records, heights, relative, metres, lens_of, tilt_px, by_height)
+        network = solve_network(graph, records, yaw, priors)
         metres = network.metres
-    level = shape.level.copy()
-    for s in range(segments):
-        turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
-        level[records.segment == s] = turn @ level[records.segment == s]
-    vehicles = [np.flatnonzero(yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)]
-    tags = tuple(tag_heading(records, rows, yaw) for rows in vehicles)
-    each = metres[records.segment] * relative
-    return InitialOrientation(
-        position=network.position,
-        yaw=_fill_headings(records, yaw, yaw_known, component, tags),
-        level=level,
-        metres=each,
-        height=each * focal[records.lens],
-        focal=focal,
-        focal_sigma=shape.log_focal_sigma,
-        k1=shape.k1,
-        tilt_sigma=np.minimum(shape.tilt_sigma, network.offset_sigma / focal[lens_of]),
-        component=component,
-        pair_ok=network.pair_ok,
-        gps_ok=network.gps_ok,
-        gps_residual=network.gps_residual,
-        lag=network.lag,
-        yaw_known=yaw_known,
-        scale_known=scale_known,
-        recorded_focal=focal_by_height(records, heights, metres, lens_of),
-        tags=tags,
-        graph=graph,
-        misfit=shape.misfit,
-    )
+    return _Solved(shape, graph, heights, relative, yaw, yaw_known, scale_known, network)
 
 
 def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
@@ -201,12 +226,11 @@ def _network_priors(
     lens_of: Ints,
     tilt_px: Array,
     by_height: Array,
-    focal: Array,
 ) -> NetworkPriors:
     """Segments of one lens share its metres per pixel, scaled by their recorded heights where these are possible."""
     config = active().initial
     link, link_sigma = np.ones(len(metres)), np.full(len(metres), config.link_sigma)
-    for k in range(len(focal)):
+    for k in range(len(by_height)):
         rows = lens_of == k
         if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
             link[rows] = heights.segment[rows] / np.median(heights.segment[rows])

@@ -110,6 +110,7 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
     for c in config.scale_schedule:
         e = (zoom - (x[i] - x[j])) / sigma
         d = (prior - x) / prior_sigma
+        # square roots of the Geman-McClure weights: rows are multiplied by them on both sides
         w = 1.0 / ((1.0 + e * e / c) * sigma)
         v = 1.0 / ((1.0 + d * d / c) * prior_sigma)
         matrix = coo_matrix((np.r_[w, -w], (np.r_[k, k], np.r_[i, j])), shape=(len(inside), count)).tocsr()

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.robust import mad_sigma
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -43,7 +44,7 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
     known = np.flatnonzero(np.isfinite(value))
     v = value[known]
     if len(v) > 2:
-        noise = 1.4826 * float(np.median(np.abs(np.diff(v)))) / np.sqrt(2.0)
+        noise = mad_sigma(np.diff(v)) / np.sqrt(2.0)
         limit = max(limit, active().initial.segment_jump_sigmas * noise)
     level = 0
     for k in range(1, len(v)):
