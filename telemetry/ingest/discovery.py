@@ -15,7 +15,8 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
     | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
 )
-LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg"})
+LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"})
+_UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _SIDECARS = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
 
@@ -174,7 +175,7 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
     suffix = file.suffix.lower()
     folder = folders.get(file.parent) or Folder(file.parent, "")
     kinds = (
-        (PICTURE_SUFFIXES, folder.pictures),
+        (PICTURE_SUFFIXES | _UNREAD_PICTURES, folder.pictures),
         (VIDEO_SUFFIXES, folder.videos),
         (LOG_SUFFIXES, folder.logs),
         (_SUBTITLES, folder.subtitles),

@@ -15,6 +15,8 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.table.pose_row import PoseTable, lookup
+from telemetry.formats.video.sei import register
+from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
 from telemetry.ingest.photo_order import in_order
@@ -43,7 +45,7 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
         options: see LoadOptions.
 
     Raises:
-        InputError: an input does not exist or is of no known kind.
+        InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
     """
     found = survey(inputs, progress=progress, options=options)
     findings = [*found.findings, *(f for source in found.sources for f in source.findings)]
@@ -54,6 +56,8 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
     """The same as `load`, source by source, for `inspect`."""
     options = options or LoadOptions()
+    for layout in options.sei_layouts:
+        register(read_sei_layout(layout))
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(found.root, found)
     vehicles = {folder.path: folder.vehicle for folder in found.folders}

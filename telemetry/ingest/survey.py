@@ -28,6 +28,7 @@ class LoadOptions:
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.
         run: maps a function over items in processes, for many photos; None reads them in threads.
+        sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei_layout`.
         decode: False to look at the metadata of videos only, without taking pictures (for `inspect`).
     """
 
@@ -38,6 +39,7 @@ class LoadOptions:
     workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
     decode: bool = True
     run: Callable[..., Iterator[Any]] | None = None
+    sei_layouts: tuple[Path, ...] = ()
 
 
 @dataclass(slots=True)

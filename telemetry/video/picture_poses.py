@@ -76,6 +76,7 @@ class Poses:
         self.findings: list[Finding] = []
         cues = subtitles if subtitles is not None else found.cues
         self._add("KLV", self._klv_rows())
+        self._add("GPMF", [(t, s) for t, s in found.gpmf_samples if s.has_position])
         self._add("SRT", [(c.start_s, c.sample) for c in cues.cues if c.sample is not None and c.sample.has_position])
         self._note(cues)
 
@@ -239,6 +240,17 @@ class Poses:
 
     def _note(self, cues: srt.Subtitles) -> None:
         name = self._scan.path.name
+        sizes: dict[str, list[int]] = {}
+        for uuid, size in self._scan.unknown_sei:
+            sizes.setdefault(uuid, []).append(size)
+        for uuid, found in sizes.items():
+            count = sum(self._scan.unknown_sei[uuid, size] for size in found)
+            span = f"{min(found)}" if len(found) == 1 else f"{min(found)} to {max(found)}"
+            text = (
+                f"{plural(count, 'SEI message')} of {name} with UUID {uuid} and {span} bytes are not known; if they "
+                "hold poses, describe their layout with --sei-layout"
+            )
+            self.findings.append(Finding("sei-unknown", text, note=True))
         errors: dict[str, int] = {}
         for _, _, packet in self._scan.klv_packets:
             if packet.error:

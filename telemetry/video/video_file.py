@@ -4,13 +4,14 @@ One pass over the packets, without decoding, finds all metadata: SEI of each pic
 subtitle track. `telemetry.video.picture_poses` makes one pose for each picture of it.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from telemetry.formats.video import bitstream, djmd, klv, sei, srt
+from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
 from telemetry.samples.unreadable import Unreadable
@@ -47,7 +48,9 @@ class VideoScan:
         created_s: UTC epoch seconds of the container's creation time.
         pictures: one for each video packet, in order of the file.
         klv_packets: video time (None if unknown), number of video packets before it, packet.
-        djmd_samples: video time and sample. cues: of a subtitle track. damaged: packets that could not be read.
+        djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
+        damaged: packets that could not be read.
+        unknown_sei: how many private SEI messages of a UUID and a size nobody knows.
     """
 
     path: Path
@@ -59,8 +62,10 @@ class VideoScan:
     pictures: list[PictureNote] = field(default_factory=list)
     klv_packets: list[tuple[float | None, int, klv.Packet]] = field(default_factory=list)
     djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
+    gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
     cues: srt.Subtitles = field(default_factory=srt.Subtitles)
     damaged: int = 0
+    unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
 
     @property
     def sei_count(self) -> int:
@@ -166,7 +171,7 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
             if len(result.pictures) >= _MAX_PICTURES:
                 break
             seconds = None if packet.pts is None else float((packet.pts - start) * packet.time_base)
-            note = _note(bytes(packet), form, seconds)
+            note = _note(bytes(packet), form, seconds, result.unknown_sei)
             note.position = packet.pos
             result.pictures.append(note)
         elif packet.stream.type == "subtitle":
@@ -179,8 +184,12 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
         result.cues = srt.parse_cues(texts)
 
 
-def _note(data: bytes, form: bitstream.StreamFormat | None, seconds: float | None) -> PictureNote:
-    reading = None if form is None else sei.read(bitstream.sei_messages(data, form))
+def _note(
+    data: bytes, form: bitstream.StreamFormat | None, seconds: float | None, unknown: Counter[tuple[str, int]]
+) -> PictureNote:
+    messages = [] if form is None else bitstream.sei_messages(data, form)
+    reading = sei.read(messages)
+    unknown.update(sei.unknown(messages))
     if reading is None:
         return PictureNote(seconds)
     return PictureNote(seconds, reading.sample, reading.decoders)
@@ -194,7 +203,12 @@ def _subtitle_text(data: bytes) -> str:
 
 
 def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers: dict[int, bytes]) -> None:
-    """KLV (also where a set is spread over packets) or djmd, by content."""
+    """KLV (also where a set is spread over packets), djmd or GPMF, by content."""
+    if gpmf.is_gpmf(bytes(packet)):
+        samples, length = gpmf.read_gpmf(bytes(packet)), float((packet.duration or 0) * packet.time_base) or 1.0
+        if seconds is not None:
+            result.gpmf_samples += [(seconds + length * i / len(samples), s) for i, s in enumerate(samples)]
+        return
     data = leftovers.pop(packet.stream.index, b"") + bytes(packet)
     found = list(klv.packets(data))
     if found:

@@ -178,3 +178,19 @@ def test_flipped_bits_in_djmd_are_survived(data):
         raw[data.draw(st.integers(0, len(raw) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     sample = read_djmd(bytes(raw))
     assert sample is None or not sample.has_position or abs(sample.lat_deg) <= 90
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["HOME(8.0,47.0) 2017.08.05 14:11:51\nGPS(8.25,47.5,16) BAROMETER(91.2)", "GPS (8.25, 47.5, 16), D 9.0m, Hb:91.2"],
+)
+def test_heights_of_older_forms_are_read(text):
+    (cue,) = parse_srt(f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n").cues
+    assert cue.sample.height_m == 91.2
+
+
+def test_a_file_without_cue_times_is_placed_by_its_dates():
+    block = "{}\n2019-04-01 10:00:{:02d}.500\n[latitude: 47.5] [longitude: 8.25]\n"
+    cues = parse_srt("\n".join(block.format(i, 10 + 2 * i) for i in range(3))).cues
+    assert [cue.start_s for cue in cues] == [0.0, 2.0, 4.0]
+    assert all(cue.sample.lat_deg == 47.5 for cue in cues)

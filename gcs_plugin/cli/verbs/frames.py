@@ -20,6 +20,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
     add("--every-m", type=float, metavar="M", help="one picture every M metres (default: 4 %% of the height)")
     add("--every-s", type=float, metavar="S", help="one picture every S seconds")
+    add(
+        "--sei-layout", type=Path, action="append", default=[], metavar="FILE",
+        help="TOML file that describes a private SEI message (docs/telemetry.md)",
+    )  # fmt: skip
     add("--json", action="store_true", help="print what was written as one JSON document on stdout")
 
 
@@ -46,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=args.out, prefix=".taking-") as cache, ProgressBars() as progress:
-            options = LoadOptions(args.every_m, args.every_s, Path(cache), exclude=(args.out,))
+            layouts = tuple(args.sei_layout)
+            options = LoadOptions(args.every_m, args.every_s, Path(cache), exclude=(args.out,), sei_layouts=layouts)
             found = load(args.inputs, progress=progress, options=options)
             require_frames(found)
             taken: set[Path] = set()

@@ -18,6 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add("inputs", nargs="+", type=Path, metavar="INPUT", help="folders, photos, videos, logs")
+    add(
+        "--sei-layout", type=Path, action="append", default=[], metavar="FILE",
+        help="TOML file that describes a private SEI message (docs/telemetry.md)",
+    )  # fmt: skip
     add("--json", action="store_true", help="print one JSON document on stdout")
     add("--picture", type=Path, metavar="PNG", help="write a picture of the tracks")
     add("--no-pictures", action="store_true", help="look at tags only, do not match pictures to confirm the yaw")
@@ -36,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from telemetry.ingest.summary import summarise
 
     with ProgressBars() as progress:
-        found = survey(args.inputs, progress=progress, options=LoadOptions(decode=False))
+        options = LoadOptions(decode=False, sei_layouts=tuple(args.sei_layout))
+        found = survey(args.inputs, progress=progress, options=options)
         document = summarise(found, pictures=not args.no_pictures)
     if args.picture is not None:
         draw_tracks(found, args.picture)

@@ -1,4 +1,4 @@
-"""Flight logs: tlog (MAVLink with arrival times), ArduPilot's DataFlash .BIN, PX4's .ulg; poses and camera events.
+"""Flight logs: tlog, ArduPilot's DataFlash .BIN, PX4's .ulg, lists of exposures; poses and camera events.
 
 All give the same: samples over UTC and exposures in order. Readers take only the messages they need and survive
 truncation and damage: a bad record is skipped, the next good one found.
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from telemetry.formats.log.dataflash import read_dataflash
+from telemetry.formats.log.exposure_list import read_exposure_list
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
 from telemetry.formats.log.mavlink_poses import TYPES, CameraEvent, MavlinkPoses
 from telemetry.formats.log.ulog import read_ulog
@@ -32,10 +33,12 @@ def read_log(path: Path) -> list[FlightLog]:
         ".tlog": read_tlog,
         ".bin": lambda p: [read_dataflash(p)],
         ".ulg": lambda p: [read_ulog(p)],
+        ".pos": lambda p: [read_exposure_list(p)],
+        ".mrk": lambda p: [read_exposure_list(p)],
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg)")
+        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg, .pos, .MRK)")
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")

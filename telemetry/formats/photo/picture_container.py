@@ -20,6 +20,9 @@ _MAX_SEGMENTS = 4096
 _START_OF_FRAME = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 
 
+_HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"heim", b"heis"})
+
+
 class NotAPicture(Unreadable):
     """A file with a picture's suffix is none or is damaged; the text is one sentence for the user."""
 
@@ -86,6 +89,8 @@ def _by_content(fd: int, head: bytes, size: int) -> Container:
     if head[:2] == b"BM" and len(head) >= 26:
         width, height = struct.unpack_from("<ii", head, 18)
         return Container("bmp", abs(width), abs(height), exif.Exif())
+    if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
+        raise NotAPicture("HEIC and AVIF pictures cannot be read here; convert them to JPEG, which keeps their tags")
     raise NotAPicture("the content is no picture that can be read (JPEG, PNG, TIFF, WebP, BMP); leave the file out")
 
 

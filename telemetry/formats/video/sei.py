@@ -121,6 +121,25 @@ def read(messages: Iterable[tuple[int, bytes]]) -> Reading | None:
     return None if merged is None else Reading(merged, tuple(names))
 
 
+_ENCODER_SETTINGS = frozenset(
+    {
+        bytes.fromhex("dc45e9bde6d948b7962cd820d923eeef"),  # x264
+        bytes.fromhex("2ca2de09b51747dbbb55a4fe7fc2fc4e"),  # x265
+    }
+)
+
+
+def unknown(messages: Iterable[tuple[int, bytes]]) -> list[tuple[str, int]]:
+    """UUID and payload size of each private message that no decoder knows; an encoder's settings are none."""
+    found = []
+    for kind, payload in messages:
+        if kind == USER_DATA_UNREGISTERED and len(payload) >= 16 and payload[:16] not in _ENCODER_SETTINGS:
+            decoder, _ = _find(kind, payload)
+            if decoder is None:
+                found.append((payload[:16].hex(), len(payload) - 16))
+    return found
+
+
 def _find(kind: int, payload: bytes) -> tuple[Decoder | None, bytes]:
     if kind != USER_DATA_UNREGISTERED:
         return _REGISTRY.get((kind, None)), payload

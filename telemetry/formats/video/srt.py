@@ -32,8 +32,8 @@ _NUMBER = r"\s*([+-]?\d+(?:\.\d+)?)"
 _TUPLE = re.compile(rf"GPS\s*\({_NUMBER}\s*,{_NUMBER}\s*(?:,{_NUMBER}\s*(M?))?[^)]{{0,16}}\)", re.IGNORECASE)
 _HOME = re.compile(rf"HOME\s*\({_NUMBER}\s*,{_NUMBER}")
 _DISTANCE = re.compile(rf"\bD{_NUMBER}\s*m\b")
-_HEIGHT = re.compile(rf"\bH{_NUMBER}\s*m\b")
-_BAROMETER = re.compile(rf"BAROMETER\s*:{_NUMBER}")
+_HEIGHT = re.compile(rf"\b(?:H{_NUMBER}\s*m\b|Hb\s*:{_NUMBER})")
+_BAROMETER = re.compile(rf"BAROMETER\s*(?::{_NUMBER}|\({_NUMBER}\s*M?\))", re.IGNORECASE)
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
 _FLIGHT = re.compile(rf"\bF\.PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
 _DATE = re.compile(r"\d{4}[-./]\d{2}[-./]\d{2}[ T]\d{1,2}:\d{2}:\d{2}(?:[.,]\d{1,6}(?:[.,]\d{1,3})?)?")
@@ -94,12 +94,25 @@ def parse_cues(texts: list[tuple[float, float, str]]) -> Subtitles:
 
 def _blocks(text: str) -> Iterator[_Raw]:
     cues = list(_CUE.finditer(text))
+    if not cues:
+        yield from _undated_blocks(text)
     for i, cue in enumerate(cues):
         end = cues[i + 1].start() if i + 1 < len(cues) else len(text)
         h, m, s, ms, h2, m2, s2, ms2 = (int(g) for g in cue.groups())
         start_s = h * 3600 + m * 60 + s + ms / 1000.0
         end_s = h2 * 3600 + m2 * 60 + s2 + ms2 / 1000.0
         yield _Raw(start_s, max(end_s, start_s), text[cue.end() : min(end, cue.end() + _MAX_BLOCK)])
+
+
+def _undated_blocks(text: str) -> Iterator[_Raw]:
+    """Blocks of a file without cue times: placed by the dates in them, from the first one on."""
+    first: float | None = None
+    for block in re.split(r"\n\s*\n", text.replace("\r", "")):
+        date = _DATE.search(block)
+        moment = None if date is None else _local_time(date[0])
+        if moment is not None:
+            first = moment if first is None else first
+            yield _Raw(moment - first, moment - first, block[:_MAX_BLOCK])
 
 
 def _read(blocks: list[_Raw]) -> Subtitles:
@@ -150,7 +163,7 @@ def _sample(text: str, latitude_first: bool | None) -> Sample | None:
         sample.lat_deg, sample.lon_deg = (a, b) if latitude_first else (b, a)
     height = _HEIGHT.search(text) or _BAROMETER.search(text)
     if height is not None:
-        sample.height_m = float(height[1])
+        sample.height_m = float(height[1] or height[2])
     gimbal, flight = _GIMBAL.search(text), _FLIGHT.search(text)
     if gimbal is not None:
         sample.pitch_deg, sample.roll_deg, sample.yaw_deg = (float(gimbal[i]) for i in (1, 2, 3))
