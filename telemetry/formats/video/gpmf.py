@@ -1,7 +1,7 @@
 """GoPro's metadata track (GPMF) in MP4: positions of GPS5 and GPS9.
 
 Nested entries: four letters, type, size of a structure, number of structures (big-endian), values padded to four bytes;
-type 0 holds entries. SCAL divides the values that follow it in its stream. GPS5: latitude, longitude, altitude (mean sea
+type 0 holds entries. SCAL divides the values that follow in its stream. GPS5: latitude, longitude, altitude (mean sea
 level; above the ellipsoid before HERO9), speed over ground and in space; GPSU is the UTC of its packet, GPSF the fix.
 GPS9 adds days since 2000, seconds of the day, precision and fix to each sample. Source: GoPro's gpmf-parser, README.
 """
