@@ -23,7 +23,7 @@ class _Entry(NamedTuple):
     key: bytes
     kind: int
     size: int
-    count: int
+    rows: int
     value: bytes
 
 
