@@ -1,4 +1,4 @@
-"""Which legs of a flight are over while the vehicle still flies: what comes later does not change them any more."""
+"""Legs of a flight that are complete while the vehicle still flies: later pictures do not change them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,8 @@ from orthoswarm.model.legs import REACH, split_legs
 
 Array = NDArray[np.float64]
 
-SETTLED = 2 * REACH
-"""Frames after a leg's end from which on neither its corner nor its frames can change."""
+FINAL_AFTER_FRAMES = 2 * REACH
+"""So many frames after a leg's end neither its corner nor its frames can change; follows from `split_legs`."""
 
 
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
@@ -27,6 +27,6 @@ def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = Fal
     for k in range(int(leg.max()) + 1):
         members = np.flatnonzero(leg == k)
         last = int(members[-1])
-        if over or last + SETTLED < n:
+        if over or last + FINAL_AFTER_FRAMES < n:
             ends.append((int(members[0]), last))
     return ends

@@ -1,9 +1,10 @@
-"""What the pictures found about the records, in plain words, and why a photo could not be placed."""
+"""Messages for the report: where pictures contradict the records, and why a photo could not be placed."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
@@ -11,17 +12,6 @@ from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.initial.heading import tag_yaw
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecords
-
-_FLIP = float(np.radians(150.0))
-_HEADING_OFFSET_DEG = 5.0
-_TILT_DEG = 2.0
-_ONE_WAY = 0.9
-"""Length of the mean of headings from which on a tilt cannot be told from a slope of the ground."""
-_SLOPE_DEG = 6.0
-_OBLIQUE_DEG = 35.0
-_HEIGHT_SHARE, _HEIGHT_SIGMAS = 0.15, 4.0
-_LAG_M = 1.0
-_LISTED = 3
 
 
 def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
@@ -31,12 +21,12 @@ def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
         if tag.source:
             rows = (records.vehicle == v) & start.yaw_known
             off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
-            flipped |= rows & (np.nan_to_num(off) > _FLIP)
+            flipped |= rows & (np.nan_to_num(off) > np.radians(active().flight.flipped_yaw_deg))
     return flipped
 
 
 def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
-    """Sentences on everything in the records that the pictures contradict, but heights: those are told in the end."""
+    """Sentences on all records that the pictures contradict, except heights (see `height_findings`)."""
     found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
     found += _position_findings(frames, records, start)
     found += _overlap_findings(records, start)
@@ -46,13 +36,13 @@ def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrien
 def unplaced_reasons(
     frames: Sequence[Frame], records: PhotoRecords, placed: Flags, damaged: Mapping[int, str]
 ) -> dict[int, str]:
-    """Why photos that no other holds could not be placed by pictures."""
+    """Why photos without tie points to others could not be placed by pictures."""
     reasons = dict(damaged)
     for k in np.flatnonzero(~placed).tolist():
         tilt = float(np.degrees(records.pitch[k])) + 90.0
         if k in reasons:
             continue
-        if tilt > _OBLIQUE_DEG:
+        if tilt > active().flight.oblique_deg:
             reasons[k] = f"{frames[k].image} looks {tilt:.0f} degrees off nadir and matches no other photo"
         else:
             reasons[k] = f"{frames[k].image} matches no other photo; it is placed by its tags alone"
@@ -61,13 +51,14 @@ def unplaced_reasons(
 
 def runs(names: Sequence[str], flags: Flags) -> str:
     """Runs of flagged photos as text: "A to C, F"."""
+    most = active().flight.named_most
     edge = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
     parts = [
         names[int(a)] if a == b else f"{names[int(a)]} to {names[int(b)]}" for a, b in zip(first, last, strict=True)
     ]
-    text = ", ".join(parts[:_LISTED])
-    return text if len(parts) <= _LISTED else f"{text} and {len(parts) - _LISTED} more runs"
+    text = ", ".join(parts[:most])
+    return text if len(parts) <= most else f"{text} and {len(parts) - most} more runs"
 
 
 def _name(frames: Sequence[Frame], records: PhotoRecords, vehicle: int) -> str:
@@ -85,7 +76,7 @@ def _yaw_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initial
         who = _name(frames, records, v)
         if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
             found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
-        elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
+        elif tag.source and abs(np.degrees(tag.offset)) > active().flight.heading_offset_deg:
             found.append(f"{who}: recorded headings are {-np.degrees(tag.offset):+.0f} degrees off, put right")
         elif tag.source == "flight_yaw" and np.isfinite(records.yaw[rows]).any():
             found.append(f"{who}: the pictures follow the airframe's heading, not the recorded camera yaw")
@@ -99,6 +90,7 @@ def tilt_of(level: Array) -> Array:
 
 def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     found = []
+    c = active().flight
     tagged = records.tag_level()
     between = np.degrees(tilt_of(np.asarray(start.level @ np.swapaxes(tagged, 1, 2))))
     for v in range(len(start.tags)):
@@ -106,8 +98,8 @@ def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initia
         sigma = np.degrees(start.tilt_sigma[records.segment[rows]].max())
         off, seen = float(np.median(between[rows])), float(np.degrees(np.median(tilt_of(start.level[rows]))))
         who = _name(frames, records, v)
-        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY
-        if off < max(_SLOPE_DEG if one_way else _TILT_DEG, 3.0 * sigma):
+        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > c.one_way_length
+        if off < max(c.slope_deg if one_way else c.tilt_difference_deg, c.tilt_difference_sigmas * sigma):
             continue
         tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))
         if not np.isfinite(records.pitch[rows]).any():
@@ -124,12 +116,13 @@ def height_findings(
 ) -> list[str]:
     """Sentences on recorded heights that the adjusted pictures contradict, and on heights that are not recorded.
 
-    Metres per pixel come from the way flown, so that a height is known as well as the focal length.
+    Metres per pixel come from the distance flown, so a height is known as well as the focal length.
 
     Args:
         frames: N photos. records: what they recorded. start: from the pairs.
         adjustment: of all of them, without a map.
     """
+    c = active().flight
     found, without = [], []
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
     height = adjustment.cameras.position[:, 2] - ground
@@ -144,11 +137,13 @@ def height_findings(
             without.append((who, seen))
             continue
         said = float(np.nanmedian(recorded))
-        limit = max(_HEIGHT_SHARE, _HEIGHT_SIGMAS * float(doubt[rows][0]))
-        if said <= 2.0 or abs(np.log(max(seen, 1.0) / said)) > limit:
+        limit = max(c.height_difference_share, c.height_difference_sigmas * float(doubt[rows][0]))
+        if said <= c.least_height_m or abs(np.log(max(seen, 1.0) / said)) > limit:
             found.append(contradiction(who, said, seen))
     if without:
-        names = ", ".join(who for who, _ in without[:_LISTED]) + (" and others" if len(without) > _LISTED else "")
+        names = ", ".join(who for who, _ in without[: c.named_most]) + (
+            " and others" if len(without) > c.named_most else ""
+        )
         seen = float(np.median([height for _, height in without]))
         found.append(f"{names}: no height is recorded; {seen:.0f} m come from metres per pixel")
     return found
@@ -169,8 +164,8 @@ def _position_findings(frames: Sequence[Frame], records: PhotoRecords, start: In
     speed = np.abs(records.velocity())
     for v, lag in enumerate(start.lag.tolist()):
         rows = records.vehicle == v
-        moving = speed[rows & (speed > 0.3)]
-        if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
+        moving = speed[rows & (speed > active().flight.lag_least_speed_m_s)]
+        if len(moving) and abs(lag) * float(np.median(moving)) > active().flight.lag_m:
             who = _name(frames, records, v)
             found.append(f"{who}: recorded positions lag by {lag:.1f} s")
     return found

@@ -1,4 +1,4 @@
-"""One vehicle's dense flight up to the map: records, calibration, tracks, relative adjustment (RECIPE.md 1 to 3)."""
+"""One vehicle's flight of overlapping pictures: records, calibration, tracks, start of the adjustment without map."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,32 +24,17 @@ from orthoswarm.refine.features.tracks import follow, predicted_homography
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-STRONG_K1 = 0.12
-FEW = 100
-"""Flights of fewer pictures are followed at four times as many corners."""
-FEWEST = 10
-FOLLOWED_OVERLAP = 0.78
-"""Fewer pictures, or less forward overlap, are matched in pairs instead of being followed."""
-UNBROKEN = 0.3
-"""Share of tracks that survive into each picture of an unbroken chain. Photos without a height mostly have no angles
-either, and what lies behind a break is then held by positions alone."""
-HEIGHT_SIGMA_M = (0.1, 2.0)
-ATTITUDE_SIGMA_RAD = (np.radians(0.05), np.radians(3.0))
-"""Least and greatest sigma that recorded heights and attitudes are given after a look at their noise."""
-HEIGHT_BEGIN_M, LEAP_M = 0.5, 5.0
-"""Sigma of a recorded height to begin with, and how far one must leave those around it not to be taken as it is."""
-
 
 @dataclass(slots=True)
 class Flight:
-    """A vehicle's frames with everything that was found out about them so far.
+    """A vehicle's frames and what is known of them so far.
 
     Attributes:
         frames: in order. records: what they recorded (headings already corrected). leg: int32 (N,).
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
         survived: float64 (N,), share of tracks that survived into each picture.
-        warnings: findings in plain words. sparse: True where photos were matched in pairs, not followed.
-        focal_sigma: relative one sigma of a lens found together with other vehicles and held since (else 0).
+        warnings: for the report. sparse: True where photos were matched in pairs, not followed.
+        focal_sigma: relative sigma of a focal length found together with other vehicles and held since (else 0).
     """
 
     frames: Sequence[Frame]
@@ -78,13 +63,14 @@ class Flight:
 def open_flight(
     frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: Callable[[Frame], Gray], fov_start: float
 ) -> Flight | None:
-    """Track a vehicle's pictures and set up its adjustment; nothing is solved yet.
+    """Follow a vehicle's pictures and set up its adjustment; nothing is solved yet.
 
     None where the pictures cannot be followed from one to the next (those are matched in pairs instead, see
-    `sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a chain
-    that breaks and a single straight way, on which drift and scale stand for each other.
+    `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a
+    chain that breaks or a single straight way, on which drift and scale cannot be separated.
     """
-    if len(frames) < FEWEST:
+    c = active().flight
+    if len(frames) < c.followed_photos:
         return None
     records = read_records(frames, grid, origin)
     leg = split_legs(records.position, records.time_s if records.timed else None)
@@ -92,35 +78,36 @@ def open_flight(
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
     flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
-    if calibration.pairs < 3 or flow > 1.0 - FOLLOWED_OVERLAP:
+    if calibration.pairs < c.followed_calibration_pairs or flow > 1.0 - c.followed_overlap:
         return None
     unknown = not records.has_height.any()
     if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
     records = records.with_yaw(records.yaw + calibration.yaw_offset)
     tracks, survived = _track(records, pictures, calibration)
-    if np.median(survived[1:]) < 0.5 or tracks.count < 3 * len(frames) ** 0.5:
+    if np.median(survived[1:]) < c.followed_survival or tracks.count < c.followed_tracks_factor * len(frames) ** 0.5:
         return None
-    if unknown and survived[1:].min() < UNBROKEN:
+    if unknown and survived[1:].min() < c.unbroken_survival:
         return None
     adjustment = _begin(records, pictures, calibration, tracks)
     return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))
 
 
 def weigh_records(flight: Flight) -> None:
-    """Give heights and attitudes the sigmas that they show: pictures tell well how one differs from the next.
+    """Estimate the sigmas of recorded heights and attitudes from how adjusted cameras differ from one to the next.
 
-    Positions that scatter more than theirs say get larger ones, too. Heights that were doubtful to begin with stay so.
+    Positions that scatter more than their sigmas say get larger ones, too. Heights doubtful from the start stay so.
     """
+    c = active().flight
     adj = flight.adjustment
     p = adj.priors
     height = adj.cameras.position[:, 2] - p.position[:, 2]
     attitude = log_rotation(np.swapaxes(p.rotation, 1, 2) @ adj.cameras.rotation)
-    z = float(np.clip(_jitter(height[:, None])[0], *HEIGHT_SIGMA_M))
-    turn = np.clip(_jitter(attitude), *ATTITUDE_SIGMA_RAD)
+    z = float(np.clip(_step_sigma(height[:, None])[0], *c.height_sigma_range_m))
+    turn = np.clip(_step_sigma(attitude), *np.radians(c.attitude_sigma_range_deg))
     sigma = p.position_sigma.copy()
     if flight.calibration.trusted_height:
-        sigma[:, 2] = np.where(sigma[:, 2] > HEIGHT_BEGIN_M, sigma[:, 2], z)
+        sigma[:, 2] = np.where(sigma[:, 2] > c.first_height_sigma_m, sigma[:, 2], z)
     off = adj.position_residuals()[:, :2] / np.maximum(sigma[:, :2], 1e-9)
     sigma[:, :2] *= max(1.0, 1.4826 * float(np.median(np.abs(off))))
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
@@ -129,11 +116,11 @@ def weigh_records(flight: Flight) -> None:
 
 def distorts_strongly(flight: Flight) -> bool:
     """True if the lens distorts so much that two parameters do not describe it."""
-    return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= STRONG_K1)
+    return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= active().flight.strong_k1)
 
 
 def free_full_lens(flight: Flight) -> bool:
-    """Give a strongly distorting lens all its parameters; a weak one keeps two, which is better held.
+    """Solve a strongly distorting lens in full; others keep two parameters, which are better determined.
 
     Returns:
         True if more parameters are free now (some more steps are due).
@@ -141,13 +128,14 @@ def free_full_lens(flight: Flight) -> bool:
     adj = flight.adjustment
     if not distorts_strongly(flight):
         return False
-    width = flight.pictures.size[0]
-    sigma = np.tile([0.3, 0.3, 0.2, 0.3, 0.012 * width, 0.012 * width], (len(adj.cameras.lens), 1))
+    c = active().flight
+    centre_px = c.principal_point_share * flight.pictures.size[0]
+    sigma = np.tile([*c.strong_lens_sigma, centre_px, centre_px], (len(adj.cameras.lens), 1))
     adj.priors = replace(adj.priors, lens_sigma=sigma)
     return True
 
 
-def _jitter(values: Array) -> Array:
+def _step_sigma(values: Array) -> Array:
     """Robust sigma of each column of a sequence's noise from one picture to the next."""
     step = np.diff(values, axis=0)
     return np.asarray(1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0) / np.sqrt(2.0))
@@ -158,7 +146,8 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
     width, height = pictures.size
     f = calibration.focal_px
     matrix = np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
-    reach = 0.8 * height / f * calibration.height_m
+    c = active().flight
+    reach = c.predicted_step_share * height / f * calibration.height_m
 
     def prediction(i: int) -> Array | None:
         if i == 0 or np.hypot(*steps[i, :2]) > reach:
@@ -166,12 +155,13 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
         step = np.array([steps[i, 0], steps[i, 1], 0.0])
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
+    few = len(rotation) < c.few_photos
     cell_px = active().features.cell_px
-    few = len(rotation) < FEW
     return follow(len(rotation), pictures.gray, prediction, cell_px=cell_px // 2 if few else cell_px)
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
+    c = active().flight
     n = len(records.position)
     width, height = pictures.size
     position = records.position.copy()
@@ -179,17 +169,15 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
-    horizontal = np.where(
-        np.isfinite(records.position_sigma),
-        np.maximum(records.position_sigma, 0.02),
-        active().records.position_sigma_m,
-    )
-    tilt = np.where(records.has_tilt, np.radians(0.2), np.radians(3.0))
-    yaw = np.where(records.has_yaw, np.radians(0.2), np.radians(5.0))
+    stated = np.maximum(records.position_sigma, c.stated_position_floor_m)
+    horizontal = np.where(np.isfinite(records.position_sigma), stated, active().records.position_sigma_m)
+    tilt = np.where(records.has_tilt, np.radians(c.tilt_sigma_deg), np.radians(c.free_tilt_sigma_deg))
+    yaw = np.where(records.has_yaw, np.radians(c.yaw_sigma_deg), np.radians(c.free_yaw_sigma_deg))
+    usual = active().bundle
     model = GroupPriors(
-        height_sigma=1.0 if calibration.trusted_height else active().bundle.unknown_height_sigma_m,
-        lag_sigma=0.5 if records.timed else 0.3,
-        drift_sigma=15.0 if not np.isfinite(records.position_sigma).all() else 0.0,
+        height_sigma=usual.height_offset_sigma_m if calibration.trusted_height else usual.unknown_height_sigma_m,
+        lag_sigma=active().records.lag_sigma_s if records.timed else c.untimed_lag_sigma_s,
+        drift_sigma=usual.drift_sigma_m if not np.isfinite(records.position_sigma).all() else 0.0,
     )
     priors = Priors(
         position,
@@ -200,7 +188,7 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
         np.zeros(n, np.int32),
         (model,),
         np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
-        np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
+        np.array([[*c.lens_sigma, 0, 0, 0]]),
     )
     return Adjustment.begin(cameras, tracks, priors, first_points(cameras, tracks))
 
@@ -220,13 +208,15 @@ def _height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arr
     A height that leaves those around it may be a spike, or the climb after the takeoff: the height of the others is
     as good a guess, as doubtful as they differ, and the pictures tell which it is.
     """
+    c = active().flight
     z = records.position[:, 2]
     if not calibration.trusted_height:
-        return np.full(len(z), calibration.height_m), np.full(len(z), HEIGHT_BEGIN_M)
-    smooth = np.array([np.median(z[max(0, i - 3) : i + 4]) for i in range(len(z))])
+        return np.full(len(z), calibration.height_m), np.full(len(z), c.first_height_sigma_m)
+    reach = c.height_reach_photos
+    smooth = np.array([np.median(z[max(0, i - reach) : i + reach + 1]) for i in range(len(z))])
     off = np.abs(z - smooth)
-    leaps = off > LEAP_M
-    return np.where(leaps, smooth, z), np.where(leaps, off, HEIGHT_BEGIN_M)
+    leaps = off > c.height_leap_m
+    return np.where(leaps, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
 
 
 def fov_deg(flight: Flight) -> float:

@@ -6,18 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import Solution
-
-LONGEST_UNIT = 600
-"""Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded."""
-_SMALL_PART = 6
 
 
 def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
     """Frames of one vehicle, camera and size each, in order; a zoom change or a turned camera starts a new lens.
 
-    Handfuls of frames with another camera string but the same size stay with the vehicle's main camera.
+    A few frames with another camera name but the same size stay with the vehicle's main camera.
     """
     units: list[list[Frame]] = []
     for frames in vehicles.values():
@@ -25,7 +22,7 @@ def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
         for frame in frames:
             groups.setdefault((frame.camera, frame.width, frame.height), []).append(frame)
         for group in _absorb(groups):
-            parts = max(1, int(np.ceil(len(group) / LONGEST_UNIT)))
+            parts = max(1, int(np.ceil(len(group) / active().flight.longest_unit_photos)))
             units += [list(part) for part in _even(group, parts)]
     return units
 
@@ -38,7 +35,7 @@ def _absorb(groups: dict[tuple[str, int, int], list[Frame]]) -> list[list[Frame]
     for keys in by_size.values():
         main = max(keys, key=lambda k: len(groups[k]))
         for key in keys:
-            if key != main and len(groups[key]) < _SMALL_PART:
+            if key != main and len(groups[key]) < active().flight.own_unit_photos:
                 groups[main] = _in_order([*groups[main], *groups.pop(key)])
         out += [groups[k] for k in keys if k in groups]
     return out

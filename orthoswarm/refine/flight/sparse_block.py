@@ -1,4 +1,4 @@
-"""A vehicle's sparse photos as a Flight, adjusted without a map, for the same later steps as a dense one."""
+"""A vehicle's sparse photos as a Flight, adjusted without a map, for the same later steps as a followed one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -34,7 +35,7 @@ def open_sparse_flight(
 ) -> Flight:
     """Match a vehicle's photos with each other and adjust them without a map.
 
-    The counterpart of `flight.open_flight` for photos that cannot be followed, with the adjustment already solved.
+    The counterpart of `open_flight` for photos that cannot be followed, with the adjustment already solved.
 
     Args:
         frames: of one vehicle and one lens, in order of time.
@@ -47,9 +48,12 @@ def open_sparse_flight(
     frames = [replace(frame, camera=frames[0].camera) for frame in frames]
     start = sparse_start(frames, read_photo_records(frames, grid, origin), read, run, progress)
     adjustment = solve_sparse(start)
-    believed = trusted_heights(adjustment, start)
+    trusted = trusted_heights(adjustment, start)
     warnings = [*start.warnings, *height_findings(frames, start.records, start.plane, adjustment)]
-    return make_flight(frames, grid, origin, read, start, np.arange(len(frames)), adjustment, believed, warnings)
+    return make_flight(
+        frames, grid, origin, read, start=start, rows=np.arange(len(frames)), adjustment=adjustment,
+        trusted_height=trusted, warnings=warnings,
+    )  # fmt: skip
 
 
 def make_flight(
@@ -57,10 +61,11 @@ def make_flight(
     grid: LocalGrid,
     origin: Array,
     read: ReadGray,
+    *,
     start: SparseStart,
     rows: NDArray[np.int64],
     adjustment: Adjustment,
-    believed: NDArray[np.bool_],
+    trusted_height: NDArray[np.bool_],
     warnings: Sequence[str],
     focal_sigma: float = 0.0,
 ) -> Flight:
@@ -74,8 +79,8 @@ def make_flight(
         start: of all photos that were matched together.
         rows: which of them are the vehicle's.
         adjustment: of the vehicle's photos alone, in pixels of the full pictures.
-        believed: bool, of all photos, whose recorded heights were believed to the end.
-        warnings: findings to be told with this vehicle.
+        trusted_height: bool, of all photos, those whose recorded heights the adjustment used to the end.
+        warnings: for the report of this vehicle.
         focal_sigma: of a lens that was found together with others, see `Flight`.
     """
     records = flight_records.read_records(frames, grid, origin)
@@ -89,7 +94,7 @@ def make_flight(
         float(adjustment.cameras.lens[0, F]),
         float(np.median(heights_above_ground(adjustment))),
         wrap_rad(yaw - records.yaw),
-        bool(believed[rows].any()),
+        bool(trusted_height[rows].any()),
         start.pairs[1],
         mine,
     )
@@ -116,5 +121,9 @@ def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]
     out.common[:] = adjustment.common
     common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
     common_lens[:, 4:] /= step
-    out.step(9.0, datum_prior(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0))
+    # a step computes the weights and normal equations of the new adjustment
+    out.step(
+        active().flight.sparse_stage_c[-1],
+        datum_prior(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0),
+    )
     return out

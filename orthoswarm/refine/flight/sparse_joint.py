@@ -1,8 +1,8 @@
 """Sparse photos of several vehicles matched and adjusted together, then taken apart into flights.
 
-Each vehicle alone would leave its own scale, tilt and drift: seams between legs and vehicles close only if the photos
-on both sides of them are adjusted together. Cameras that go by the same name share a lens until all else is found; then
-each vehicle has its own, close to the common one.
+Each vehicle alone would have its own scale, tilt and drift: legs and vehicles fit each other only if the photos on both
+sides are adjusted together. Cameras of the same name share a lens until all else is found; then each vehicle has its
+own, close to the common one.
 """
 
 from collections.abc import Sequence
@@ -11,11 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.refine.bundle.adjustment import Adjustment
-from orthoswarm.refine.bundle.block_arrays import Tracks
+from orthoswarm.refine.bundle.block_arrays import WIDTH, Tracks
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.flight.record_findings import height_findings
@@ -25,19 +26,6 @@ from orthoswarm.refine.flight.sparse_block import make_flight, open_sparse_fligh
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import Progress, ReadGray
 from orthoswarm.refine.initial.planar_similarity import Array
-
-_MOST_LENSES = 16
-_OWN_LENS_STEPS = 4
-_OWN_LENS_SIGMA = (0.01, 0.01, 0.01, 0.05)
-"""Of log f, k1, k2, k3 about the common lens."""
-_OWN_CENTRE_SHARE = 0.004
-_HELD_POSITION_M = 0.3
-_HELD_ATTITUDE = float(np.radians(0.3))
-_HELD_LENS = 0.003
-_MOVABLE = GroupPriors(
-    bias_sigma=(_HELD_ATTITUDE, _HELD_ATTITUDE, _HELD_ATTITUDE), height_sigma=1.0, lag_sigma=0.0, drift_sigma=15.0,
-    drift_bend=0.5, knot_every=60,
-)  # fmt: skip
 
 
 def open_sparse_flights(
@@ -69,53 +57,60 @@ def open_sparse_flights(
     records = read_photo_records(frames, grid, origin, share_lenses=True)
     start = sparse_start(frames, records, read, run, progress)
     adjustment = solve_sparse(start)
-    believed = trusted_heights(adjustment, start)
+    trusted = trusted_heights(adjustment, start)
     focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
-    if int(records.vehicle.max()) < _MOST_LENSES:
+    if int(records.vehicle.max()) < active().flight.joint_most_vehicles:
         adjustment = own_lenses(adjustment, start)
         focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
     found = height_findings(frames, start.records, start.plane, adjustment)
-    told = _by_unit([*start.warnings, *found], [part[0].vehicle for part in units])
+    by_unit = _by_unit([*start.warnings, *found], [part[0].vehicle for part in units])
     flights, first = [], 0
-    for part, warnings in zip(units, told, strict=True):
+    for part, warnings in zip(units, by_unit, strict=True):
         rows = np.arange(first, first + len(part))
         first += len(part)
         alone = _extract_block(adjustment, start, rows)
         sigma = float(focal_sigma[rows[0]])
-        flights.append(make_flight(part, grid, origin, read, start, rows, alone, believed, warnings, sigma))
+        flights.append(
+            make_flight(
+                part, grid, origin, read, start=start, rows=rows, adjustment=alone, trusted_height=trusted,
+                warnings=warnings, focal_sigma=sigma,
+            )
+        )  # fmt: skip
     return flights
 
 
 def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
-    """Findings by unit; those that concern several go with the first one."""
-    told: list[list[str]] = [[] for _ in names]
+    """Warnings by unit; those that concern several go with the first one."""
+    by_unit: list[list[str]] = [[] for _ in names]
     for text in warnings:
         own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
-        told[own[0] if own else 0].append(text)
-    return told
+        by_unit[own[0] if own else 0].append(text)
+    return by_unit
 
 
 def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
     """Let every vehicle have its own lens, close to the one that it shared, and adjust on."""
+    c = active().flight
     vehicle = start.records.vehicle
     first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
     lens = adjustment.cameras.lens[adjustment.cameras.lens_id[first]].copy()
     p = adjustment.priors
     sigma = np.empty((len(lens), 6))
-    sigma[:, :4] = _OWN_LENS_SIGMA
-    sigma[:, 4:] = _OWN_CENTRE_SHARE * lens[:, 6:7]
+    sigma[:, :4] = c.joint_lens_sigma
+    sigma[:, 4:] = c.joint_principal_point_share * lens[:, 6:7]
     sigma[p.lens_sigma[adjustment.cameras.lens_id[first]] == 0] = 0.0
     cameras = replace(adjustment.cameras, lens=lens, lens_id=vehicle.astype(np.int32))
     priors = replace(p, lens=np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]]), lens_sigma=sigma)
     own = Adjustment.begin(cameras, adjustment.tracks, priors, adjustment.points)
     own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
-    for _ in range(_OWN_LENS_STEPS):
-        own.step(9.0, datum_prior(own))
+    for _ in range(c.joint_lens_steps):
+        own.step(c.joint_lens_c, datum_prior(own))
     return own
 
 
 def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
     """The adjustment of some photos by themselves, as found together with all others."""
+    c = active().flight
     local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)
     t = adjustment.tracks
@@ -129,17 +124,18 @@ def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.
     cameras = replace(cameras, lens=cameras.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
     lens = np.concatenate([[np.log(cameras.lens[0, 0])], cameras.lens[0, 1:6]])[None]
     free = adjustment.priors.lens_sigma[lens_row] > 0
+    width = cameras.lens[0, WIDTH]
+    held = c.held_lens_sigma * np.array([1, 1, 1, 1, width, width])
+    attitude = float(np.radians(c.held_attitude_sigma_deg))
     priors = Priors(
         position=cameras.position.copy(),
-        position_sigma=np.full((len(rows), 3), _HELD_POSITION_M),
+        position_sigma=np.full((len(rows), 3), c.held_position_sigma_m),
         rotation=cameras.rotation.copy(),
-        rotation_sigma=np.full((len(rows), 3), _HELD_ATTITUDE),
+        rotation_sigma=np.full((len(rows), 3), attitude),
         velocity=start.velocity[rows],
         group=np.zeros(len(rows), np.int32),
-        models=(_MOVABLE,),
+        models=(GroupPriors(bias_sigma=(attitude, attitude, attitude), lag_sigma=0.0),),
         lens=lens,
-        lens_sigma=np.where(free, _HELD_LENS * np.array([1, 1, 1, 1, cameras.lens[0, 6], cameras.lens[0, 6]]), 0.0)[
-            None
-        ],
+        lens_sigma=np.where(free, held, 0.0)[None],
     )
     return Adjustment.begin(cameras, tracks, priors, adjustment.points[points])

@@ -1,7 +1,7 @@
-"""The front end for sparse photos: from frames to start values, tracks and priors of the adjustment.
+"""Sparse photos: from frames to start values, tracks and priors of the adjustment.
 
 For photos that overlap too little, or too irregularly, to be followed from one to the next: forward overlap under about
-80 %, corners, crosshatches, several sorties. What tags say is evidence; the pictures decide.
+80 %, corners, crosshatches, several sorties. Tags are evidence; the pictures decide.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,11 +25,6 @@ from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, Phot
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments
 
-_OUTLIER_SIGMA_M = 5.0
-_STATED_FLOOR_M = 0.03
-_RECORDED_HEIGHT_SIGMA_M = 0.3
-_FREE_HEIGHT_SIGMA_M = 1.5
-
 
 @dataclass(frozen=True, slots=True)
 class SparseStart:
@@ -42,11 +37,11 @@ class SparseStart:
         position_prior: float64 (N, 3), recorded positions; where the receiver is an outlier, the network's.
         position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
             and possible. velocity: float64 (N, 2), metres per second.
-        log_focal: float64 (L,) belief from tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
-        placed: bool (N,), False where no picture holds the photo. reasons: photo -> why it is not held.
+        log_focal: float64 (L,) by the tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
+        placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why it has none.
         damaged: photos that cannot be decoded.
         yaw_flipped: bool (N,), the recorded yaw is turned by 180 degrees.
-        metres_per_pixel: float64 (N,). warnings: findings in plain words. plane: all that the start in 2-D found.
+        metres_per_pixel: float64 (N,). warnings: for the report. plane: the planar start values.
         records: what the photos recorded. pairs: pairs tried and matched.
     """
 
@@ -167,7 +162,7 @@ def assemble(
     held[np.unique(tracks.camera)] = True
     velocity = records.velocity()
     return SparseStart(
-        cameras=_rig(records, start),
+        cameras=_camera_block(records, start),
         tracks=tracks,
         segment=records.segment,
         component=start.component,
@@ -189,7 +184,7 @@ def assemble(
     )
 
 
-def _rig(records: PhotoRecords, start: InitialOrientation) -> CameraBlock:
+def _camera_block(records: PhotoRecords, start: InitialOrientation) -> CameraBlock:
     position = np.stack([start.position.real, start.position.imag, start.height], axis=1)
     lens = np.zeros((len(start.focal), 8))
     first = [int(np.argmax(records.lens == k)) for k in range(len(start.focal))]
@@ -203,18 +198,20 @@ def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[
 
     A position that states its own sigma (RTK) lags by the same time on all photos; others by a time that varies.
     """
+    c = active().flight
     position = np.stack([records.position.real, records.position.imag, start.height], axis=1)
     known = np.isfinite(records.height_m) & np.isfinite(start.recorded_focal)[records.lens]
     position[known, 2] = records.height_m[known]
     velocity = records.velocity()
     stated = np.isfinite(records.position_sigma)
-    across = np.where(stated, np.hypot(records.position_sigma, _STATED_FLOOR_M), 1.0)
+    across = np.where(stated, np.hypot(records.position_sigma, c.sparse_stated_floor_m), c.sparse_position_sigma_m)
     along = np.where(stated, 0.0, active().initial.lag_spread_s)
-    up = np.where(known, np.where(stated, np.maximum(across, 0.05), _RECORDED_HEIGHT_SIGMA_M), _FREE_HEIGHT_SIGMA_M)
+    recorded_up = np.where(stated, np.maximum(across, c.sparse_stated_height_floor_m), c.sparse_height_sigma_m)
+    up = np.where(known, recorded_up, c.sparse_free_height_sigma_m)
     sigma = np.stack([np.hypot(across, along * velocity.real), np.hypot(across, along * velocity.imag), up], axis=1)
     off = ~start.gps_ok
     position[off, 0], position[off, 1] = start.position.real[off], start.position.imag[off]
-    sigma[off, :2] = _OUTLIER_SIGMA_M
+    sigma[off, :2] = c.sparse_outlier_sigma_m
     return position, sigma, known
 
 

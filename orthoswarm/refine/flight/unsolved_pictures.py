@@ -1,6 +1,6 @@
 """Pictures that cannot be refined: too few of their kind, or all taken at one spot.
 
-Metres per pixel come from the distance flown; where nothing was flown the record is better than any estimate.
+They are placed as recorded, or as their solved neighbours moved.
 """
 
 from collections import Counter
@@ -10,25 +10,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
 
-FEWEST = 3
-_NEIGHBOURS = 5
-_EXTRA_SIGMA_M = 2.0
-_SPOT_SHARE = 0.05
-_WANDER_SHARE, _WANDER_STEPS, _WANDER_FEWEST = 0.3, 0.9, 6
+BeforeAfter = tuple[PlacedFrame, PlacedFrame]
+"""A frame as recorded and as solved."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefinableSplit:
-    """Recorded frames by what a refiner can make of them, each in the order of the frames.
+    """Recorded frames by whether a refiner can solve them, each in the order of the frames.
 
     Attributes:
-        fit: those that it can refine. odd: too few of their camera and size, to be carried by the others.
+        fit: those that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
         still: those of vehicles that took all pictures at one spot, to stay as recorded.
-        warnings: what was sorted out, in plain words.
+        warnings: what cannot be solved, for the report.
     """
 
     fit: list[PlacedFrame]
@@ -55,10 +53,11 @@ def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
 
 
 def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
-    """Which frames have fewer than FEWEST of their vehicle, camera and size, where others have enough: bool (N,)."""
+    """Which frames have too few of their vehicle, camera and size, where others have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
-    few = np.array([count[kind] < FEWEST for kind in kinds], bool)
+    least = active().flight.least_photos_of_kind
+    few = np.array([count[kind] < least for kind in kinds], bool)
     return few if not few.all() else np.zeros(len(frames), bool)
 
 
@@ -70,20 +69,21 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     out = set()
     for vehicle, own in members.items():
         positions = np.array([p.camera.position for p in own])
-        if len(own) > FEWEST and _stands(positions):
+        if len(own) > active().flight.least_photos_of_kind and _hovers(positions):
             out.add(vehicle)
     return out
 
 
-def _stands(positions: NDArray[np.float64]) -> bool:
-    """Whether a path (N, 3) is one spot, or a receiver's noise about one: steps as long as the whole is wide."""
+def _hovers(positions: NDArray[np.float64]) -> bool:
+    """Whether a path (N, 3) is one spot, or a receiver's noise about one: steps as long as the spread."""
+    c = active().flight
     spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
     height = float(np.median(positions[:, 2]))
-    if spread < _SPOT_SHARE * height:
+    if spread < c.hover_share * height:
         return True
-    wide = float(np.sqrt(((positions[:, :2] - positions[:, :2].mean(0)) ** 2).sum(1).mean()))
+    rms = float(np.sqrt(((positions[:, :2] - positions[:, :2].mean(0)) ** 2).sum(1).mean()))
     steps = float(np.sqrt((np.diff(positions[:, :2], axis=0) ** 2).sum(1).mean()))
-    return len(positions) >= _WANDER_FEWEST and spread < _WANDER_SHARE * height and steps > _WANDER_STEPS * wide
+    return len(positions) >= c.wander_photos and spread < c.wander_share * height and steps > c.wander_steps * rms
 
 
 def place_by_neighbours(
@@ -102,7 +102,7 @@ def place_by_neighbours(
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
     pairs = [pair for pair in pairs if not pair[1].weak] or pairs
-    return [_carried(one, _near(one, pairs)) for one in odd] if pairs else list(odd)
+    return [_moved_like(_nearest(one, pairs), one) for one in odd] if pairs else list(odd)
 
 
 def move_with_neighbours(
@@ -111,7 +111,7 @@ def move_with_neighbours(
     """Move frames by what changed in their nearest neighbours when those were placed again; as sure of them as before.
 
     Args:
-        extra: placed beside the others, but not with them.
+        extra: placed after the others, not solved with them.
         before: the others as they were.
         after: the others as they are.
     """
@@ -120,19 +120,22 @@ def move_with_neighbours(
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
 
 
-def _near(one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> list[tuple[PlacedFrame, PlacedFrame]]:
+def _nearest(
+    one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]
+) -> list[tuple[PlacedFrame, PlacedFrame]]:
     """The refined frames nearest to a frame, of its own vehicle if there are any."""
     own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]
-    return [own[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
+    return [own[i] for i in np.argsort(away, kind="stable")[: active().flight.unsolved_neighbours]]
 
 
-def _carried(one: PlacedFrame, near: Sequence[tuple[PlacedFrame, PlacedFrame]]) -> PlacedFrame:
+def _moved_like(near: Sequence[BeforeAfter], one: PlacedFrame) -> PlacedFrame:
+    """A frame moved by the median shift of its neighbours, turned and scaled as the nearest."""
     shift = np.median([after.camera.position - old.camera.position for old, after in near], axis=0)
     old, after = near[0]
     turn = after.camera.rotation @ old.camera.rotation.T
     ratio = float(np.median([a.camera.lens.focal_px / o.camera.lens.focal_px for o, a in near]))
     lens = replace(one.camera.lens, focal_px=one.camera.lens.focal_px * ratio)
     camera = Camera(one.camera.position + shift, turn @ one.camera.rotation, lens)
-    sigma = float(np.hypot(max(a.sigma_m for _, a in near), _EXTRA_SIGMA_M))
+    sigma = float(np.hypot(max(a.sigma_m for _, a in near), active().flight.unsolved_sigma_m))
     return PlacedFrame(one.frame, camera, after.stage, sigma, weak=True)

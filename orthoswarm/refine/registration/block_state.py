@@ -6,12 +6,13 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.weakly_held_pictures import ENOUGH, observations_per_camera
+from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
 
@@ -106,7 +107,7 @@ def to_solution(
     stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
     cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
-    weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else ENOUGH)
+    weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else active().flight.held_observations)
     placed = [
         PlacedFrame(frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
         for i, frame in enumerate(flight.frames)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
@@ -23,7 +24,7 @@ from orthoswarm.refine.flight.relative_block import Flight, open_flight
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
-from orthoswarm.refine.flight.weakly_held_pictures import ENOUGH, observations_per_camera
+from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit
 from orthoswarm.refine.strategy.vehicle_passes import Options, from_flight, read_frame, relative
@@ -137,7 +138,7 @@ def _hold_drift(flight: Flight) -> None:
 def _check(flight: Flight) -> None:
     """Refuse what a few pictures can make of themselves but no camera can be."""
     cameras, records = flight.cameras(), flight.records
-    if float(np.median(observations_per_camera(flight))) < ENOUGH:
+    if float(np.median(observations_per_camera(flight))) < active().flight.held_observations:
         raise OrthoSwarmError("its pictures show too little that one can be laid beside the other")
     if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
         raise OrthoSwarmError("its pictures do not hold together yet")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
@@ -20,7 +21,6 @@ from orthoswarm.refine.bundle.covariance import frame_sigmas
 from orthoswarm.refine.bundle.height_consistency import contradicted_heights, height_disagreement, release_heights
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
-    FEW,
     Flight,
     distorts_strongly,
     free_full_lens,
@@ -127,7 +127,7 @@ def followed(
         surface = relative(flight, options.ground(origin))
         if not NARROWEST_RAD < fov_rad(float(flight.cameras().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
             return None  # the recorded height that is behind such a lens cannot be right
-        if len(frames) < FEW and distorts_strongly(flight):
+        if len(frames) < active().flight.few_photos and distorts_strongly(flight):
             return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
         return from_flight(flight, surface, origin, basemap, watch, learned)
     except AdjustmentError:

@@ -13,7 +13,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import split_legs
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.flight.solve_units import LONGEST_UNIT, merge_units, split_units
+from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 
 
@@ -83,9 +83,9 @@ def test_a_stray_camera_name_does_not_split_a_flight():
 
 
 def test_long_flights_are_cut_into_even_stretches():
-    units = split_units({"a": [frame(i) for i in range(LONGEST_UNIT * 2 + 10)]})
+    units = split_units({"a": [frame(i) for i in range(active().flight.longest_unit_photos * 2 + 10)]})
     assert len(units) == 3
-    assert max(map(len, units)) <= LONGEST_UNIT
+    assert max(map(len, units)) <= active().flight.longest_unit_photos
 
 
 def solution(vehicle, first, count):
