@@ -7,12 +7,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.intake.picture_sources import Source
+from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of
+from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.jobs.job_queue import Job, Jobs
 from gcs_plugin.daemon.jobs.joint_refinement import Together
 from gcs_plugin.daemon.jobs.leg_placement import Coarse
@@ -21,10 +24,12 @@ from gcs_plugin.daemon.jobs.publisher import Press
 from gcs_plugin.daemon.jobs.sortie_refinement import Refinement
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
+from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer, frame_of_row
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_frames, packed, unpacked
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
@@ -34,6 +39,7 @@ from gcs_plugin.daemon.vehicles import VehicleLinks, completion_rows, note_compl
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Frame
 from orthoswarm.raster.basemap import Basemap
 from telemetry.samples.sample import Sample
 
@@ -77,10 +83,13 @@ class Daemon:
         canvases.mkdir(exist_ok=True)
         trusted = distrust_after_power_cut(self.journal)
         self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
+        self.refused = RefusedPictures(self.events.publish)
+        self.console = ConsoleState(self.journal, self.events.publish)
+        self.plans = Plans(folder / "plans")
         fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
-            fov_rad=fov, on_area=self._area_changed,
+            fov_rad=fov, on_area=self._area_changed, anchor=self._anchor, on_rejected=self._rejected,
         )  # fmt: skip
         self.crew, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
@@ -104,7 +113,6 @@ class Daemon:
             self.jobs.add("refine", vehicle, sortie)
         self.legwatch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
-        self.plans = Plans(folder / "plans")
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
         if settings.links:
@@ -192,6 +200,7 @@ class Daemon:
         if known is not None:
             return int(known["seq"]), False
         width, height, suffix = picture_size(data)
+        pose = self._with_fix(pose)
         require_space(self.settings.workspace, len(data))
         time_s = came if pose.time_s is None else pose.time_s
         path = self.store.put(key, suffix, data)
@@ -205,11 +214,23 @@ class Daemon:
             sortie = self.sortie(pose.vehicle)
             self.posted[pose.vehicle] += 1
             self.drawer.add(seq, frame, came, sortie)
-            self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+            if pose.has_fix:
+                self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
             if self.posted[pose.vehicle] == _FEW:
                 self.crew.warm_kernels()
                 self.background.warm_up()
         return seq, new
+
+    def _with_fix(self, pose: PostedPose) -> PostedPose:
+        """The pose; where its receiver had no fix, with what the vehicle's link says about that moment."""
+        if pose.has_fix or pose.time_s is None:
+            return pose
+        linked = self._pose_at(pose.vehicle, pose.time_s)
+        values = None if linked is None else pose_values(linked)
+        if values is None:
+            return pose
+        without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
+        return replace(pose, values=values | without)
 
     def sortie(self, vehicle: str) -> int:
         """The vehicle's present sortie."""
@@ -258,6 +279,14 @@ class Daemon:
     def layer_rows(self) -> list[dict[str, Any]]:
         """The layers as JSON values, the basemap first."""
         return views.layer_rows(self.layers, self.tiles.basemap)
+
+    def _anchor(self) -> Anchor | None:
+        """What says where the map lies before any picture does: the basemap, else the newest plan."""
+        basemap = self.tiles.basemap
+        if basemap is not None:
+            return Anchor.of_ground("the basemap", basemap.epsg, basemap.bounds)
+        found = self.plans.newest_bounds()
+        return None if found is None else Anchor("the newest plan", found)
 
     def _area_changed(self, area: Area) -> None:
         """Read the basemap on the area's grid."""
@@ -399,4 +428,13 @@ class Daemon:
 
     def problems(self) -> list[str]:
         """What is wrong at present, in words."""
-        return [text for text in (self.drawer.problem, self.drawer.overload) if text]
+        found = [self.drawer.problem, self.drawer.overload, self.jobs.problem, *self.refused.problems()]
+        for source in self.sources:
+            if source.without_pose:
+                text = f"{source.without_pose} pictures of {source.vehicle} have no pose"
+                found.append(f"{text}; put the flight's log beside them")
+        return [text for text in found if text]
+
+    def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:
+        """A picture that is safe on the disk cannot be on the map."""
+        self.refused.note("place" if misplaced else "map", reason, frame.vehicle, frame.image)

@@ -10,7 +10,7 @@ from orthoswarm import __version__
 _QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
 
-def prometheus(daemon: Daemon) -> str:
+def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     """All figures, one metric a line with its help and type."""
     lines: list[str] = []
 
@@ -48,6 +48,11 @@ def prometheus(daemon: Daemon) -> str:
         counts[row["kind"], row["state"]] = row["n"]
     metric("jobs", "gauge", "Jobs by kind and state.", [({"kind": k, "state": s}, n) for (k, s), n in counts.items()])
     single("journal_commits_total", "counter", "Commits since the start.", daemon.journal.commits)
+    metric(
+        "pictures_refused_total", "counter", "Pictures refused, or not on the map, since the start, by cause.",
+        [({"cause": cause}, count) for cause, count in daemon.refused.counts.items()],
+    )  # fmt: skip
+    single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
     single("problems", "gauge", "Things that are wrong at present.", len(daemon.problems()))
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
     single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())

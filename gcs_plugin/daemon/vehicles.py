@@ -84,6 +84,7 @@ class VehicleLinks:
         from gcs_plugin.links.signing import find_key
 
         self._settings, self._journal, self._events, self._jobs = settings, journal, events, jobs
+        self._titles = {v.id: v.name for v in settings.vehicles}
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._kept: dict[int, _Kept] = {}
         self._stop = threading.Event()
@@ -445,7 +446,8 @@ class VehicleLinks:
 
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
         kept = self._keep(vehicle.system)
-        row = vehicle.summary(now) | {"id": kept.id, "alarm": self.fleet.separation.text(vehicle.system)}
+        row = vehicle.summary(now) | {"id": kept.id, "name": self._titles.get(kept.id, "")}
+        row["alarm"] = self.fleet.separation.text(vehicle.system)
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))

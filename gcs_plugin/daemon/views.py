@@ -48,18 +48,26 @@ def vehicle_rows(
     sources: Iterable[Source],
     linked: Mapping[str, dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """All vehicles that were heard (linked: id -> what their link tells), that sent pictures, or that should."""
-    names = {v.id: v.name for v in named if v.name}
-    documents = {row["id"]: row for row in _senders(journal, names)}
+    """All vehicles that were heard, that sent pictures, or that should.
+
+    Args:
+        journal: of the workspace. named: with names given by the operator. sources: of pictures.
+        linked: id -> what the vehicle's link says.
+
+    Returns:
+        A row a vehicle; each has its `id`, and its `name` (empty if it was given none).
+    """
+    documents = {row["id"]: row for row in _senders(journal)}
     for name, heard in linked.items():
         documents[name] = documents.get(name, {"sortie": 1, "frames": {}}) | heard
     for source in sources:
         documents.setdefault(source.vehicle, {"id": source.vehicle, "state": "waiting", "frames": {}, "sortie": 1})
         documents[source.vehicle]["pictures"] = source.document()
-    return list(documents.values())
+    names = {v.id: v.name for v in named}
+    return [row | {"name": names.get(row["id"], "")} for row in documents.values()]
 
 
-def _senders(journal: Journal, names: Mapping[str, str]) -> Iterable[dict[str, Any]]:
+def _senders(journal: Journal) -> Iterable[dict[str, Any]]:
     """Vehicles in the journal, with their counts of frames and where the last picture was taken."""
     rows = journal.rows(
         "SELECT v.id, v.sortie, COUNT(f.seq) AS frames, SUM(f.stage = 'fine') AS fine,"
@@ -73,8 +81,6 @@ def _senders(journal: Journal, names: Mapping[str, str]) -> Iterable[dict[str, A
     for row in rows:
         name = unpacked(row["id"])
         document: dict[str, Any] = {"id": name, "state": "pictures", "sortie": row["sortie"]}
-        if name in names:
-            document["name"] = names[name]
         document["frames"] = {k: row[k] or 0 for k in ("frames", "fine", "coarse", "rejected")}
         if row["last"] in last:
             pose = json.loads(last[row["last"]]["pose"])

@@ -5,7 +5,7 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +21,12 @@ _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
     "clearance_m",
 )  # fmt: skip
+_MOST_NUMBER: Final = 1e6
 _CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS}
+
+
+GeographicBounds = tuple[float, float, float, float]
+"""South, west, north, east in degrees."""
 
 
 class Plans:
@@ -33,6 +38,7 @@ class Plans:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
         """Plan; gives the figures of `orthoswarm plan --json` with the plan's `id`.
@@ -109,6 +115,30 @@ class Plans:
             raise InputError(f"{name} has no sortie {sortie} (there are {most}); send another")
         return starts
 
+    def flights(self, name: Any, sortie: int = 1) -> dict[str, dict[str, Any]]:
+        """Vehicle -> `start_s`, `time_s` and `height_m` (of the takeoff) of a flight, for those that have it.
+
+        Raises:
+            InputError: there is no such plan.
+        """
+        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
+        rows = {v["id"]: v["flights"][sortie - 1] for v in figures["vehicles"] if len(v["flights"]) >= sortie}
+        return {
+            vehicle: {"start_s": row["start_s"], "time_s": row["time_s"], "height_m": row["takeoff_height_m"]}
+            for vehicle, row in rows.items()
+        }
+
+    def newest_bounds(self) -> GeographicBounds | None:
+        """South, west, north, east of the newest plan in degrees, None if there is none."""
+        found = sorted(self.folder.glob("plan-*/all.geojson"))
+        if not found:
+            return None
+        if self._bounds is None or self._bounds[0] != found[-1]:
+            positions = list(_positions(json.loads(found[-1].read_text(encoding="utf-8"))))
+            lon, lat = zip(*positions, strict=True)
+            self._bounds = found[-1], (min(lat), min(lon), max(lat), max(lon))
+        return self._bounds[1]
+
     def _path(self, name: Any) -> Path:
         if not isinstance(name, str) or not _NAME.match(name) or not (self.folder / name / "plan.json").is_file():
             raise InputError("there is no such plan; see /api/plans")
@@ -129,12 +159,12 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
         value = body.get(key)
         if value is None and key not in ("altitude_m", "fov_min_deg"):
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{key} is missing or no number; send one")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST_NUMBER:
+            raise InputError(f"{key} is missing or no number that makes sense; send one")
         values[key] = float(value)
     for key, choices in _CHOICES.items():
         if key in body:
-            if body[key] not in choices:
+            if not isinstance(body[key], str) or body[key] not in choices:
                 raise InputError(f"{key} is none of {', '.join(choices)}; choose one")
             values[key] = body[key]
     starts = body.get("starts", [])
@@ -144,7 +174,25 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_position(start: Any) -> bool:
-    return isinstance(start, list | tuple) and len(start) == 2 and all(isinstance(v, int | float) for v in start)
+    return (
+        isinstance(start, list | tuple)
+        and len(start) == 2
+        and all(isinstance(v, int | float) and abs(v) <= 360.0 for v in start)
+    )
+
+
+def _positions(document: Any) -> Iterator[tuple[float, float]]:
+    """All positions (longitude, latitude) of a GeoJSON document."""
+    if isinstance(document, dict):
+        for key in ("features", "geometry", "geometries", "coordinates"):
+            if key in document:
+                yield from _positions(document[key])
+    elif isinstance(document, list):
+        if document and isinstance(document[0], int | float):
+            yield float(document[0]), float(document[1])
+        else:
+            for part in document:
+                yield from _positions(part)
 
 
 def plan_into(request: PlanRequest) -> dict[str, Any]:

@@ -148,7 +148,7 @@ class Commands:
         if not words or not (self._plan or len(words) > 1):
             return ["usage: orthoswarm upload VEHICLE [PLAN]; plan first"]
         plan = words[1] if len(words) > 1 else self._plan
-        return [self.client.ask(f"/api/missions/{self._named(words[0])}/upload", {"plan": plan})["text"]]
+        return [self.client.ask(f"/api/missions/{self._named(words[0])}/upload", {"plan": plan})["reason"]]
 
     def _named(self, word: str) -> str:
         """The daemon's name of a vehicle that was typed as its name or as its system id."""
@@ -186,7 +186,7 @@ class Commands:
         def run(words: list[str]) -> list[str]:
             if len(words) != 1:
                 return [f"usage: orthoswarm {verb} VEHICLE"]
-            return [self.client.ask(f"/api/missions/{self._named(words[0])}/{verb}", {})["text"]]
+            return [self.client.ask(f"/api/missions/{self._named(words[0])}/{verb}", {})["reason"]]
 
         return run
 

@@ -16,7 +16,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _OPEN: Final = frozenset({"/healthz", "/", "/favicon.ico"})
 _OPEN_FOLDERS: Final = ("/static/",)
-_COMMANDS: Final = ("/api/missions", "/api/refine", "/api/export", "/api/plans", "/api/vehicles", "/api/jobs")
+_COMMANDS: Final = ("/api/missions", "/api/refine", "/api/export", "/api/plans", "/api/plan", "/api/finds")
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS: Final = [
     (b"x-content-type-options", b"nosniff"),

@@ -1,6 +1,10 @@
 """Reading pictures: as stored in the file (EXIF rotation not applied), 8 bit, grey or RGB."""
 
+import io
+import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +13,11 @@ from orthoswarm.model.errors import OrthoSwarmError
 
 Bytes = NDArray[np.uint8]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".dng"})
+
+
+MOST_PIXELS: Final = 200_000_000
+"""Larger pictures are refused before they are decoded: 200 megapixels, as the largest phones' and aerial cameras' have,
+take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that takes many gigabytes."""
 
 
 class PictureError(OrthoSwarmError):
@@ -68,7 +77,58 @@ def read_rgba(path: Path) -> Bytes:
     return np.asarray(cv2.cvtColor(_decode_other(path, data, gray=False), cv2.COLOR_BGR2RGBA))
 
 
+def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int, int, str]:
+    """Columns, rows and format (Pillow's name: JPEG, PNG, ...) of an encoded picture, without decoding it.
+
+    Args:
+        data: the whole file. formats: those that are allowed, all that Pillow knows by default.
+
+    Raises:
+        PictureError: it is no picture, or larger than MOST_PIXELS.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    Image.MAX_IMAGE_PIXELS = MOST_PIXELS  # beyond that Pillow warns, beyond twice as many it raises
+    try:
+        with Image.open(io.BytesIO(data), formats=formats) as picture:
+            (width, height), kind = picture.size, picture.format or ""
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise PictureError("it has more pixels than any camera; leave it out or send a smaller one") from None
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, OverflowError, struct.error):
+        raise PictureError("it is no readable picture; leave it out or copy it again") from None
+    if width * height > MOST_PIXELS or min(width, height) < 1:
+        text = f"it has {width} x {height} pixels, more than {MOST_PIXELS // 1_000_000} megapixels"
+        raise PictureError(f"{text}; leave it out or send a smaller one")
+    return width, height, kind
+
+
 def _bytes(path: Path) -> bytes:
+    """A picture file's content, once its size is known to be bearable."""
+    data = _content(path)
+    if data[:2] == b"\xff\xd8":
+        width, height = _jpeg_size(data)
+        if width * height > MOST_PIXELS:
+            raise PictureError(f"{path.name} has {width} x {height} pixels, more than any camera; leave it out")
+        return data
+    try:
+        picture_size(data)
+    except PictureError as error:
+        raise PictureError(str(error).replace("it ", f"{path.name} ", 1)) from None
+    return data
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Columns and rows by a JPEG's header; 0, 0 where that is damaged, which decoding says better."""
+    import simplejpeg
+
+    try:
+        height, width, *_ = simplejpeg.decode_jpeg_header(data)
+    except ValueError:
+        return 0, 0
+    return int(width), int(height)
+
+
+def _content(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:

@@ -154,8 +154,10 @@ def second_sortie(served, plan):
 def test_commands_that_cannot_be_carried_out_say_why(flown):
     served, _, _ = flown
     served.until("/api/vehicles", lambda rows: len(rows) == 2)
-    assert "v9" in served.command("/api/missions/v9/start").json()["detail"]
-    assert "mission" in served.command("/api/missions/2/start").json()["detail"]  # heard, and known by its number
+    absent = served.command("/api/missions/v9/start", {"id": "mine"}).json()
+    assert (absent["id"], absent["outcome"]) == ("mine", "not_sent") and "v9" in absent["reason"]
+    refused = served.command("/api/missions/2/start").json()  # heard, and known by its number
+    assert refused["outcome"] == "refused" and "mission" in refused["reason"]
     assert served.command("/api/missions/v1/explode").status_code == 404
     assert "plan" in served.command("/api/missions/v1/upload", {"plan": "../../etc"}).json()["detail"]
     assert "vehicles" in served.command("/api/plans", {"area": square(100)}).json()["detail"]
@@ -192,7 +194,7 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     assert [r["id"] for r in waiting if "takeoff" in r and r["takeoff"]["in_s"] > 1.0] == [later]
     assert "under way" in served.command(go).json()["detail"]
     served.until("/api/vehicles", lambda rows: sum(r["mission"]["phase"] == "active" for r in rows) == 1)
-    assert "cancelled" in served.command(f"/api/missions/{later}/rtl").json()["text"]
+    assert "cancelled" in served.command(f"/api/missions/{later}/rtl").json()["reason"]
     served.until("/api/completions", lambda rows: len(rows) == 1)  # and the other one stays on the ground
     rows = {r["id"]: r for r in served.get("/api/vehicles").json()}
     assert "takeoff" not in rows[later] and not rows[later]["armed"]

@@ -55,14 +55,18 @@ def _opens(data: bytes) -> bool:
     """Whether a picture of another kind (TIFF) can be decoded to its last row."""
     import io
 
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
+    from orthoswarm.raster.picture_file import PictureError, picture_size
+
+    try:
+        picture_size(data)
+    except PictureError:
+        return len(data) > 64  # no picture, or too large: whoever reads it says so
     try:
         with Image.open(io.BytesIO(data)) as picture:
             picture.load()
-    except UnidentifiedImageError:
-        return len(data) > 64
-    except (OSError, ValueError, SyntaxError, EOFError, struct.error):
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
         return False
     return True
 

@@ -13,8 +13,10 @@ from orthoswarm.model.frame import Fix, Frame
 MOST_TEXT: Final = 1 << 20
 _OPTIONAL: Final = {
     "height_m": 1e5, "altitude_m": 1e5, "yaw_deg": 1e5, "pitch_deg": 1e5, "roll_deg": 1e5, "flight_yaw_deg": 1e5,
-    "position_sigma_m": 1e6, "fov_deg": 179.0,
+    "position_sigma_m": 1e6, "fov_deg": 179.0, "gps_fix": 8,
 }  # fmt: skip
+_FIX_2D: Final = 2
+_NOWHERE_DEG: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +25,24 @@ class PostedPose:
 
     Attributes:
         vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if it was not said.
-        values: lat_deg, lon_deg and what else is known, in degrees and metres.
+        values: lat_deg, lon_deg and what else is known, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE.
     """
 
     vehicle: str
     image: str
     time_s: float | None
     values: dict[str, float]
+
+    @property
+    def has_fix(self) -> bool:
+        """Whether the position is one."""
+        return is_position(self.values)
+
+
+def is_position(values: Mapping[str, Any]) -> bool:
+    """Whether a pose holds a position: a receiver without a fix gives 0, 0, or says so (GPS_FIX_TYPE below 2D)."""
+    lat, lon = float(values["lat_deg"]), float(values["lon_deg"])
+    return values.get("gps_fix", _FIX_2D) >= _FIX_2D and not (abs(lat) < _NOWHERE_DEG and abs(lon) < _NOWHERE_DEG)
 
 
 def parse_pose(document: Any, image: str | None = None) -> PostedPose:
@@ -86,8 +99,9 @@ def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str,
     def radians(key: str) -> float | None:
         return None if v.get(key) is None else math.radians(v[key])
 
+    lat_deg, lon_deg = (v["lat_deg"], v["lon_deg"]) if is_position(v) else (0.0, 0.0)
     fix = Fix(
-        v["lat_deg"], v["lon_deg"], v.get("height_m"), v.get("altitude_m"), radians("yaw_deg"), radians("pitch_deg"),
+        lat_deg, lon_deg, v.get("height_m"), v.get("altitude_m"), radians("yaw_deg"), radians("pitch_deg"),
         radians("roll_deg"), radians("flight_yaw_deg"), v.get("position_sigma_m"), bool(v.get("height_is_ground")),
     )  # fmt: skip
     return Frame(image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=radians("fov_deg"))

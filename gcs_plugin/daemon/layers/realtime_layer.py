@@ -18,7 +18,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.intake.posted_pose import frame_of
+from gcs_plugin.daemon.intake.posted_pose import frame_of, is_position
+from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
 from gcs_plugin.daemon.layers.draw_queue import Pending, Waiting
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
 from gcs_plugin.daemon.store.event_bus import Events
@@ -70,6 +71,8 @@ class Drawer:
         gsd_m: float | None = None,
         fov_rad: float | None = None,
         on_area: Callable[[Area], None] = lambda _: None,
+        anchor: Callable[[], Anchor | None] = lambda: None,
+        on_rejected: Callable[[Frame, str, bool], None] = lambda frame, reason, misplaced: None,
     ) -> None:
         """Take up where the last daemon stopped; `start` begins to draw.
 
@@ -82,9 +85,14 @@ class Drawer:
             gsd_m: ground pixel; from the first pictures if None.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
             on_area: called in the drawing thread when the area changes.
+            anchor: gives where the map is to lie, None to go by the pictures.
+            on_rejected: called with each frame that cannot be on the map, why, and whether that is for its place.
         """
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
         self._gsd_m, self._fov_rad, self._on_area = gsd_m, fov_rad, on_area
+        self._anchor, self._on_rejected = anchor, on_rejected
+        self._far: list[tuple[float, float]] | None = None
+        self._begun = 0
         self._queue = Waiting(_IN_MEMORY)
         self._waiting: set[int] = set()
         self._looked = 0.0
@@ -237,7 +245,10 @@ class Drawer:
                 pending = None if self._stop else self._queue.take()
             if pending is None:
                 break
+            begun = self._begun
             result = self._draw(pending)
+            if self._begun != begun:
+                done.clear()  # what was drawn before on another map is drawn again
             done.append(result)
             seqs.append(pending.seq)
             self._note(pending, result)
@@ -262,6 +273,7 @@ class Drawer:
         try:
             place = self._place(frame)
             if isinstance(place, str):
+                self._on_rejected(frame, place, True)
                 return self._told(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
             picture = read_rgba(frame.path)
@@ -272,6 +284,7 @@ class Drawer:
             raise
         except OrthoSwarmError as error:
             reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
+            self._on_rejected(frame, reason, False)
             return self._told(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
             return self._told(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
@@ -293,14 +306,19 @@ class Drawer:
 
     def _place(self, frame: Frame) -> tuple[Camera, float] | str:
         """The frame's camera and sigma, the layer ready to take it; or why it cannot be drawn."""
+        if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
+            return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
+        far = self._is_far(frame)
+        if far is not None:
+            return far
         if self._grid is None:
             if not -80.0 <= frame.fix.lat_deg <= 84.0:
                 return "it lies beyond the UTM grid, near a pole"
             epsg = self.area.epsg if self.area else utm_epsg(frame.fix.lat_deg, frame.fix.lon_deg)
             self._grid = LocalGrid(epsg)
         place = self._grid.to_grid(frame.fix.lat_deg, frame.fix.lon_deg)
-        if not np.isfinite(place).all() or (self.area is not None and self._away_m(place) > _FAR_M):
-            return "it lies more than 100 km from the others; use a workspace of its own for it"
+        if not np.isfinite(place).all():
+            return "its position is beyond the map's grid; use a workspace of its own for it"
         placed = recorded_cameras([frame], self._grid, self._fov_rad).placed
         if not placed:
             return "its position is not a number"
@@ -316,9 +334,66 @@ class Drawer:
             self._begin_again(camera, place)
         return self._with_room(camera) or (camera, placed[0].sigma_m)
 
-    def _away_m(self, place: Any) -> float:
-        assert self.area is not None
-        return float(np.hypot(*(place - np.array(self.area.origin))))
+    def _is_far(self, frame: Frame) -> str | None:
+        """Why a frame lies too far away for the map, None if it does not; the map may move to it.
+
+        The basemap says where the map lies, without one the newest plan, without that most of the pictures. A map that
+        was begun elsewhere (by pictures with a wrong position) is begun again, as long as nothing was solved on it,
+        and all frames are drawn again.
+        """
+        fix, anchor = frame.fix, self._anchor()
+        if anchor is not None and anchor.distance_m(fix.lat_deg, fix.lon_deg) > _FAR_M:
+            km = anchor.distance_m(fix.lat_deg, fix.lon_deg) / 1e3
+            return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
+        if self.area is None:
+            return None
+        lat, lon = (float(v) for v in LocalGrid(self.area.epsg).to_geographic(self.area.origin))
+        away_m = distance_m(fix.lat_deg, fix.lon_deg, lat, lon)
+        if away_m <= _FAR_M:
+            return None
+        wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
+        if (wrong or (anchor is None and self._is_majority(frame))) and not self._solved():
+            self._move_away()
+            return None
+        return (
+            f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
+        )
+
+    def _is_majority(self, frame: Frame) -> bool:
+        """Whether more of the frames lie around this one, too far from the map, than on the map."""
+        if self._far is None:
+            rows = self._journal.rows("SELECT pose FROM frames WHERE stage = 'rejected'")
+            poses = [pose for row in rows if is_position(pose := json.loads(row["pose"]))]
+            self._far = [(pose["lat_deg"], pose["lon_deg"]) for pose in poses]
+        here = (frame.fix.lat_deg, frame.fix.lon_deg)
+        self._far.append(here)
+        around = sum(distance_m(*here, *other) <= _FAR_M for other in self._far)
+        row = self._journal.one("SELECT COUNT(*) AS n FROM frames WHERE drawn = 1 AND reason IS NULL")
+        return row is not None and around > int(row["n"])
+
+    def _solved(self) -> bool:
+        query = "SELECT 1 FROM solutions UNION SELECT 1 FROM coarse LIMIT 1"
+        return self._journal.one(query) is not None
+
+    def _draw_anew(self) -> None:
+        """All frames are drawn again, by what the journal says."""
+        self._begun += 1
+        with self._condition:
+            self._queue.forget_drawn()
+            self._more = True
+
+    def _move_away(self) -> None:
+        """Leave the place where the map lies: the next frame begins it, and all are drawn again."""
+        _log.warning("the map was begun at a wrong position; it is begun again where most pictures lie")
+
+        def change(db: sqlite3.Connection) -> None:
+            db.execute("UPDATE frames SET drawn = 0")
+            db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
+
+        self._journal.write(change)
+        self._draw_anew()
+        self.area, self._grid, self._mosaic, self._far = None, None, None, None
+        self._layer.replace(None)
 
     def _is_other_scale(self, camera: Camera) -> bool:
         """Whether the map's scale was taken from pictures during the climb."""
@@ -373,9 +448,7 @@ class Drawer:
 
         self._journal.write(change)
         if again:
-            with self._condition:
-                self._queue.forget_drawn()
-                self._more = True
+            self._draw_anew()
         self.area = area
         self._layer.replace(canvas)
         self._mosaic = RealtimeMosaic(canvas)

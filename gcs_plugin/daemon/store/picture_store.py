@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import Final
 
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.model.errors import InputError
+from orthoswarm.raster import picture_file
 
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
-_MOST_PIXELS: Final = 400_000_000
 
 
 def frame_key(vehicle: str, image: str) -> bytes:
@@ -23,23 +22,15 @@ def frame_key(vehicle: str, image: str) -> bytes:
 
 
 def picture_size(data: bytes) -> tuple[int, int, str]:
-    """Columns, rows and file suffix of a picture, read from its head.
+    """Columns, rows and file suffix of a picture, by its header.
 
     Raises:
         InputError: it is no picture, or a huge one.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
     try:
-        with Image.open(io.BytesIO(data), formats=_FORMATS) as picture:
-            (width, height), kind = picture.size, picture.format or ""
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, OverflowError):
-        raise InputError("the file is no picture (JPEG, PNG, WebP, TIFF or BMP); send the camera's file") from None
-    except Image.DecompressionBombError:
-        raise InputError("the picture has more pixels than any camera; send a smaller one") from None
-    if width * height > _MOST_PIXELS or min(width, height) < 1:
-        raise InputError(f"a picture of {width} x {height} pixels is not possible; send a smaller one")
+        width, height, kind = picture_file.picture_size(data, _FORMATS)
+    except picture_file.PictureError as error:
+        raise InputError(f"the file cannot be taken: {error}") from None
     return width, height, _SUFFIXES[kind]
 
 

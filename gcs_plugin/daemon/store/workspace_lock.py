@@ -1,5 +1,6 @@
 """The ground the daemon stands on: its workspace's lock, the disk's room, this start of the machine, the basemap."""
 
+import contextlib
 import json
 import logging
 import os
@@ -22,13 +23,18 @@ _log = logging.getLogger(__name__)
 def take_over(workspace: Path) -> Workspace:
     """The workspace's lock; one that a dying daemon still holds is waited for.
 
+    The folder becomes its owner's alone: it holds the token, pictures, and positions.
+
     Raises:
         InputError: another daemon holds it.
     """
     end = time.monotonic() + _LOCK_S
     while True:
         try:
-            return Workspace(workspace)
+            lock = Workspace(workspace)
+            with contextlib.suppress(OSError):  # another's folder, or a file system without rights
+                workspace.chmod(0o700)
+            return lock
         except InputError:
             if workspace.is_file() or time.monotonic() > end:
                 raise

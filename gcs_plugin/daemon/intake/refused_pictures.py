@@ -1,0 +1,77 @@
+"""Pictures that were refused, dropped or left off the map: counted by cause, and said while it is news."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from orthoswarm.export.product_files import iso_time
+
+CAUSES: Final = {
+    "disk": "the workspace's disk is full or gone",
+    "pose": "the pose is wrong or missing",
+    "picture": "the file is no picture, or too large",
+    "time": "the upload stood still",
+    "place": "the picture's position cannot be on the map",
+    "map": "the picture cannot be drawn",
+}
+_NEWS_S: Final = 600.0
+
+
+@dataclass(slots=True)
+class _Refusals:
+    count: int
+    vehicle: str
+    image: str
+    reason: str
+    time_s: float
+
+
+class RefusedPictures:
+    """Counts them since the daemon's start; any thread.
+
+    Args:
+        publish: called with each, as fields of an event. clock: UTC epoch seconds.
+    """
+
+    def __init__(self, publish: Callable[..., None], clock: Callable[[], float] = time.time) -> None:
+        self._publish, self._clock = publish, clock
+        self._lock = threading.Lock()
+        self._by_cause: dict[str, _Refusals] = {}
+
+    def note(self, cause: str, reason: str, vehicle: str = "", image: str = "") -> None:
+        """Count one.
+
+        Args:
+            cause: one of CAUSES. reason: in a sentence. vehicle, image: as far as known.
+        """
+        with self._lock:
+            before = self._by_cause.get(cause)
+            count = 1 if before is None else before.count + 1
+            self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
+        self._publish("refused", cause=cause, count=count, vehicle=vehicle, image=image, reason=reason)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Cause -> how many; every cause is there."""
+        with self._lock:
+            return {cause: self._by_cause[cause].count if cause in self._by_cause else 0 for cause in CAUSES}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row a cause with `cause`, `text`, `count` and the last one's `vehicle`, `image`, `reason`, `time`."""
+        with self._lock:
+            return [
+                {
+                    "cause": cause, "text": CAUSES[cause], "count": r.count, "vehicle": r.vehicle, "image": r.image,
+                    "reason": r.reason, "time": iso_time(r.time_s),
+                }
+                for cause, r in self._by_cause.items()
+            ]  # fmt: skip
+
+    def problems(self) -> list[str]:
+        """A sentence for each cause of the last ten minutes."""
+        now = self._clock()
+        with self._lock:
+            recent = [r for r in self._by_cause.values() if now - r.time_s < _NEWS_S]
+        return [f"{r.count} picture{'s' * (r.count > 1)} refused or not on the map: {r.reason}" for r in recent]

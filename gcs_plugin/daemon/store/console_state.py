@@ -1,0 +1,103 @@
+"""What the operator works on, the same for every page: the plan with its settings, and marked finds."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+_PLAN_FIELDS: Final = ("area", "settings", "plan", "vehicles")
+_MOST_FINDS: Final = 10_000
+_MOST_NOTE: Final = 10_000
+
+
+class OutdatedError(OrthoSwarmError):
+    """Another page has changed the plan meanwhile."""
+
+
+class ConsoleState:
+    """The plan and the finds, kept in the journal.
+
+    Args:
+        journal: where they are kept. publish: called with an event's kind and fields when they change.
+    """
+
+    def __init__(self, journal: Journal, publish: Callable[..., None]) -> None:
+        self._journal, self._publish = journal, publish
+        self._lock = threading.Lock()
+
+    def plan(self) -> dict[str, Any]:
+        """The plan: `area` (GeoJSON), `settings`, `plan` (id), `vehicles` (who flies what), `version` from 0."""
+        found: dict[str, Any] = self._journal.fact("console_plan") or {}
+        return {"version": 0, **dict.fromkeys(_PLAN_FIELDS), **found}
+
+    def put_plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Replace the plan; gives it with its new version.
+
+        Args:
+            body: the fields of `plan`; `version` is the one that was changed, left out to replace any.
+
+        Raises:
+            InputError: a field is not what it should be.
+            OutdatedError: the plan has another version by now.
+        """
+        for key in ("area", "settings", "vehicles"):
+            if not isinstance(body.get(key), dict | None):
+                raise InputError(f"{key} is no JSON object; send one, or null")
+        if not isinstance(body.get("plan"), str | None):
+            raise InputError("plan is no id of a plan; send one, or null")
+        with self._lock:
+            before, known = self.plan()["version"], body.get("version")
+            if known is not None and known != before:
+                raise OutdatedError(f"the plan was changed elsewhere (version {before}); load it and change it again")
+            plan = {key: body.get(key) for key in _PLAN_FIELDS} | {"version": before + 1}
+            self._journal.remember("console_plan", plan)
+        self._publish("plan", **plan)
+        return plan
+
+    def finds(self) -> list[dict[str, Any]]:
+        """The finds, oldest first: `id`, `lat_deg`, `lon_deg`, `sigma_m`, `note`, `time`."""
+        return list((self._journal.fact("finds") or {"rows": []})["rows"])
+
+    def add_find(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Mark a find; gives it with its id.
+
+        Raises:
+            InputError: a field is not what it should be, or there are too many.
+        """
+        row = {
+            "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
+            "sigma_m": None if body.get("sigma_m") is None else _number(body, "sigma_m", 1e6),
+            "note": body.get("note") or "", "time": iso_time(time.time()),
+        }  # fmt: skip
+        if not isinstance(row["note"], str) or len(row["note"]) > _MOST_NOTE:
+            raise InputError(f"note is no text of at most {_MOST_NOTE} characters; send a shorter one")
+        with self._lock:
+            found = self._journal.fact("finds") or {"next": 1, "rows": []}
+            if len(found["rows"]) >= _MOST_FINDS:
+                raise InputError(f"there are {_MOST_FINDS} finds; delete some first")
+            row = {"id": found["next"], **row}
+            self._journal.remember("finds", {"next": found["next"] + 1, "rows": [*found["rows"], row]})
+        self._publish("finds")
+        return row
+
+    def delete_find(self, number: int) -> bool:
+        """Delete a find; False if there is no such."""
+        with self._lock:
+            found = self._journal.fact("finds") or {"next": 1, "rows": []}
+            rows = [row for row in found["rows"] if row["id"] != number]
+            if len(rows) == len(found["rows"]):
+                return False
+            self._journal.remember("finds", found | {"rows": rows})
+        self._publish("finds")
+        return True
+
+
+def _number(body: Mapping[str, Any], key: str, largest: float) -> float:
+    value = body.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
+        raise InputError(f"{key} is missing or out of range; send a number, at most {largest:g}")
+    return float(value)

@@ -1,0 +1,227 @@
+"""Commands to vehicles over HTTP: each has an id and an outcome, and is never executed 5 s after it was given.
+
+When it was given the client says by the daemon's clock (`given_s`, which it learns from the heartbeats of the event
+stream). Without that it is the moment when the request was read, unless the daemon stood still just before: then
+nobody can tell how old the request is, and it is not executed. The same id sent again gets the same outcome, without
+the command being given twice.
+"""
+
+import asyncio
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final
+
+from fastapi import HTTPException, Request, Response
+
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
+from gcs_plugin.daemon.vehicles import VehicleLinks
+from gcs_plugin.fleet.commands import VERBS, CommandResult, new_id
+from gcs_plugin.mission.exchange import COMMAND_S, Verdict
+from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
+from gcs_plugin.web.standstill import Standstill
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+Rows = list[dict[str, Any]]
+
+ALL: Final = "all"
+_ALL_VERBS: Final = ("pause", "resume", "rtl", "land")
+_AHEAD_S: Final = 2.0
+_MOST_ID: Final = 200
+_REMEMBERED: Final = 1000
+_THREADS: Final = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A command as it was given.
+
+    Attributes:
+        id: of the client or new. at: UTC epoch seconds by the daemon's clock.
+    """
+
+    id: str
+    at: float
+
+    @property
+    def age_s(self) -> float:
+        """How long ago that was."""
+        return time.time() - self.at
+
+
+class CommandRoutes:
+    """The routes of commands to vehicles.
+
+    Args:
+        daemon: whose vehicles. standstill: of the loop in which requests are read.
+    """
+
+    def __init__(self, daemon: Daemon, standstill: Standstill) -> None:
+        self._daemon, self._standstill = daemon, standstill
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="commands")
+        self._known: OrderedDict[str, tuple[tuple[str, str], asyncio.Task[Rows]]] = OrderedDict()
+
+    def close(self) -> None:
+        """Let go of the threads."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
+        """Give a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
+
+        Body: `id` and `given_s` (epoch seconds by the daemon's clock). Answers once the outcome is known, with `id`,
+        `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
+        stands for all on the links (not for upload and start); its answer has `id` and `results`, a row a vehicle.
+        """
+        if verb not in (*VERBS, "upload"):
+            raise HTTPException(404, f"there is no such command; choose upload, {', '.join(VERBS)}")
+        if vehicle == ALL and verb not in _ALL_VERBS:
+            raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
+        body = await json_body(request)
+        links, given = self._links(), self._given(body)
+        task = self._known_task(given.id, (vehicle, verb))
+        if task is None:
+            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, links, vehicle, verb, given, body))
+            self._known[given.id] = (vehicle, verb), task
+            while len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+        rows = await asyncio.shield(task)
+        return JsonAnswer({"id": given.id, "results": rows} if vehicle == ALL else rows[0])
+
+    def _known_task(self, number: str, what: tuple[str, str]) -> "asyncio.Task[Rows] | None":
+        known = self._known.get(number)
+        if known is None:
+            return None
+        if known[0] != what:
+            raise HTTPException(409, f"the id {number} was used for another command; give each command its own")
+        if known[1].done() and (known[1].cancelled() or known[1].exception() is not None):
+            return None  # it was no command: a wrong plan, for example
+        return known[1]
+
+    def _given(self, body: Mapping[str, Any]) -> Given:
+        number, at = body.get("id"), body.get("given_s")
+        if number is None:
+            number = new_id()
+        if not isinstance(number, str) or not 0 < len(number) <= _MOST_ID:
+            raise InputError(f"id is no text of 1 to {_MOST_ID} characters; send one, or none for a new one")
+        if at is None:
+            return Given(number, time.time() - self._standstill.length_s())
+        if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < 1e11 or not math.isfinite(at):
+            raise InputError("given_s is no time; send epoch seconds by the daemon's clock, as its heartbeats tell")
+        return Given(number, float(at))
+
+    def _carry_out(
+        self, links: VehicleLinks, vehicle: str, verb: str, given: Given, body: dict[str, Any]
+    ) -> Rows:  # fmt: skip
+        """Give a command to the end; in a thread."""
+        names = _names(links) if vehicle == ALL else [vehicle]
+        late = _late(given)
+        if late is not None:
+            rows = [CommandResult(given.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
+        elif verb == "upload":
+            rows = [self._upload(links, vehicle, given, body)]
+        else:
+            override = _override(body, vehicle)
+            began = links.clock() - max(0.0, given.age_s)
+            rows = links.commands(verb, names, given_s=began, command_id=given.id, override=override)
+        for row in rows:
+            self._daemon.events.publish("command", **row)
+        return rows
+
+    def _upload(self, links: VehicleLinks, vehicle: str, given: Given, body: dict[str, Any]) -> dict[str, Any]:
+        def result(outcome: Verdict, reason: str) -> dict[str, Any]:
+            return CommandResult(given.id, vehicle, "upload", outcome, reason).document()
+
+        try:
+            system = links.system_of(vehicle)
+        except OrthoSwarmError as error:
+            return result(Verdict.NOT_SENT, str(error))
+        mission = self._daemon.plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot)
+        try:
+            return result(Verdict.DONE, links.command(lambda fleet: fleet.upload(system, mission)))
+        except OrthoSwarmError as error:
+            return result(Verdict.REFUSED, str(error))
+
+    # -- plans ----------------------------------------------------------------------------------------------------
+
+    async def preflight(self, number: str, request: Request) -> Response:
+        """Check a plan's vehicles before their start ({"sortie": 1, "vehicles": {"v1": "alpha"}}).
+
+        Answers `checks`: a row a vehicle with `vehicle`, `state` and `items` (`name`, `state`: `ok`, `warning`, `red`;
+        `reason`), and the plan's `start_s`, `height_m` and `time_s`.
+        """
+        body = await json_body(request)
+        takeoffs = self._takeoffs()
+        sortie, names = names_of(body)
+        rows = await in_thread(self._threads, takeoffs.preflight, number, sortie, names)
+        flights = await in_thread(self._threads, self._daemon.plans.flights, number, sortie)
+        about = {names.get(vehicle, vehicle): flight for vehicle, flight in flights.items()}
+        checks = [row | about.get(row["vehicle"], {}) for row in rows]
+        return JsonAnswer({"plan": number, "sortie": sortie, "checks": checks})
+
+    async def start_plan(self, number: str, request: Request) -> Response:
+        """Start all vehicles of a plan at its times ({"sortie": 1}). Answers with the seconds until each takeoff.
+
+        {"vehicles": {"v1": "alpha"}} says which vehicle flies which part where names differ, {"override": {"alpha":
+        ["battery"]}} which red preflight items do not stop the start. A `pause`, `rtl` or `land` of a vehicle that
+        waits cancels its takeoff, a `start` starts it at once.
+        """
+        body = await json_body(request)
+        takeoffs, given = self._takeoffs(), self._given(body)
+        sortie, names = names_of(body)
+        override = _override(body, ALL)
+        seconds = await in_thread(self._threads, _begin, takeoffs, given, number, sortie, names, override)
+        return JsonAnswer({"plan": number, "sortie": sortie, "takeoffs_in_s": seconds}, status_code=202)
+
+    def _links(self) -> VehicleLinks:
+        if self._daemon.links is None:
+            raise HTTPException(409, "the daemon has no links; start it with --link")
+        return self._daemon.links
+
+    def _takeoffs(self) -> Takeoffs:
+        if self._daemon.takeoffs is None:
+            raise HTTPException(409, "the daemon has no links; start it with --link")
+        return self._daemon.takeoffs
+
+
+def _begin(
+    takeoffs: Takeoffs,
+    given: Given,
+    number: str,
+    sortie: int,
+    names: dict[str, str],
+    override: Mapping[str, Collection[str]],
+) -> dict[str, float]:
+    late = _late(given)
+    if late is not None:
+        raise OrthoSwarmError(f"{late}; nobody was started")
+    return takeoffs.begin(number, sortie, names, override)
+
+
+def _late(given: Given) -> str | None:
+    """Why a command is not executed because of its time, None if it is fresh."""
+    age = given.age_s
+    if age > COMMAND_S:
+        return f"it was given {age:.0f} s ago, too long to be executed now; look at the vehicle and give it again"
+    if age < -_AHEAD_S:
+        return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"
+    return None
+
+
+def _names(links: VehicleLinks) -> list[str]:
+    return [links.name_of(system) for system in sorted(links.fleet.vehicles)]
+
+
+def _override(body: Mapping[str, Any], vehicle: str) -> dict[str, list[str]]:
+    """Vehicle -> red items that do not stop its start: {"v1": ["battery"]}, or ["battery"] for one vehicle."""
+    override = body.get("override", {})
+    if isinstance(override, list) and vehicle != ALL:
+        override = {vehicle: override}
+    if not isinstance(override, dict) or not all(
+        isinstance(items, list) and all(isinstance(item, str) for item in items) for items in override.values()
+    ):
+        raise InputError('override names no preflight items; send for example {"v1": ["battery"]}, or nothing')
+    return override

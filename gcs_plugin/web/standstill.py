@@ -1,0 +1,52 @@
+"""Whether the process itself stood still: stopped, swapped out, or the laptop was closed.
+
+What lay in the sockets meanwhile is read at once afterwards, and nothing in it tells how old it is.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Final
+
+_TICK_S: Final = 0.25
+STILL_S: Final = 3.0
+_AFTER_S: Final = 1.0
+
+
+def clock_with_sleep() -> float:
+    """Seconds that also pass while the machine sleeps, where the system has such a clock (Linux)."""
+    boot = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if boot is None else time.clock_gettime(boot)
+
+
+class Standstill:
+    """Watches the event loop in which `run` runs.
+
+    Args:
+        clock: seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = clock_with_sleep) -> None:
+        self._clock = clock
+        self._ticked: float | None = None
+        self._length_s, self._ended = 0.0, float("-inf")
+
+    def tick(self) -> None:
+        """Say that the loop runs."""
+        now = self._clock()
+        if self._ticked is not None and now - self._ticked > STILL_S:
+            self._length_s, self._ended = now - self._ticked, now
+        self._ticked = now
+
+    def length_s(self) -> float:
+        """How long the process stood still just now, at most a second ago; 0 if it did not."""
+        now = self._clock()
+        if self._ticked is not None and now - self._ticked > STILL_S:
+            return now - self._ticked  # what was waiting in the socket is read before the next tick
+        return self._length_s if now - self._ended < _AFTER_S else 0.0
+
+    async def run(self) -> None:
+        """Tick until cancelled."""
+        while True:
+            self.tick()
+            await asyncio.sleep(_TICK_S)

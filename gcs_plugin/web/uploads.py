@@ -1,0 +1,204 @@
+"""Posted pictures: as many at once as memory bears, no client more than its share, none that stands still for long.
+
+A radio that vanishes leaves its upload half-sent and its connection open. Without a time-out a few hundred of these
+would stop all posting.
+"""
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final
+
+from fastapi import HTTPException, Request, Response
+from starlette.datastructures import UploadFile
+from starlette.formparsers import MultiPartException
+from starlette.requests import ClientDisconnect
+
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, parse_pose
+from gcs_plugin.web.answers import JsonAnswer, in_thread, parse_json
+from gcs_plugin.web.guard import TooLarge, bounded
+from orthoswarm.model.errors import InputError, StorageError
+
+MOST_PICTURE_BYTES: Final = 96_000_000
+_MOST_POSE_BYTES: Final = 16_000_000
+_BACKLOG: Final = 1500
+_THREADS: Final = 12
+
+
+@dataclass(frozen=True, slots=True)
+class UploadLimits:
+    """What uploads may use.
+
+    Attributes:
+        most: uploads at once. share: of one client (address) at once; more of it wait.
+        idle_s: without a byte, after which one is given up. slow_s: after that time one must have come at
+            `least_bytes_s` bytes a second since its beginning.
+    """
+
+    most: int = 256
+    share: int = 128
+    idle_s: float = 10.0
+    slow_s: float = 30.0
+    least_bytes_s: float = 1000.0
+
+
+class UploadRoute:
+    """The route that takes pictures.
+
+    Args:
+        daemon: to which they go. limits: see UploadLimits.
+
+    Attributes:
+        waiting: posts that wait for their turn.
+    """
+
+    def __init__(self, daemon: Daemon, limits: UploadLimits = UploadLimits()) -> None:
+        self._daemon, self._limits = daemon, limits
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="uploads")
+        self._turn = asyncio.Condition()
+        self._total, self._by_client = 0, Counter[str]()
+        self._names: dict[tuple[str, str], tuple[asyncio.Lock, int]] = {}
+        self.waiting = 0
+
+    def close(self) -> None:
+        """Let go of the threads."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def post_frame(self, request: Request) -> Response:
+        """Take a picture with its pose. 201 once it is safe on disk, 200 if it was there already.
+
+        Multipart: file `image`, JSON `pose` with `vehicle`, `image`, `time`, `lat_deg`, `lon_deg`, `height_m`,
+        `yaw_deg`, `pitch_deg`, `roll_deg`; `gps_fix` (MAVLink's GPS_FIX_TYPE) if known. Under load the answer waits;
+        an upload that stands still for 10 s is given up with 408.
+        """
+        refused = self._daemon.refused
+        async with self._slot(request):
+            pose, data = await self._upload(request)
+            while self._daemon.drawer.backlog > _BACKLOG:
+                await asyncio.sleep(0.02)
+            async with self._one_at_a_time(pose.vehicle, pose.image):
+                try:
+                    seq, new = await in_thread(self._threads, self._daemon.add_picture, pose, data)
+                except InputError as error:
+                    refused.note("picture", str(error), pose.vehicle, pose.image)
+                    raise
+                except StorageError as error:
+                    refused.note("disk", str(error), pose.vehicle, pose.image)
+                    raise
+        body = {"seq": seq, "vehicle": pose.vehicle, "image": pose.image, "new": new}
+        return JsonAnswer(body, status_code=201 if new else 200)
+
+    @contextlib.asynccontextmanager
+    async def _slot(self, request: Request) -> AsyncIterator[None]:
+        """Wait until the client may upload."""
+        client = request.client.host if request.client else ""
+        limits = self._limits
+        self.waiting += 1
+        try:
+            async with self._turn:
+                await self._turn.wait_for(
+                    lambda: self._total < limits.most and self._by_client[client] < limits.share
+                )  # fmt: skip
+                self._total += 1
+                self._by_client[client] += 1
+        finally:
+            self.waiting -= 1
+        try:
+            yield
+        finally:
+            self._total -= 1
+            self._by_client[client] -= 1
+            if not self._by_client[client]:
+                del self._by_client[client]
+            async with self._turn:
+                self._turn.notify_all()
+
+    async def _upload(self, request: Request) -> tuple[PostedPose, bytes]:
+        """The pose and the picture's bytes of a multipart request."""
+        try:
+            return await self._read(request)
+        except TooLarge as error:
+            raise self._refuse(413, "picture", str(error)) from None
+        except TimeoutError:
+            text = "the upload stood still or was slower than 1 kB/s; send it again when the radio is better"
+            raise self._refuse(408, "time", text, {"Connection": "close"}) from None
+        except ClientDisconnect:
+            raise self._refuse(400, "time", "the upload was broken off; send it again") from None
+        except InputError as error:
+            self._daemon.refused.note("pose", str(error))
+            raise
+
+    def _refuse(self, status: int, cause: str, text: str, headers: dict[str, str] | None = None) -> HTTPException:
+        self._daemon.refused.note(cause, text)
+        return HTTPException(status, text, headers)
+
+    async def _read(self, request: Request) -> tuple[PostedPose, bytes]:
+        length = request.headers.get("content-length", "0")
+        if length.isdigit() and int(length) > MOST_PICTURE_BYTES + _MOST_POSE_BYTES:
+            raise TooLarge(f"the request is larger than {MOST_PICTURE_BYTES // 1_000_000} MB; send a smaller picture")
+        receive = moving(request.receive, self._limits)
+        request._receive = bounded(receive, MOST_PICTURE_BYTES + _MOST_POSE_BYTES)
+        try:
+            form = await request.form(max_files=4, max_fields=8, max_part_size=_MOST_POSE_BYTES)
+        except (MultiPartException, ValueError) as error:
+            raise InputError(f"the request is no multipart form ({error}); send image and pose as one") from None
+        except HTTPException as error:
+            raise HTTPException(error.status_code, f"the request is no multipart form ({error.detail})") from None
+        try:
+            image, text = form.get("image"), form.get("pose")
+            if not isinstance(image, UploadFile):
+                raise InputError("the form has no file 'image'; send the picture there")
+            if isinstance(text, UploadFile):
+                text = (await text.read(_MOST_POSE_BYTES)).decode("utf-8", "replace")
+            if not isinstance(text, str):
+                raise InputError("the form has no 'pose'; send JSON there")
+            pose = await in_thread(self._threads, _pose, text, image.filename)
+            return pose, await image.read()
+        finally:
+            await form.close()
+
+    @contextlib.asynccontextmanager
+    async def _one_at_a_time(self, vehicle: str, image: str) -> AsyncIterator[None]:
+        """The same picture sent twice at once is stored once."""
+        key = (vehicle, image)
+        lock, users = self._names.get(key, (asyncio.Lock(), 0))
+        self._names[key] = (lock, users + 1)
+        try:
+            async with lock:
+                yield
+        finally:
+            lock, users = self._names[key]
+            if users == 1:
+                del self._names[key]
+            else:
+                self._names[key] = (lock, users - 1)
+
+
+def moving(receive: Callable[[], Awaitable[Any]], limits: UploadLimits) -> Callable[[], Awaitable[Any]]:
+    """An ASGI receive that raises TimeoutError where a body stands still, or comes too slowly on the whole."""
+    loop = asyncio.get_running_loop()
+    began, size = loop.time(), 0
+
+    async def receiving() -> Any:
+        nonlocal size
+        async with asyncio.timeout(limits.idle_s):
+            message = await receive()
+        size += len(message.get("body", b""))
+        took = loop.time() - began
+        if message.get("more_body") and took > limits.slow_s and size < took * limits.least_bytes_s:
+            raise TimeoutError
+        return message
+
+    return receiving
+
+
+def _pose(text: str, filename: str | None) -> PostedPose:
+    try:
+        document = parse_json(text)
+    except ValueError:
+        raise InputError("the pose is no JSON; send a JSON object") from None
+    return parse_pose(document, filename)
