@@ -6,6 +6,7 @@ would stop all posting.
 
 import asyncio
 import contextlib
+import json
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from starlette.requests import ClientDisconnect
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, parse_pose
-from gcs_plugin.web.answers import JsonAnswer, in_thread, parse_json
+from gcs_plugin.web.answers import JsonAnswer, in_thread
 from gcs_plugin.web.guard import TooLarge, bounded
 from orthoswarm.model.errors import InputError, StorageError
 
@@ -198,7 +199,7 @@ def moving(receive: Callable[[], Awaitable[Any]], limits: UploadLimits) -> Calla
 
 def _pose(text: str, filename: str | None) -> PostedPose:
     try:
-        document = parse_json(text)
-    except ValueError:
+        document = json.loads(text)  # a NaN is refused with its name
+    except (ValueError, RecursionError):
         raise InputError("the pose is no JSON; send a JSON object") from None
     return parse_pose(document, filename)
