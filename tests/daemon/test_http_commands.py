@@ -18,7 +18,7 @@ from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.listener import open_listener
 from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadLimits, moving
-from tests.kit.daemon_kit import GRID, line, serving
+from tests.kit.daemon_kit import GRID, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 
 LIMIT_S = 60.0
@@ -214,10 +214,8 @@ def test_half_sent_uploads_stop_neither_others_nor_their_own_sender(tmp_path):
         assert gone[0].recv(1000).startswith(b"HTTP/1.1 408")
         rows = served.until("/healthz", lambda health: health["refused"])["refused"]
         assert rows[0]["cause"] == "time"
-        again = httpx.Client(transport=httpx.HTTPTransport(local_address="127.0.0.2"), timeout=120)
-        from tests.kit.daemon_kit import form
-
-        assert again.post(f"{served.url}/api/frames", **form(other)).status_code == 201
+        with httpx.Client(transport=httpx.HTTPTransport(local_address="127.0.0.2"), timeout=120) as again:
+            assert again.post(f"{served.url}/api/frames", **form(other)).status_code == 201
         for connection in gone:
             connection.close()
 
