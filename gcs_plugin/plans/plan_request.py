@@ -12,6 +12,7 @@ import shapely
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
+from gcs_plugin.plans.ground_below import GroundBelow
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import End, Plan
@@ -50,6 +51,7 @@ class PlanRequest:
         follow: follow the lines of a file that has polygons, too.
         gaps: the area is a file of gaps as `orthoswarm coverage` writes it. fly_not_arrived: fly gaps, too, whose
             pictures were taken but have not arrived.
+        dem: height model of the ground; lines are then spaced for the highest ground of the area.
     """
 
     area: Path
@@ -75,6 +77,7 @@ class PlanRequest:
     follow: bool = False
     gaps: bool = False
     fly_not_arrived: bool = False
+    dem: Path | None = None
 
     def flight_options(self) -> Options:
         """How the flights are to be.
@@ -115,18 +118,38 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     options = request.flight_options()
     progress("area")
     if request.gaps:
+        if request.dem is not None:
+            raise InputError("--dem works for a polygon to cover; leave it out with --gaps")
         return _gap_plan(request, foot, options, progress)
     shapes, no_fly = read_shapes(request.area)
     no_fly += _no_fly_rings(request.no_fly)
     if shapes.polygons and not request.follow:
         area = make_area(shapes.polygons, no_fly)
+        ground = None if request.dem is None else _ground_below(request, request.dem, area)
+        if ground is not None:
+            above = request.altitude_m - ground.high_m
+            foot = footprint(above, fov, request.aspect, request.side_overlap, request.forward_overlap)
         plan = plan_area(area, request.vehicles, request.altitude_m, foot, request.method, options, progress)
+        if ground is not None:
+            plan = replace(plan, warnings=(*plan.warnings, ground.note(request.altitude_m)))
         return plan, area
+    if request.dem is not None:
+        raise InputError("--dem works for a polygon to cover; leave it out along given lines")
     if not shapes.lines:
         what = "line" if shapes.polygons else "polygon and no line"
         raise InputError(f"{request.area} holds no {what}; draw one in it")
     zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
     return plan_lines(shapes.lines, request.vehicles, request.altitude_m, foot, zones, options, progress), zones
+
+
+def _ground_below(request: PlanRequest, dem: Path, area: Area) -> GroundBelow:
+    """The ground below a plan, checked for clearance."""
+    if not request.starts:
+        raise InputError("give --start with --dem: heights of a mission count from the takeoff point")
+    starts = np.array(request.starts, float)
+    ground = GroundBelow.read(dem, area, area.grid.to_grid(starts[:, 0], starts[:, 1]))
+    ground.check(request.altitude_m)
+    return ground
 
 
 def _gap_plan(

@@ -24,7 +24,8 @@ def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
         figures = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         features = json.loads((folder / "all.geojson").read_text(encoding="utf-8"))["features"]
         width, height = (float(side) for side in figures["footprint_m"])
-        altitude = float(figures["altitude_m"])
+        flat = math.degrees(2.0 * math.atan(0.5 * width / float(figures["altitude_m"])))
+        fov = math.radians(float(figures.get("fov_min_deg", flat)))  # a plan from the web page does not state it
         # A leg over hills has several points; only its ends matter here.
         lines = [f["geometry"]["coordinates"] for f in features if f["properties"].get("kind") == "leg"]
         ends = np.array([[line[0][:2], line[-1][:2]] for line in lines], float).reshape(-1, 2, 2)
@@ -35,4 +36,4 @@ def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
     except (ValueError, KeyError, TypeError, IndexError):
         raise InputError(f"{folder} holds a broken plan.json or all.geojson; plan again") from None
     legs = grid.to_grid(ends[..., 1], ends[..., 0])
-    return PlannedFlight(legs, width, height, 2.0 * math.atan(0.5 * width / altitude))
+    return PlannedFlight(legs, width, height, fov)

@@ -5,7 +5,7 @@
     cover.put(the_same_views_placed)          # replaces those of the same vehicle and image
     cover.states(complete=False)
 
-One thread adds. A picture costs 0.1 to 0.3 ms on cells of 1 m from 80 m above ground.
+One thread adds. A picture that shows 190 x 150 m costs 0.6 ms in cells of 1 m.
 """
 
 import math

@@ -33,6 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
     add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
     add("--json", action="store_true", help="one JSON document on stdout")
+    dem_help = "height model of the ground: lines spaced for the highest ground, at least 20 m above it (needs --start)"
+    add("--dem", type=Path, metavar="FILE", help=dem_help)
     flight = parser.add_argument_group("flight")
     start_help = "takeoff point; give it again for more (default: at each vehicle's first line; for example -33.9,18.4)"
     flight.add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
@@ -70,11 +72,13 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_request import make_plan
 
     check_folder(args.out)
-    plan, area = make_plan(_request(args), _say)
+    request = _request(args)
+    plan, area = make_plan(request, _say)
     _say("files")
     from gcs_plugin.plans.plan_picture import draw
 
     figures = report(plan, args.autopilot)
+    figures["fov_min_deg"] = request.fov_min_deg
     files: dict[str, str | bytes] = dict(mission_files(plan, args.autopilot))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
@@ -102,6 +106,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         area=args.area or args.gaps,
         gaps=args.gaps is not None,
         fly_not_arrived=args.fly_not_arrived,
+        dem=args.dem,
         vehicles=args.vehicles,
         altitude_m=args.altitude,
         fov_min_deg=args.fov_min if args.map is None else _solved_fov(args.map),
