@@ -3,7 +3,8 @@
     python benchmarks/coverage_faults.py --flights 100
 
 No picture is rendered: a plan is flown in geometry, some of it fails, and pictures are placed with the errors that
-they state. Truth is Camera.project of the true cameras at the centres of the cells. The gaps are then flown again.
+they state (blur is taken as known, not measured). Truth is Camera.project of the true cameras at the
+centres of the cells. The gaps are then flown again, without faults.
 """
 
 import argparse
