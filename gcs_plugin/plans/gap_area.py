@@ -84,6 +84,10 @@ def gap_area(gaps: Sequence[ReadGap], no_fly: Sequence[Ring], foot: Footprint, f
     zones = [make_area([Polygon(zone)], (), grid).ground for zone in no_fly]
     forbidden = shapely.union_all(zones)
     notes: list[str] = []
+    if not zones:
+        notes.append(
+            "no no-fly zone is known: a file of gaps does not hold those of the first plan, give them with --no-fly"
+        )
     waiting = [] if fly_not_arrived else [g for g in gaps if g.cause is Cause.NOT_ARRIVED]
     if waiting:
         notes.append(

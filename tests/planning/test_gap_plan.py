@@ -64,8 +64,9 @@ def test_gaps_of_a_coverage_are_covered_with_the_solved_lens(
 
 def test_neighbouring_gaps_become_one_leg(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gaps = _gaps(tmp_path / "g.geojson", *(((0, 30 * k, 20, 30 * k + 20), "not flown") for k in range(5)))
-    _plan(tmp_path, capsys, "--gaps", gaps, "--fov-min", 60, "--vehicles", 1)
+    out = _plan(tmp_path, capsys, "--gaps", gaps, "--fov-min", 60, "--vehicles", 1)
     (leg,) = _legs(tmp_path)
+    assert any("--no-fly" in w for w in out["warnings"])
     assert abs(leg[0, 0] - 10.0) < 40.0 and abs(leg[-1, 1] - leg[0, 1]) > 60.0
 
 
