@@ -3,7 +3,7 @@
     python -m benchmarks.wrong_maps SET... --out DIR [--town OTHER_SET] [--kinds mirror_ns blank ...]
 
 SET is a folder of `orthoswarm twin make`. Each kind of map is made of the set's basemap, lies at the same place and
-is given to the default refiner. A line a run: how many legs are `matched`, `carried`, `failed`, how many pictures are
+is given to a refiner. A line a run: how many legs are `matched`, `carried`, `failed`, how many pictures are
 `fine`, and the median error of their middles on the ground.
 """
 
@@ -106,7 +106,7 @@ def altered(source, target, change, town=None):
         file.write(changed)
 
 
-def measure(folder, basemap_file):
+def measure(folder, basemap_file, refiner="swarm"):
     """What the refiner makes of a set with a map."""
     frames = telemetry.load([folder / "photos"]).frames
     grid = area_grid(frames)
@@ -115,7 +115,7 @@ def measure(folder, basemap_file):
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
     start = time.process_time()
-    refinement = make_refiner("swarm", grid.epsg, local_origin(grid, frames)).refine_batch(vehicles, basemap)
+    refinement = make_refiner(refiner, grid.epsg, local_origin(grid, frames)).refine_batch(vehicles, basemap)
     seconds = time.process_time() - start
     truth = read_truth(folder / "truth" / "frames.csv")
     placed = [p for solution in refinement.fine for p in solution.placed]
@@ -136,6 +136,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--refine", default="swarm", choices=("swarm", "paper"))
     parser.add_argument("--town", type=Path, help="another set, whose map is given as that of another town")
     parser.add_argument("--kinds", nargs="+", choices=[*WRONG, "town", *RIGHT])
     args = parser.parse_args()
@@ -148,7 +149,7 @@ def main():
                 target = args.out / f"{folder.name}-{kind}.tif"
                 town = args.town / "basemap.tif" if kind == "town" else None
                 altered(folder / "basemap.tif", target, {**WRONG, **RIGHT}.get(kind, right), town)
-                row = {"set": folder.name, "map": kind, **measure(folder, target)}
+                row = {"set": folder.name, "map": kind, **measure(folder, target, args.refine)}
                 target.unlink()
                 print(json.dumps(row), flush=True)
                 results.write(json.dumps(row) + "\n")

@@ -6,3 +6,17 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True)
 class RegistrationConfig:
     """Registration onto the map and onto neighbours."""
+
+    first_tie_reach_m: float = 14.0
+    """How far a tie point is searched on the map after the coarse registration, to each side; chosen, not measured."""
+    evidence_tolerances_m: tuple[float, float, float] = (0.7, 1.5, 3.0)
+    """Distances within which tie points agree on a place on the map: after a good adjustment, with tilt and drift left,
+    for sparse photos; chosen, not measured."""
+    evidence_small_half_m: float = 4.0
+    """Half a patch where those of the usual size confirm nothing: so that flights of three photos have some dozens;
+    chosen, not measured."""
+    false_matches: float = 1e-4
+    """A flight is taken to lie on the map if a map of other ground would show an agreement of tie points as good as the
+    one found so many times only (expected number of false matches); measured by benchmarks/wrong_maps.py."""
+    leg_by_chance: float = 0.01
+    """A leg of such a flight is matched if its ties agree with its place by chance with this probability only."""

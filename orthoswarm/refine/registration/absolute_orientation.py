@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
@@ -249,16 +250,26 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
     flight.adjustment = new
 
 
-def settle(flight: Flight, basemap: MapWindow, origin: Array, surface: GroundModel) -> Settled:
-    """Two rounds of ties and links; the flight must lie within some metres of the map already.
+def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMatches:
+    """Tie points of a flight that lies on the map within some metres."""
+    reach = active().registration.first_tie_reach_m
+    return accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, reach))
+
+
+def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
+    """The same with smaller patches beside each other: evidence where few large ones fit, too noisy to be used."""
+    reach = active().registration.first_tie_reach_m
+    return accepted(tie_round(flight, surface, ground, 2.0 * half_m, reach, half_m))
+
+
+def settle(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: GroundModel) -> Settled:
+    """Two rounds of ties and links.
 
     Args:
-        flight: after the coarse registration.
-        basemap: the map. origin: (2,) of the local frame.
+        flight: after the coarse registration. ground: the map below it.
+        matches: its first ties, which confirm that it lies there.
         surface: ground after the relative adjustment.
     """
-    ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-    matches = accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, 14.0))
     matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
     for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):

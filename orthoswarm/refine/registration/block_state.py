@@ -13,13 +13,19 @@ from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
+from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
 
 Array = NDArray[np.float64]
 
+NOT_FOUND = (
+    "no part of this flight was found on the map: it lies where its receiver says; check that the map shows this place"
+)
+CARRIED = "the map does not show what this flight saw; pictures of its neighbours carry it"
 FEWEST_SPARSE = 12
-LEG_TIES = 3
+LEG_AGREES_M, NEAR_M = 1.2, 5.0
+"""How near to its place on the map a tie of the last round agrees with it; how far it was searched."""
 
 
 @dataclass(slots=True)
@@ -37,6 +43,7 @@ class VehicleState:
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
             were carry it.
+        false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -62,11 +69,19 @@ class VehicleState:
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unfound: bool = False
+    false_matches: float = float("nan")
 
 
 def lies_on_map(state: VehicleState) -> bool:
     """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
     return state.on_map or state.carried
+
+
+def findings(state: VehicleState) -> list[str]:
+    """What has to be said of a vehicle: findings of its records, and how it came to lie where it does."""
+    if state.carried:
+        return [*state.flight.warnings, CARRIED]
+    return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
 
 
 def seen_from_above(state: VehicleState) -> Array:
@@ -126,7 +141,7 @@ def to_solution(
         0.0,
         map_lean,
         state,
-        list(flight.warnings),
+        findings(state),
         dict(state.timings),
         _mean_gsd(cameras, flight),
     )
@@ -165,9 +180,10 @@ def leg_states(state: VehicleState) -> list[Leg]:
         members = np.flatnonzero(flight.leg == k)
         mine = flight.leg[state.matches.camera] == k
         residual = flight.adjustment.tie_residual
-        agree = mine & (np.hypot(*residual.T) < 1.2) if len(residual) == len(mine) else mine
+        agree = mine & (np.hypot(*residual.T) < LEG_AGREES_M) if len(residual) == len(mine) else mine
         share = float(agree.sum()) / max(int(mine.sum()), 1)
-        matched = state.on_map and int(agree.sum()) >= LEG_TIES and share > 0.4
+        by_chance = agreement_probability(int(agree.sum()), int(mine.sum()), LEG_AGREES_M, NEAR_M)
+        matched = state.on_map and by_chance <= active().registration.leg_by_chance
         how: LegState = "matched" if matched else ("failed" if state.had_map and not lies_on_map(state) else "carried")
         sigma = float(np.median(state.sigma_m[members]))
         out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))

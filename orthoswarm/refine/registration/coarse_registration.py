@@ -1,6 +1,6 @@
 """Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +21,6 @@ REACHES_M = (60.0, 150.0)
 ACROSS_PX = 150
 """A picture's width in pixels of the small mosaics."""
 CONSENSUS_M = 6.0
-MANY, CLEAR_RATIO = 4, 0.7
-"""Fewer windows than this agree by chance on a map of other ground (5 of 26 maps of noise, the best ratio 0.78), so one
-of them must have a clear peak (right ones have 0.3 to 0.5)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +39,20 @@ class CoarseFit:
     confidence: float
 
 
-def coarse_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
-    """Register windows of each leg near their records, then all together, then farther off; None without consensus."""
+def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[CoarseFit]:
+    """Guesses where a flight lies on the map, one after the other, for the caller to confirm.
+
+    Windows of each leg near their records; where these are refuted all windows together; then windows farther off.
+    """
     cameras = flight.cameras()
     width = flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
     gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
     tiles = TiledMap(basemap, gsd)
     near, far = REACHES_M
-    return (
-        _fit_within(near, flight, tiles, origin, gsd)
-        or _fit_together(near, flight, tiles, origin, gsd)
-        or _fit_within(far, flight, tiles, origin, gsd)
-    )
+    for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
+        fit = find(reach_m, flight, tiles, origin, gsd)
+        if fit is not None:
+            yield fit
 
 
 def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
@@ -79,10 +78,6 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
     if not matches:
         return None
     inlier = _consensus(matches)
-    if inlier.sum() < (1 if len(matches) == 1 else 2) or inlier.mean() < 0.34:
-        return None
-    if inlier.sum() < MANY and min(m.ratio for m, ok in zip(matches, inlier) if ok) > CLEAR_RATIO:
-        return None
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 

@@ -14,7 +14,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
-from orthoswarm.refine.registration.coarse_registration import coarse_fit, shift_cameras
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, shift_cameras
 from orthoswarm.refine.registration.neighbour_ties import Held, held_cameras, link_to_held, release
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
@@ -95,35 +95,40 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
         A state that is `carried`; the same one where the neighbours' pictures share too little with it.
     """
     state, others = item
+    others = [other for other in others if lies_on_map(other)]
     out = deepcopy(state)
     out.carried = True  # so that neighbours on the map are held
-    held = held_cameras(out, [other for other in others if lies_on_map(other)])
+    held = held_cameras(out, others)
     if held is None:
         return state
-    flight = out.flight
-    mosaic = HeldMosaic(held, epsg, origin)
-    fit = coarse_fit(flight, mosaic, origin)
-    if fit is None:
-        return state
+    for fit in coarse_fits(out.flight, HeldMosaic(held, epsg, origin), origin):
+        out = deepcopy(state)
+        out.carried = True
+        if _linked(out, fit, others):
+            out.flight.pictures.drop()
+            for other in others:
+                other.flight.pictures.drop()
+            return out
+    return state
+
+
+def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> bool:
+    """Adjust a vehicle with its points observed in held pictures; False where too few of them agree."""
+    flight = state.flight
     shift_cameras(flight, fit.correction)
-    held = held_cameras(out, [other for other in others if lies_on_map(other)])
+    held = held_cameras(state, others)
     if held is None:
-        return state
+        return False
     found = link_to_held(flight, held, working_gsd(flight), REACH_PX)
     if found < FEWEST_LINKS:
-        return state
+        return False
     adj = flight.adjustment
     for c in SCHEDULE:
-        adj.step(c, out.surface.height_prior(adj.points))
+        adj.step(c, state.surface.height_prior(adj.points))
     linked = adj.tracks.camera >= len(flight.frames)
     agree = int((adj.obs_weight[linked] > 0.3).sum())
     if agree < max(FEWEST_LINKS, LEAST_SHARE * found):
-        return state
+        return False
     release(flight)
-    out.confidence = agree / found
-    flight.warnings[:] = [w for w in flight.warnings if "no part of this flight was found on the map" not in w]
-    flight.warnings.append("the map does not show what this flight saw; pictures of its neighbours carry it")
-    flight.pictures.drop()
-    for other in others:
-        other.flight.pictures.drop()
-    return out
+    state.confidence = agree / found
+    return True

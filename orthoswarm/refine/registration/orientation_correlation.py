@@ -210,14 +210,14 @@ def by_edges(strip: Strip) -> Found | None:
 
 
 def _edges(strip: Strip) -> tuple[Complex, Complex] | None:
-    """Orientation fields of a strip and of its map; None where the strip has hardly an edge."""
+    """Orientation fields of a strip and of its map; None where one of them has hardly an edge."""
     moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), 0.7), strip.valid)
     fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), 0.7), strip.known)
-    return None if np.count_nonzero(moving) < 400 else (moving, fixed)
+    return None if min(np.count_nonzero(moving), np.count_nonzero(fixed)) < FEWEST_EDGES else (moving, fixed)
 
 
+FEWEST_EDGES = 400
 STACK_BLUR_PX, STACK_APART_PX = 2.0, 6
-STACK_Z, STACK_RATIO = 5.0, 0.9
 STACK_KNOWN = 0.7
 
 
@@ -233,8 +233,8 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         strips: of one flight, at the same pixel size and reach.
 
     Returns:
-        Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak; None
-        where it does not stand out.
+        Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak: a guess
+        that the caller must confirm. None where no strip has an edge.
     """
     total = None
     for strip in strips:
@@ -252,8 +252,6 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
     rest = _without(total, int(r), int(c), STACK_APART_PX)
     rest = rest[rest != 0]
     z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
-    if z < STACK_Z or ratio > STACK_RATIO:
-        return None
     offset, gsd = np.mean([s.offset for s in strips], axis=0), strips[0].gsd_m
     return offset + gsd * np.array([column, -row]), z, ratio
 

@@ -26,7 +26,8 @@ from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
 from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
-from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
+from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.strategy.vehicle_passes import Options, from_flight, read_frame, relative
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 
@@ -113,7 +114,9 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     state = from_flight(flight, surface, origin, None, watch)
     fit = None
     if basemap is not None:
-        fit = coarse_fit(flight, basemap, origin)
+        found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
+        fit = None if found is None else found.fit
+        flight.pictures.drop()
     if fit is not None:
         height = float(np.median(flight.cameras().position[:, 2]))
         share = ONE_WAY_SIGMA if one_way else MANY_WAYS_SIGMA

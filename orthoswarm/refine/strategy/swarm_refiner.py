@@ -21,7 +21,7 @@ from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours, place_by_neighbours, split_refinable
-from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map, to_solution
+from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import lay_beside
 from orthoswarm.refine.strategy.first_pass import first_passes
 from orthoswarm.refine.strategy.second_pass import second_pass
@@ -99,7 +99,7 @@ class SwarmRefiner:
         others = [state for n in neighbours for state in states_of(n)]
         if not own or not any(neighbours_of(state, others) for state in own):
             return solution
-        told = {warning for state in own for warning in state.flight.warnings}
+        said = {warning for state in own for warning in findings(state)}
         now = self._beside(own, others, basemap)
         there = {p.frame.image for p in now.placed}
         extra = [p for p in solution.placed if p.frame.image not in there]
@@ -108,7 +108,7 @@ class SwarmRefiner:
             now,
             placed=[*own_frames, *move_with_neighbours(extra, solution.placed, now.placed)],
             dropped=dict(solution.dropped),
-            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in told)])),
+            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in said)])),
         )
 
     def _beside(self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None) -> Solution:

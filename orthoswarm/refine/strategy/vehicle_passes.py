@@ -1,6 +1,6 @@
 """The two passes of one vehicle: by itself, then on the common level beside neighbours that are held."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,8 @@ from orthoswarm.refine.flight.relative_block import (
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.registration.absolute_orientation import settle
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
-from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fit, second_look, shift_cameras
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, second_look
+from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
@@ -56,7 +57,6 @@ NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
 """Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
 DECENTRED_SHARE = 0.02
 """What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
-NOT_FOUND = "no part of this flight was found on the map; it lies in the GPS frame"
 REST_STEPS, FREE_STEPS, FREE_ROUNDS = 3, 6, 4
 AT_REST = 0.03
 """A focal length that still moves by this share in three steps is not at rest."""
@@ -169,15 +169,9 @@ def from_flight(
     )  # fmt: skip
     if basemap is not None:
         state.had_map = True
-        fit = coarse_fit(flight, basemap, origin)
-        if fit is None and learned:
-            fit = second_look(flight, basemap, origin)
-        watch.lap("coarse registration")
-        state.unfound = fit is None
-        if fit is not None:
-            _onto_map(state, fit, basemap, origin, watch)
-        elif learned:
-            flight.warnings.append(NOT_FOUND)
+        state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
+        if state.unfound and learned:
+            _second_look_onto_map(state, second_look(flight, basemap, origin), basemap, origin, watch)
     flight.pictures.drop()
     state.timings = watch.seconds
     return state
@@ -280,25 +274,39 @@ def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> Coarse
 def placed_again(
     item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
 ) -> VehicleState:
-    """A flight that edges did not find, after `look_again`: settled where it was found, else told of."""
+    """A flight that edges did not find, after `look_again`: registered where that found it."""
     state, fit = item
-    if fit is None or basemap is None:
-        state.flight.warnings.append(NOT_FOUND)
-        return state
     watch = Stopwatch()
-    state.unfound = False
-    _onto_map(state, fit, basemap, origin, watch)
+    _second_look_onto_map(state, fit, basemap, origin, watch)
     state.flight.pictures.drop()
     watch.add_to(state.timings)
     return state
 
 
-def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: Array, watch: Stopwatch) -> None:
-    """Settle a flight where it was found; it stays as it was where that would need another field of view."""
+def _second_look_onto_map(
+    state: VehicleState, fit: CoarseFit | None, basemap: MapWindow | None, origin: Array, watch: Stopwatch
+) -> None:
+    """Register a flight where learned matching found it, if tie points confirm that."""
+    state.unfound = False
+    if fit is not None and basemap is not None:
+        _onto_map(state, [fit], basemap, origin, watch)
+
+
+def _onto_map(
+    state: VehicleState, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, watch: Stopwatch
+) -> bool:
+    """Register a flight where its tie points confirm a guess; it stays as it was where they confirm none.
+
+    It also stays where the map would ask for another field of view than its pictures. Returns whether a guess was
+    confirmed.
+    """
     flight = state.flight
     before, alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
-    shift_cameras(flight, fit.correction)
-    settled = settle(flight, basemap, origin, state.surface)
+    found = confirmed(flight, fits, basemap, origin, state.surface)
+    watch.lap("coarse registration")
+    if found is None:
+        return False
+    settled = settle(flight, found.ground, found.matches, state.surface)
     told, now = (
         float(np.degrees(fov_rad(float(a.cameras.lens[0, F]), flight.pictures.size[0])))
         for a in (before, flight.adjustment)
@@ -309,16 +317,17 @@ def _onto_map(state: VehicleState, fit: CoarseFit, basemap: MapWindow, origin: A
             f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
             "found on the map is not believed"
         )
-        return
-    state.map_shift = fit.correction
+        return True
+    state.map_shift = found.fit.correction
     state.surface, state.ties, state.matches, state.roofs = (
         settled.surface,
         settled.ties,
         settled.matches,
         settled.roofs,
     )
-    state.on_map, state.confidence = True, fit.confidence
+    state.on_map, state.confidence, state.false_matches = True, found.fit.confidence, found.false_matches
     watch.lap("ties and absolute")
+    return True
 
 
 def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:

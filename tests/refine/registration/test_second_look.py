@@ -23,16 +23,16 @@ def scene(tmp_path_factory):
 @pytest.fixture
 def blind(monkeypatch):
     """Edges do not find one vehicle, the second look does (here: edges again); gives the vehicles it was asked for."""
-    by_edges, asked = vehicle_passes.coarse_fit, []
+    by_edges, asked = vehicle_passes.coarse_fits, []
 
     def first(flight, basemap, origin):
-        return None if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
+        return () if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
 
     def second(flight, basemap, origin):
         asked.append(flight.frames[0].vehicle)
-        return by_edges(flight, basemap, origin)
+        return next(by_edges(flight, basemap, origin))
 
-    monkeypatch.setattr(vehicle_passes, "coarse_fit", first)
+    monkeypatch.setattr(vehicle_passes, "coarse_fits", first)
     monkeypatch.setattr(vehicle_passes, "second_look", second)
     return asked
 

@@ -1,0 +1,84 @@
+"""Whether tie points show that a flight lies on a map, or only what any map would show by chance.
+
+An a-contrario test (Desolneux, Moisan, Morel: From Gestalt Theory to Image Analysis, 2008; for fitted models AC-RANSAC,
+Moisan and Stival 2004). On a map of other ground a tie point finds its best match anywhere in its search window, all
+places alike. So the number of tie points that agree with one shift by chance is binomial, and the number of models that
+were tried times its tail is the expected number of false matches: how many agreements as good as the one observed a
+wrong map would give. Ties that share ground are not independent; only one of a patch's size is counted.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from orthoswarm.config import active
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+FEWEST = 4
+"""Ties of a group: fewer agree with themselves alone."""
+_MOST_PAIRS = 400
+
+
+def false_matches_log10(ground: Array, shift: Array, order: Array, leg: Ints, reach_m: float, patch_m: float) -> float:
+    """Decimal logarithm of the expected number of false matches behind the best agreement of tie points.
+
+    What is tried: one shift for all of them, and for each leg a line of shifts along it (drift of the receiver, error
+    of heading), within each of the tolerances of the configuration.
+
+    Args:
+        ground: float64 (Q, 2), where the ties are, metres.
+        shift: float64 (Q, 2), from there to where the map shows them, metres, before anything was fitted to them.
+        order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between legs.
+        reach_m: how far each was searched, to each side. patch_m: side of what was compared.
+    """
+    alone = _one_a_patch(ground, patch_m)
+    shift, order, leg = shift[alone], order[alone], leg[alone]
+    groups = [(shift, np.zeros(len(shift)))]
+    groups += [(shift[leg == k], order[leg == k]) for k in np.unique(leg[leg >= 0])]
+    groups = [g for g in groups if len(g[0]) >= FEWEST]
+    tolerances = active().registration.evidence_tolerances_m
+    best = min((_group(s, t, reach_m, tolerances) for s, t in groups), default=0.0)
+    return best + float(np.log10(max(len(groups), 1)))
+
+
+def agreement_probability(agree: int, count: int, within_m: float, reach_m: float) -> float:
+    """Probability that so many of `count` ties lie within a distance of their place by chance."""
+    return float(binom.sf(agree - 1, count, _share(within_m, reach_m)))
+
+
+def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, ...]) -> float:
+    """The same for one group: lines through two of its ties, or where all are at one place shifts of one."""
+    count = len(shift)
+    if np.ptp(along) > 0:
+        i, j = np.triu_indices(count, 1)
+        apart = along[j] != along[i]
+        i, j = i[apart], j[apart]
+        step = -(-len(i) // _MOST_PAIRS)
+        i, j = i[::step], j[::step]
+        slope = (shift[j] - shift[i]) / (along[j] - along[i])[:, None]
+        fixed = 2
+    else:
+        i, slope, fixed = np.arange(count), np.zeros((count, 2)), 1
+    if not len(i):
+        return 0.0
+    model = shift[i][:, None] + slope[:, None] * (along[None] - along[i][:, None])[..., None]
+    away = np.hypot(*np.moveaxis(shift[None] - model, -1, 0))
+    best = 0.0
+    for tolerance in tolerances:
+        most = int((away < tolerance).sum(1).max())
+        tail = binom.logsf(most - fixed - 1, count - fixed, _share(tolerance, reach_m)) / np.log(10)
+        best = min(best, float(tail) + float(np.log10(len(i) * len(tolerances))))
+    return best
+
+
+def _share(within_m: float, reach_m: float) -> float:
+    """Share of a square search window that lies within a distance of one place."""
+    return min(1.0, np.pi * within_m**2 / (2.0 * reach_m) ** 2)
+
+
+def _one_a_patch(ground: Array, patch_m: float) -> NDArray[np.intp]:
+    """The first tie of each cell of a patch's size."""
+    cells = np.floor(ground / patch_m).astype(np.int64)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1]) if len(ground) else np.zeros(0, np.intp)
