@@ -16,7 +16,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
 from orthoswarm.mosaic.extent import drawn_window, ground_level, map_offset, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
-from orthoswarm.mosaic.oblique import loose, strays, told
+from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
@@ -54,7 +54,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     fine = _looking_down(run, state, [p for s in refinement.fine for p in s.placed] + state.still)
     coarse = [p for s in refinement.coarse for p in s.placed] + state.still
     coarse = [p for p in coarse if p.frame.image not in state.rejected]
-    state.warnings += loose(fine, state.odd)
+    state.warnings += weakly_held_warning(fine, state.odd)
     if run.options.gsd_m is None:
         state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
     if run.options.gains:
@@ -74,7 +74,7 @@ def _looking_down(run: RunContext, state: RunState, placed: Sequence[PlacedFrame
     """The frames without those that look far aside among others, which are left out."""
     aside = strays(placed)
     state.leave_out(aside, placed)
-    state.warnings += told(aside)
+    state.warnings += stray_warning(aside)
     return [p for p in placed if p.frame.image not in aside]
 
 

@@ -32,7 +32,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.extent import partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd
-from orthoswarm.mosaic.oblique import strays, told
+from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem
@@ -141,5 +141,5 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     state.undrawn = {**aside, **stats.rejected}
     if run.options.until == "realtime":
         state.leave_out(state.undrawn, state.recorded.placed)
-        state.warnings += told(aside)
+        state.warnings += stray_warning(aside)
     return [p for p in placed if p.frame.image not in stats.rejected]

@@ -31,14 +31,14 @@ from orthoswarm.model.errors import InputError
 
 
 def find_mask(reference: Path, given: str | None) -> Path | None:
-    """The mask to use: the one given; without one, a twin's mask of level ground beside its reference.
+    """The mask to use: the user's; without one, a twin's mask of level ground in the folder of its reference.
 
     Roofs and crowns lean in every orthoimage that is rectified on the ground, so they say nothing about its position.
     """
     if given is not None:
         return None if given == "none" else Path(given)
-    beside = reference.with_name("ground_mask.tif")
-    return beside if beside.exists() else None
+    twin_mask = reference.with_name("ground_mask.tif")
+    return twin_mask if twin_mask.exists() else None
 
 
 def evaluate_ortho(

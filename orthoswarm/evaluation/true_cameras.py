@@ -41,7 +41,7 @@ def read_truth(path: Path) -> dict[str, tuple[str, int, Camera]]:
 
 
 def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
-    """Columns and rows of a picture: from the table, else from the picture beside it, else 640x480."""
+    """Columns and rows of a picture: from the table, else from the picture in the same folder, else 640x480."""
     if row.get("width_px") and row.get("height_px"):
         return int(row["width_px"]), int(row["height_px"])
     picture = truth.parent.parent / "photos" / row["image"]
@@ -54,8 +54,8 @@ def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
 def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
     """Compare a product's frames.jsonl with true cameras.
 
-    The plane of the homographies is `ground_z_m` of report.json beside frames.jsonl (0 without one); the true ground
-    level is the median of dtm.tif beside the truth, at the cameras' nadirs (0 without one).
+    The plane of the homographies is `ground_z_m` of report.json in the folder of frames.jsonl (0 without one); the true
+    ground level is the median of dtm.tif in the folder of the truth, at the cameras' nadirs (0 without one).
 
     Raises:
         InputError: if nothing in common can be read.

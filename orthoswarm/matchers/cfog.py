@@ -128,7 +128,7 @@ def tile_centres(valid: Mask, step: int = TILE_PX) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Cfog:
-    """Patch to map without weights: one shift of the whole patch first, then tiles about it.
+    """Patch to map without weights: one shift of the complete patch first, then tiles about it.
 
     Attributes:
         search: reach of the tiles about the common shift, pixels.
@@ -152,8 +152,8 @@ class Cfog:
         inner = (slice(odd, odd + 2 * wide[1]), slice(odd, odd + 2 * wide[0]))
         coarse = cv2.resize(window[inner], wide, interpolation=cv2.INTER_AREA)
         coarse_known = cv2.resize(known[inner].astype(np.uint8), wide, interpolation=cv2.INTER_NEAREST) > 0
-        whole = correlate(features(small, small_valid), features(coarse, coarse_known))
-        shift = np.array([reach + 2 * whole.column, reach + 2 * whole.row])
+        common = correlate(features(small, small_valid), features(coarse, coarse_known))
+        shift = np.array([reach + 2 * common.column, reach + 2 * common.row])
         centres = tile_centres(valid)
         wanted = centres + shift
         return match_tiles(features(patch, valid), features(window, known), valid, wanted, centres, self.search)

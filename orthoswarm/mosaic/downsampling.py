@@ -28,8 +28,8 @@ def reduced(picture: Bytes, factor: int) -> tuple[Bytes, int]:
     if factor <= 1:
         return picture, 1
     height, width = picture.shape[0] // factor, picture.shape[1] // factor
-    whole = picture[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)), factor
+    cropped = picture[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA)), factor
 
 
 def pack(picture: Bytes, factor: int = 1) -> tuple[NDArray[np.uint32], int]:

@@ -1,7 +1,7 @@
-"""Pictures that look far off among those that look straight down: good for the adjustment, no use for an orthoimage.
+"""Oblique pictures in a nadir flight: good for the adjustment, of no use for an orthoimage.
 
-What such a picture shows at its far end is smeared over ten times its size, and houses lean away over whole streets;
-since no other picture looks there, it would surround the map with that.
+The far end of such a picture is stretched to ten times its size, and houses lean over whole streets. As no other
+picture looks there, the map would be surrounded by that.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ def tilts(placed: Sequence[PlacedFrame]) -> NDArray[np.float64]:
 def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
     """Pictures that look far off where the others of their vehicle look straight down: image -> why they are left out.
 
-    A vehicle that looks aside with more than a third of its pictures means to do so, and keeps them.
+    A vehicle with more than a third of oblique pictures took them on purpose, and keeps them.
     """
     tilt = tilts(placed)
     members: dict[str, list[int]] = {}
@@ -45,7 +45,7 @@ def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
     return out
 
 
-def told(reasons: dict[str, str]) -> list[str]:
+def stray_warning(reasons: dict[str, str]) -> list[str]:
     """The warning about strays that were left out of a map."""
     if not reasons:
         return []
@@ -53,12 +53,12 @@ def told(reasons: dict[str, str]) -> list[str]:
     return [f"{many} far aside among others that look straight down; left out of the map ({min(reasons)} first)"]
 
 
-def loose(placed: Sequence[PlacedFrame], told_already: Sequence[PlacedFrame] = ()) -> list[str]:
-    """The warning about pictures that too little holds in the adjustment; they are drawn where no other looks.
+def weakly_held_warning(placed: Sequence[PlacedFrame], reported: Sequence[PlacedFrame] = ()) -> list[str]:
+    """The warning about pictures with too few observations in the adjustment; they are drawn where no other looks.
 
-    Those that were told already are left out, and so are all where none is better.
+    Those reported already are left out, and so are all where none is better.
     """
-    known = {p.frame.image for p in told_already}
+    known = {p.frame.image for p in reported}
     weak = sorted(p.frame.image for p in placed if p.weak and p.frame.image not in known)
     if not weak or all(p.weak for p in placed):
         return []

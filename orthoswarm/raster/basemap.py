@@ -31,7 +31,7 @@ class _Source(Protocol):
     def gsds(self) -> list[float]:
         """A pixel size for each of the resolutions that are stored, metres."""
 
-    def require_whole(self, bounds: BoundingBox) -> None:
+    def require_complete(self, bounds: BoundingBox) -> None:
         """Raise UnreadableMapError if the file is shorter than what it says to hold within bounds."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
@@ -107,7 +107,7 @@ class Basemap:
         bounds = near.intersection(self.bounds)
         if bounds.empty:
             return
-        self._source.require_whole(bounds)
+        self._source.require_complete(bounds)
         for gsd in self._source.gsds():
             for window in sample_windows(bounds, gsd):
                 self.gray(window, gsd)

@@ -98,7 +98,7 @@ class RasterMap:
         """A pixel size for each stored resolution, metres."""
         return [self.native_gsd_m, *(2.0 * f * self.native_gsd_m for f in self._factors)]
 
-    def require_whole(self, bounds: BoundingBox) -> None:
+    def require_complete(self, bounds: BoundingBox) -> None:
         """Raise UnreadableMapError if the file is too short for its blocks within bounds (in the area's grid)."""
         from rasterio.warp import transform_bounds
 

@@ -164,10 +164,10 @@ def _no_cover(path: Path, epsg: int, bounds: BoundingBox, cover: float) -> str:
 
 def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
     """Refuse ground (N,) above cameras (N,), both over takeoff; NaN where a camera's height is not known."""
-    told = np.isfinite(cameras)
-    if told.any() and float((ground > cameras)[told].mean()) > MOST_BURIED:
+    known = np.isfinite(cameras)
+    if known.any() and float((ground > cameras)[known].mean()) > MOST_BURIED:
         raise InputError(
-            f"by {Path(path).name} the ground lies above {float((ground > cameras)[told].mean()):.0%} of the cameras "
+            f"by {Path(path).name} the ground lies above {float((ground > cameras)[known].mean()):.0%} of the cameras "
             f"(its heights below the flight span {ground.max() - ground.min():.0f} m); check that it is this area's "
             "and in metres"
         )

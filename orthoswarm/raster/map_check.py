@@ -1,6 +1,6 @@
 """Whether a map can be read where it is needed: found before the work begins, without reading all of it.
 
-A copy that was cut short opens like a whole one (a TIFF's directory often stands at its beginning), and blocks that
+A copy that was cut short opens like a complete one (a TIFF's directory often stands at its beginning), and blocks that
 were never written are zeros. So the places of all blocks are compared with the file's length, and some are decoded.
 """
 

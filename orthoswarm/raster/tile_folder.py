@@ -98,7 +98,7 @@ class TileFolder:
         """A pixel size for each zoom level, metres."""
         return [self.native_gsd_m * 2 ** (self._zoom - zoom) for zoom in self._columns]
 
-    def require_whole(self, bounds: BoundingBox) -> None:
+    def require_complete(self, bounds: BoundingBox) -> None:
         """Nothing to compare: each tile is a file of its own, and one that cannot be decoded is a hole in the map."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:

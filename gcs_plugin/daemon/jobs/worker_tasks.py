@@ -29,7 +29,7 @@ from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
-from orthoswarm.mosaic.oblique import strays, told
+from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
 
@@ -135,7 +135,7 @@ def without_strays(solution: Solution) -> Solution:
         solution,
         placed=[p for p in solution.placed if p.frame.image not in out],
         dropped={**solution.dropped, **out},
-        warnings=[*solution.warnings, *told(out)],
+        warnings=[*solution.warnings, *stray_warning(out)],
     )
 
 
