@@ -168,6 +168,8 @@ class Takeoffs:
                     self._condition.wait(due - self._clock())
                     continue
                 ready = self._schedule.due(self._clock())
+                if not ready:  # an earlier start is still undecided
+                    self._condition.wait(_LOOK_S)
             for system in ready:
                 threading.Thread(target=self._start, args=(self._names[system], system), daemon=True).start()
 

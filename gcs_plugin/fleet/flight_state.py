@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 STILL_S: Final = 2.5
 """How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
+_STILL_UNKNOWN_S: Final = 8.0
+"""The same where its mission is not known: an item may let it wait, and PX4 hovers for some seconds before it lands."""
 _SINKS_M_S: Final = 0.3
 _SLOW_M_S: Final = 1.0
 _LOW_M: Final = 1.5
@@ -98,11 +100,14 @@ def _on_mission(vehicle: "Vehicle") -> Word:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
     if command in (LAND, VTOL_LAND) and _comes_down(vehicle):
         return Word.LANDING
+    if command is None and _comes_down(vehicle) and vehicle.landed != "taking off":
+        return Word.LANDING
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.LANDING if _comes_down(vehicle) else Word.HOLDING
     if command == TAKEOFF or vehicle.landed == "taking off":
         return Word.TAKING_OFF
-    if vehicle.mission_state == _MISSION_PAUSED or (vehicle.still_s >= STILL_S and not waits):
+    still_s = _STILL_UNKNOWN_S if command is None else STILL_S
+    if vehicle.mission_state == _MISSION_PAUSED or (vehicle.still_s >= still_s and not waits):
         return Word.PAUSED
     return Word.ON_MISSION
 

@@ -30,26 +30,32 @@ class TakeoffSchedule:
     airspace: Airspace | None = None
     flown: dict[int, float] = field(default_factory=dict)
     _planned: dict[int, float] = field(default_factory=dict)
+    _undecided: dict[int, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, delays: Mapping[int, float], now: float, airspace: Airspace | None = None) -> "TakeoffSchedule":
         """Starts so many seconds from now, by system id."""
         waiting = {system: now + delay for system, delay in delays.items()}
-        return cls(waiting, airspace, {}, dict(waiting))
+        return cls(waiting, airspace, {}, dict(waiting), {})
 
     def due(self, now: float) -> list[int]:
-        """Those whose time has come; they wait no longer."""
+        """Those whose time has come, and before whom nobody's start is still undecided; they wait no longer."""
         ready = sorted((s for s, at in self.waiting.items() if at <= now), key=lambda s: self.waiting[s])
+        begun: list[int] = []
         for system in ready:
-            del self.waiting[system]
-        return ready
+            if any(at < self.waiting[system] for at in self._undecided.values()):
+                break
+            self._undecided[system] = self.waiting.pop(system)
+            begun.append(system)
+        return begun
 
     def next_s(self) -> float | None:
-        """When the next one starts."""
+        """When the next one starts, None if none waits."""
         return min(self.waiting.values(), default=None)
 
     def started(self, system: int, now: float) -> list[str]:
         """One flies its mission; gives what that changes for others, in words."""
+        self._undecided.pop(system, None)
         planned = self._planned.get(system, now)
         late = now - planned
         self.flown[system] = now if late > LATE_S else planned
@@ -62,7 +68,7 @@ class TakeoffSchedule:
             said.append(f"v{system} will come within {metres:.0f} m of v{other} in {at - now:.0f} s: pause one of them")
         for waiter in sorted(self.waiting, key=lambda s: self.waiting[s]):
             others = {**self.flown, **{s: at for s, at in self.waiting.items() if at < self.waiting[waiter]}}
-            start = self.airspace.next_start(waiter, self.waiting[waiter], others)
+            start = self.airspace.next_start(waiter, max(now, self.waiting[waiter]), others)
             if start > self.waiting[waiter] + _MOVED_S:
                 said.append(
                     f"v{waiter} takes off {start - self.waiting[waiter]:.0f} s later, to keep apart from others"
@@ -72,6 +78,7 @@ class TakeoffSchedule:
 
     def failed(self, system: int) -> list[int]:
         """One did not take off; gives those that waited and now stay on the ground."""
+        self._undecided.pop(system, None)
         held = sorted(self.waiting)
         self.waiting.clear()
         return held

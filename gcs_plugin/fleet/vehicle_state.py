@@ -22,7 +22,7 @@ _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 # EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these. PX4 sets CONST_POS_MODE whenever it stands still.
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
 _EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
-_STILL_M_S: Final = 0.6
+_STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
 @dataclass(slots=True)
@@ -217,7 +217,7 @@ class Vehicle:
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
-        if math.hypot(*self.velocity_m_s) > _STILL_M_S:
+        if math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]:
             self._still_since = None
         elif self._still_since is None or self._still_since > self.time_boot_s:
             self._still_since = self.time_boot_s

@@ -146,7 +146,7 @@ def test_one_that_is_late_moves_those_that_wait():
     assert schedule.due(100.0) == [1]
     assert schedule.started(1, 103.0) == [] and schedule.waiting == {2: 100.0 + apart}  # in time
     schedule = TakeoffSchedule.of({1: 0.0, 2: apart}, 100.0, Airspace.of(missions))
-    schedule.due(100.0)
+    assert schedule.due(100.0 + apart) == [1] and schedule.due(100.0 + apart) == []  # the first is undecided
     said = schedule.started(1, 100.0 + 14.0)
     assert said[0] == "v1 took off 14 s late" and "v2 takes off 14 s later" in said[1]
     assert schedule.waiting[2] == pytest.approx(100.0 + apart + 14.0, abs=1.0)
@@ -204,7 +204,8 @@ def test_one_that_cannot_arm_at_its_time_holds_the_others(folder, capsys):  # no
         code, said = fleet(capsys, "start", "--plan", folder, "--link", link, "--json")
         assert code == 1
         outcomes = [row["outcome"] for row in said["vehicles"]]
-        assert outcomes[1] == "refused" and outcomes[0] == "done"
+        assert outcomes == ["done", "refused", "not_sent"]
+        assert "stays on the ground, because vehicle 2 did not take off" in said["vehicles"][2]["text"]
         assert "Arm: Motors: Check frame class" in said["vehicles"][1]["text"]
 
 

@@ -1,0 +1,165 @@
+"""The daemon's vehicles: commands to all at once, the check, signing, and takeoffs that hold each other."""
+
+import json
+import time
+
+import pytest
+
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.daemon.vehicles import VehicleLinks
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.mission_builder import read_mission
+from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+
+
+class NoJobs:
+    def wake(self):
+        pass
+
+    def drop(self, *_):
+        pass
+
+
+class PlanFolder:
+    """The plans of a workspace, with the one plan of a folder."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def starts(self, name, sortie=1):
+        document = json.loads((self.path / "plan.json").read_text())
+        return {v["id"]: v["flights"][0]["start_s"] for v in document["vehicles"]}
+
+    def mission(self, body, vehicle, autopilot):
+        return read_mission(self.path / f"{body['mission']}.waypoints", autopilot)
+
+
+@pytest.fixture
+def open_links(tmp_path):
+    opened = []
+
+    def make(vehicles, *, key=None, speed=10.0):
+        swarm = SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=speed, key=key)
+        swarm.__enter__()
+        opened.append(swarm)
+        settings = Settings(tmp_path, links=tuple(swarm.addresses))
+        journal = Journal(tmp_path / "journal.sqlite")
+        links = VehicleLinks(settings, journal, Events(), NoJobs())
+        links.start()
+        opened.extend([journal, links])
+        return links
+
+    yield make
+    for thing in reversed(opened):
+        thing.close()
+
+
+def wait(done, limit_s=30.0):
+    end = time.monotonic() + limit_s
+    while not done() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert done()
+
+
+def ready(links, count):
+    def known():
+        rows = links.rows()
+        return len(rows) == count and all(r["lat_deg"] and r["battery"] for r in rows)
+
+    wait(known)
+    wait(lambda: all(v.ekf_ok and v.prearm_ok for v in links.fleet.vehicles.values()))
+
+
+def upload_all(links, folder):  # noqa: F811
+    for system, vehicle in links.fleet.vehicles.items():
+        loaded = read_mission(folder / f"v{system}.waypoints", vehicle.autopilot)
+        links.command(lambda fleet, s=system, m=loaded: fleet.upload(s, m))
+
+
+def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # noqa: F811
+    vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
+    links = open_links(vehicles)
+    ready(links, 3)
+    rows = links.commands("pause")
+    assert [(r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
+        (f"v{n}", "pause", "refused") for n in (1, 2, 3)
+    ]
+    assert len({r["id"] for r in rows}) == 1 and "not armed" in rows[0]["reason"]
+    upload_all(links, folder)
+    refused = links.commands("start")
+    assert all(r["outcome"] == "refused" and "separation" in r["reason"] for r in refused)  # all on one path
+    override = {name: ["separation"] for name in ("v1", "v2", "v3")}
+    assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
+    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    assert [r["outcome"] for r in links.commands("rtl")] == ["done"] * 3
+    assert {links.flight_state(name)["state"] for name in ("v1", "v2", "v3")} <= {"returning", "landing", "on mission"}
+    assert [r["outcome"] for r in links.commands("land", ["v2"])] == ["done"]
+    late = links.commands("rtl", ["v1"], given_s=links.clock() - 6.0)
+    assert late[0]["outcome"] == "not_sent" and "6 s ago" in late[0]["reason"]
+    assert links.commands("rtl", ["v9"])[0]["outcome"] == "not_sent"
+    with pytest.raises(InputError, match="there is no command 'explode'"):
+        links.commands("explode")
+
+
+def test_the_check_comes_as_json(open_links, folder):  # noqa: F811
+    links = open_links(make_swarm(2, home=HOME))
+    ready(links, 2)
+    rows = links.preflight()
+    assert [row["vehicle"] for row in rows] == ["v1", "v2"] and json.dumps(rows)
+    items = {item["name"]: item for item in rows[0]["items"]}
+    assert items["mission"]["state"] == "red" and items["gps"]["state"] == "ok" and rows[0]["state"] == "red"
+    assert "was not started: mission" in links.commands("start", ["v1"])[0]["reason"]
+
+
+def test_with_a_key_unsigned_vehicles_are_not_believed(open_links, monkeypatch):
+    monkeypatch.setenv("ORTHOSWARM_SIGNING_KEY", "a passphrase that only the swarm knows")
+    links = open_links(make_swarm(1, home=HOME))
+    time.sleep(3.0)
+    assert links.rows() == [] and links.fleet.hub.rejected > 0
+
+
+def test_one_that_cannot_take_off_holds_the_others_and_it_is_said(open_links, folder):  # noqa: F811
+    document = json.loads((folder / "plan.json").read_text())
+    for number, vehicle in enumerate(document["vehicles"]):
+        vehicle["flights"][0]["start_s"] = 4.0 * number
+    (folder / "plan.json").write_text(json.dumps(document))
+    vehicles = make_swarm(3, home=HOME)
+    links = open_links(vehicles)
+    ready(links, 3)
+    said = []
+    takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
+    with pytest.raises(OrthoSwarmError, match="nobody was started"):
+        takeoffs.begin("plan-1")
+    upload_all(links, folder)
+    assert {row["state"] for row in takeoffs.preflight("plan-1")} <= {"ok", "warning"}
+    vehicles[1].arms = False
+    assert takeoffs.begin("plan-1") == {"v1": 0.0, "v2": 4.0, "v3": 8.0}
+    wait(lambda: "failed" in takeoffs.rows().get("v3", {}), 40.0)
+    assert takeoffs.rows()["v3"]["failed"] == "held on the ground, because v2 did not take off"
+    assert "Check frame class" in takeoffs.rows()["v2"]["failed"]
+    assert any("v2 did not take off" in text and "v3 stay on the ground" in text for text in said)
+    assert not vehicles[2].flight.armed
+    takeoffs.close()
+
+
+def test_a_takeoff_that_waits_is_cancelled_by_rtl(open_links, folder):  # noqa: F811
+    document = json.loads((folder / "plan.json").read_text())
+    document["vehicles"] = document["vehicles"][:2]
+    document["vehicles"][1]["flights"][0]["start_s"] = 60.0
+    (folder / "plan.json").write_text(json.dumps(document))
+    links = open_links(make_swarm(2, home=HOME))
+    ready(links, 2)
+    upload_all(links, folder)
+    takeoffs = Takeoffs(links, PlanFolder(folder), lambda _: None)
+    takeoffs.begin("plan-1")
+    (row,) = links.commands("rtl", ["v2"])
+    assert row["outcome"] == "done" and "is cancelled" in row["reason"]
+    assert "v2" not in takeoffs.rows()
+    takeoffs.close()
