@@ -90,7 +90,7 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     }  # fmt: skip
 
 
-def _feed(name: str, inputs: int, seed: int, told: Any) -> None:
+def _feed(name: str, inputs: int, seed: int, result: Any) -> None:
     """Feed one reader within limits; sends inputs done, failures, one failure as text and seconds."""
     from tests.telemetry.test_reader_fuzz import mutated
 
@@ -110,7 +110,7 @@ def _feed(name: str, inputs: int, seed: int, told: Any) -> None:
             except Exception as error:
                 failures += 1
                 example = f"{type(error).__name__}: {error}"
-    told.send((inputs, failures, example, time.process_time() - start))
+    result.send((inputs, failures, example, time.process_time() - start))
 
 
 def main() -> int:

@@ -2,7 +2,7 @@
 
 A decoder of your own: a callable from the payload to a `Sample` (or None), registered with
 
-    from telemetry.sei import Decoder, register
+    from telemetry.formats.video.sei import Decoder, register
     register(Decoder("mine", 5, bytes.fromhex("00112233445566778899aabbccddeeff"), my_function))
 
 or named in the entry point group `orthoswarm.sei` of a package, as an object of type `Decoder`. For payload type 5
