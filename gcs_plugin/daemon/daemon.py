@@ -17,11 +17,11 @@ from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.jobs.job_queue import Job, Jobs
-from gcs_plugin.daemon.jobs.joint_refinement import Together
-from gcs_plugin.daemon.jobs.leg_placement import Coarse
+from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
+from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.publisher import Press
-from gcs_plugin.daemon.jobs.sortie_refinement import Refinement
+from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
 from gcs_plugin.daemon.layers.anchor import Anchor
@@ -91,27 +91,29 @@ class Daemon:
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
             fov_rad=fov, on_area=self._area_changed, anchor=self._anchor, on_rejected=self._rejected,
         )  # fmt: skip
-        self.crew, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
-        press = Press(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
-        self.coarse = Coarse(self.journal, self.store, press, self.background, settings.basemap, self._published)
-        self.refinement = Refinement(
-            self.journal, self.store, press, self.crew, self.drawer, settings.basemap, self._published,
+        self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
+        publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
+        self.coarse = LegPlacement(
+            self.journal, self.store, publisher, self.background, settings.basemap, self._published
+        )
+        self.refinement = SortieRefinement(
+            self.journal, self.store, publisher, self.workers, self.drawer, settings.basemap, self._published,
             self._make_way, lambda: self.jobs.stopping,
         )  # fmt: skip
-        self.together = Together(self.journal, press, self.background, settings.basemap, self._published)
+        self.together = JointRefinement(self.journal, publisher, self.background, settings.basemap, self._published)
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
-            "redraw": lambda job, tell: press.draw_again(self.background, tell), "export": self._export,
+            "redraw": lambda job, tell: publisher.draw_again(self.background, tell), "export": self._export,
         }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
         )
         self.jobs.on_end(self._after_job)
-        if press.lost:
+        if publisher.lost:
             self.jobs.add("redraw")
-        for vehicle, sortie in press.outdated:
+        for vehicle, sortie in publisher.outdated:
             self.jobs.add("refine", vehicle, sortie)
-        self.legwatch = LegWatch(self._leg_over, self._refine_late)
+        self.leg_watch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
@@ -139,9 +141,9 @@ class Daemon:
             self._area_changed(self.drawer.area)
         self.drawer.start()
         self.jobs.start()
-        threading.Thread(target=self.crew.warm_up, daemon=True).start()
+        threading.Thread(target=self.workers.warm_up, daemon=True).start()
         self._watch_what_came_before()
-        self.legwatch.start()
+        self.leg_watch.start()
         if self.links is not None:
             self.links.start()
         for source in self.sources:
@@ -151,12 +153,12 @@ class Daemon:
         """Stop; what is under way goes on at the next start."""
         self.jobs.give_up()
         self._close_sources()
-        self.legwatch.close()
+        self.leg_watch.close()
         if self.takeoffs is not None:
             self.takeoffs.close()
         if self.links is not None:
             self.links.close()
-        self.crew.close()
+        self.workers.close()
         self.background.close()
         self.jobs.close()
         self.drawer.close()
@@ -215,9 +217,9 @@ class Daemon:
             self.posted[pose.vehicle] += 1
             self.drawer.add(seq, frame, came, sortie)
             if pose.has_fix:
-                self.legwatch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+                self.leg_watch.add(pose.vehicle, sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
             if self.posted[pose.vehicle] == _FEW:
-                self.crew.warm_kernels()
+                self.workers.warm_kernels()
                 self.background.warm_up()
         return seq, new
 
@@ -347,7 +349,7 @@ class Daemon:
         for row in rows:
             pose = json.loads(row["pose"])
             time_s = row["arrived"] if row["time"] is None else row["time"]
-            self.legwatch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
+            self.leg_watch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
 
     def _make_way(self, vehicle: str, layer: str | None) -> None:
         """A refinement begins, or needs a layer: what is done in the background stands aside."""
@@ -412,7 +414,7 @@ class Daemon:
         )
         facts = facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
-            time.process_time(), (self.crew.usage(), self.background.usage()), peak_rss_mb(),
+            time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
         )  # fmt: skip
         task = ExportTask(
             self.settings.workspace, tuple(job.detail["formats"]), canvases, area.epsg, area.gsd_m,

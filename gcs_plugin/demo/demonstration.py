@@ -27,11 +27,11 @@ _MADE: Final = (
     "realtime.tif", "coarse.tif", "orthoimage.tif", _MARK,
 )  # fmt: skip
 _MOST_S: Final = 900.0
-Tell = Callable[[str, int, int], None]
+ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: Setting, out: Path, tell: Tell, *, port: int = 0, opened: Callable[[str], None]
+    setting: Setting, out: Path, tell: ReportProgress, *, port: int = 0, opened: Callable[[str], None]
 ) -> dict[str, Any]:
     """Run it; gives the content of report.json.
 
@@ -177,7 +177,7 @@ class Served:
         self._socket.close()
 
 
-def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
+def _fly(daemon: "Daemon", setting: Setting, tell: ReportProgress) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
     links = daemon.links
     assert links is not None
@@ -212,7 +212,7 @@ def _fly(daemon: "Daemon", setting: Setting, tell: Tell) -> None:
     tell("flying: pictures on the map", photos, photos)
 
 
-def _finish(daemon: "Daemon", tell: Tell) -> None:
+def _finish(daemon: "Daemon", tell: ReportProgress) -> None:
     """Wait until every completion's refinement is on the map, and the products are written."""
 
     def refined() -> bool:

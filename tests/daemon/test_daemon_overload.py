@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
-from gcs_plugin.daemon.layers.draw_queue import Pending, Waiting
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, Pending
 from gcs_plugin.daemon.layers.layers import Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.event_bus import Events
@@ -32,7 +32,7 @@ def drained(queue):
 
 
 def test_while_it_keeps_up_frames_are_drawn_as_they_come():
-    queue = Waiting(100)
+    queue = DrawQueue(100)
     for seq in range(20):
         queue.put(pending(seq, 4.0 * seq))
         assert queue.take().seq == seq
@@ -40,7 +40,7 @@ def test_while_it_keeps_up_frames_are_drawn_as_they_come():
 
 
 def test_ground_that_is_empty_goes_first():
-    queue = Waiting(100)
+    queue = DrawQueue(100)
     queue.put(pending(0, 0.0))
     assert queue.take().seq == 0
     for seq, east in ((1, 3.0), (2, 6.0), (3, 400.0), (4, 20.0), (5, 403.0)):
@@ -53,7 +53,7 @@ def test_ground_that_is_empty_goes_first():
 
 def test_the_first_few_of_a_jam_are_spread_over_its_ground():
     """Of 400 frames along 800 m, the first 40 that are drawn leave no gap as wide as the 40 that came first would."""
-    queue = Waiting(1000)
+    queue = DrawQueue(1000)
     for seq in range(400):
         queue.put(pending(seq, 2.0 * seq))
     first = sorted(2.0 * queue.take().seq for _ in range(40))
@@ -63,7 +63,7 @@ def test_the_first_few_of_a_jam_are_spread_over_its_ground():
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=60), st.integers(1, 30))
 def test_nothing_disappears_from_the_queue(places, most):
-    queue, left = Waiting(most), set()
+    queue, left = DrawQueue(most), set()
     for seq, place in enumerate(places):
         out = queue.put(pending(seq, float(place)))
         if out is not None:
@@ -76,7 +76,7 @@ def test_nothing_disappears_from_the_queue(places, most):
 
 
 def test_a_full_queue_lets_go_of_what_shows_least():
-    queue = Waiting(3)
+    queue = DrawQueue(3)
     queue.put(pending(0, 0.0))
     assert queue.take().seq == 0
     for seq, east in ((1, 2.0), (2, 300.0), (3, 600.0)):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
-from gcs_plugin.daemon.jobs.joint_refinement import Together
+from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
+from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import without_strays
@@ -162,8 +162,8 @@ class Rows:
         return [{"vehicle": packed(v), "sortie": 1, **self.one("", ())} for v in ("v1", "v2")]
 
 
-class Taken:
-    """A crew whose process is taken away while it works."""
+class StoppedWorkers:
+    """Workers whose process is taken away while it works."""
 
     def __init__(self):
         self.began, self.ends = threading.Event(), threading.Event()
@@ -179,10 +179,10 @@ class Taken:
 
 
 class Placed:
-    """A press of an area."""
+    """A publisher of an area."""
 
     def __init__(self, folder):
-        self.kept = folder
+        self.solutions = folder
 
     def area(self):
         from gcs_plugin.daemon.layers.layers import Area
@@ -191,8 +191,8 @@ class Placed:
 
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
-    crew = Taken()
-    work = Together(Rows(), Placed(tmp_path), crew, tmp_path / "map.tif")
+    workers = StoppedWorkers()
+    work = JointRefinement(Rows(), Placed(tmp_path), workers, tmp_path / "map.tif")
     jobs = Jobs(journal, Events(), {"together": work.solve}, slots=1)
     job = jobs.add("together", "v1", 1)
     found = []
@@ -200,12 +200,12 @@ def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal
     def run():
         try:
             work.solve(job, lambda share, text: None)
-        except GaveWay:
+        except Preempted:
             found.append("gave way")
 
     thread = threading.Thread(target=run)
     thread.start()
-    assert crew.began.wait(60)
+    assert workers.began.wait(60)
     work.give_up()
     thread.join(60)
     assert found == ["gave way"]

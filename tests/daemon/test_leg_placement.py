@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs_plugin.daemon.jobs.job_queue import GaveWay, Jobs
+from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
@@ -47,7 +47,7 @@ def frames_at(positions, first_s=1e9):
 @given(legs=st.integers(1, 4), per_leg=st.integers(8, 30), seen=st.integers(2, 120))
 def test_a_leg_that_is_over_stays_as_it_is(legs, per_leg, seen):
     path = lawn(legs, per_leg)
-    early = ended_legs(path[: min(seen, len(path))])
+    early = ended_legs(path[: min(visible_ground, len(path))])
     assert early == ended_legs(path)[: len(early)]
 
 
@@ -160,7 +160,7 @@ def test_work_that_gave_way_is_done_again(journal):
     def handler(job, tell):
         tries.append(job.attempts)
         if len(tries) == 1:
-            raise GaveWay
+            raise Preempted
         return lambda db: None
 
     jobs = Jobs(journal, Events(), {"coarse": handler}, slots=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.intake.file_complete import is_video_whole, is_whole
+from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
 from gcs_plugin.daemon.intake.posted_pose import frame_of
 from gcs_plugin.daemon.intake.vehicle_log import write_link_log
 from gcs_plugin.daemon.store.picture_store import frame_key
@@ -136,8 +136,8 @@ def test_a_video_with_its_poses_is_taken_after_landing(watched, tmp_path):
     shots = line(12, "video", step_m=6.0)
     plain = film(tmp_path / "plain.mp4", shots)
     poses = {n: sample_of(shot) for n, shot in enumerate(shots)}
-    add_sei(plain, tmp_path / "marked.mp4", poses.__getitem__)
-    data = (tmp_path / "marked.mp4").read_bytes()
+    add_sei(plain, tmp_path / "uniquely_named.mp4", poses.__getitem__)
+    data = (tmp_path / "uniquely_named.mp4").read_bytes()
     target = root / "video" / "DJI_0001.MP4"
     target.write_bytes(data[: len(data) // 3])
     time.sleep(2.0)
@@ -294,29 +294,29 @@ def test_pictures_say_whether_they_are_whole(kind):
     out = io.BytesIO()
     Image.fromarray(noise).save(out, kind)
     data = out.getvalue()
-    assert is_whole(data, suffix)
+    assert is_complete(data, suffix)
     for share in (0.2, 0.5, 0.9, 0.99):
         cut = data[: int(share * len(data))]
-        assert not is_whole(cut, suffix), share
+        assert not is_complete(cut, suffix), share
         if kind in ("JPEG", "PNG"):  # space that was reserved and not yet written
-            assert not is_whole(cut + bytes(len(data) - len(cut)), suffix), share
+            assert not is_complete(cut + bytes(len(data) - len(cut)), suffix), share
     if kind == "JPEG":
-        assert is_whole(data + bytes(100), suffix)  # some cameras pad
+        assert is_complete(data + bytes(100), suffix)  # some cameras pad
         progressive = io.BytesIO()
         Image.fromarray(noise).save(progressive, "JPEG", progressive=True)
-        assert is_whole(progressive.getvalue(), suffix)
-        assert not is_whole(progressive.getvalue()[:-200], suffix)
+        assert is_complete(progressive.getvalue(), suffix)
+        assert not is_complete(progressive.getvalue()[:-200], suffix)
 
 
 def test_videos_say_whether_they_are_whole(tmp_path):
     shots = line(4)
     data = film(tmp_path / "v.mp4", shots).read_bytes()
-    assert is_video_whole(tmp_path / "v.mp4")
+    assert is_video_complete(tmp_path / "v.mp4")
     for size in (10, 100, len(data) // 2, len(data) - 1):
         (tmp_path / "half.mp4").write_bytes(data[:size])
-        assert not is_video_whole(tmp_path / "half.mp4"), size
+        assert not is_video_complete(tmp_path / "half.mp4"), size
     (tmp_path / "text.mp4").write_bytes(b"this is no video at all")
-    assert is_video_whole(tmp_path / "text.mp4")  # whoever reads it says what is wrong
+    assert is_video_complete(tmp_path / "text.mp4")  # whoever reads it says what is wrong
 
 
 def test_one_vehicles_part_of_a_log_holds_its_packets_only(tmp_path):

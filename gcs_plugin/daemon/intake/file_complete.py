@@ -11,7 +11,7 @@ _BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 """JPEG markers without a length."""
 
 
-def is_whole(data: bytes, suffix: str) -> bool:
+def is_complete(data: bytes, suffix: str) -> bool:
     """Whether a picture's bytes reach to its end; True for kinds that do not tell.
 
     A copy that has stalled, or one whose space was reserved and is still zeros, is not whole.
@@ -71,7 +71,7 @@ def _opens(data: bytes) -> bool:
     return True
 
 
-def is_video_whole(path: Path) -> bool:
+def is_video_complete(path: Path) -> bool:
     """Whether an MP4 or MOV has all the boxes that it says it has, its index among them; True for other kinds.
 
     Raises:

@@ -13,7 +13,7 @@ Stamp = tuple[int, int]
 """Size of a file and time of its last change, nanoseconds."""
 
 
-class Taken:
+class FolderState:
     """What was taken from a folder, in a file of the workspace; of no use to another journal, and then begun anew.
 
     Args:

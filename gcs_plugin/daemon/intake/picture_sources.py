@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
-from gcs_plugin.daemon.intake.watched_folder import Desk, FolderReader
+from gcs_plugin.daemon.intake.watched_folder import FolderReader, PictureIntake
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from telemetry.samples.sample import Sample
 
@@ -52,7 +52,7 @@ class Source:
         self._state, self.taken, self._without_pose = "waiting", 0, 0
         self._reader: FolderReader | None = None
         if not is_stream(where):
-            desk = Desk(
+            desk = PictureIntake(
                 vehicle,
                 self._keep,
                 partial(pose_at, vehicle),

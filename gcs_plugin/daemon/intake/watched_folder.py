@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.daemon.intake.file_complete import is_video_whole, is_whole
-from gcs_plugin.daemon.intake.folder_state import Stamp, Taken, digest_of, video_digest
+from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
+from gcs_plugin.daemon.intake.folder_state import FolderState, Stamp, digest_of, video_digest
 from gcs_plugin.daemon.intake.pose_relay import apart_m, pose_values, posted_frame
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from orthoswarm.model.errors import OrthoSwarmError
@@ -63,7 +63,7 @@ class _File:
 
 
 @dataclass(slots=True)
-class Desk:
+class PictureIntake:
     """What a folder's reader needs from others.
 
     Attributes:
@@ -98,17 +98,17 @@ class FolderReader:
         state: in words. poseless: files that wait for a pose.
     """
 
-    def __init__(self, folder: Path, desk: Desk) -> None:
+    def __init__(self, folder: Path, desk: PictureIntake) -> None:
         from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
         from telemetry.ingest.discovery import LOG_SUFFIXES, VIDEO_SUFFIXES
 
-        self.folder, self._desk = folder, desk
+        self.folder, self._intake = folder, desk
         self.state = "waiting"
         self.poseless: set[Path] = set()
         self._pictures, self._videos, self._logs = PICTURE_SUFFIXES, VIDEO_SUFFIXES, LOG_SUFFIXES
         self._wanted = PICTURE_SUFFIXES | VIDEO_SUFFIXES | LOG_SUFFIXES | {".srt", ".txt", ".csv"}
         self._files: dict[Path, _File] = {}
-        self._taken = Taken(desk.cache, desk.vehicle, folder)
+        self._taken = FolderState(desk.cache, desk.vehicle, folder)
         self._tried: object = None
         self._again_at, self._again_s = 0.0, _AGAIN_S[0]
         self._fresh_at: float | None = None
@@ -116,7 +116,7 @@ class FolderReader:
     def run(self) -> None:
         """Watch until told to stop."""
         wait = _POLL_S
-        while not self._desk.stop.wait(wait):
+        while not self._intake.stop.wait(wait):
             began = time.monotonic()
             self._look(began)
             wait = max(_POLL_S, min(5.0, (time.monotonic() - began) / _SCAN_SHARE if not self._busy() else 0.0))
@@ -141,7 +141,7 @@ class FolderReader:
                 self._files[path] = _File(stamp, now, done)
         photos = [p for p in here if p.suffix.lower() in self._pictures and self._settled(p, now, _POLL_S)]
         for batch in self._batches(photos):
-            if self._desk.stop.is_set():
+            if self._intake.stop.is_set():
                 return
             self._take_photos(batch, now)
         for path in here:
@@ -150,7 +150,7 @@ class FolderReader:
         self._pair(here, now)
         if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
             self._fresh_at = None
-            self._desk.settled()
+            self._intake.settled()
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; what cannot be read now is left for the next look."""
@@ -198,7 +198,7 @@ class FolderReader:
         file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.told:
             file.told = True
-            self._desk.tell(f"{self._name(path)} of {self._desk.vehicle} is not whole; copy it again")
+            self._intake.tell(f"{self._name(path)} of {self._intake.vehicle} is not whole; copy it again")
 
     # -- taking ---------------------------------------------------------------------------------------------------
 
@@ -211,7 +211,7 @@ class FolderReader:
             except OSError:  # gone again, or not readable yet
                 self._wait_for(path, now)
                 continue
-            if not is_whole(data, path.suffix):
+            if not is_complete(data, path.suffix):
                 self._wait_for(path, now)
                 continue
             digest = digest_of(data)
@@ -228,7 +228,7 @@ class FolderReader:
             found = self._load(asked)
         mine = {os.path.normpath(path.absolute()): path for path in whole}
         for frame in found.frames if found else []:
-            if self._desk.stop.is_set():
+            if self._intake.stop.is_set():
                 return
             photo = mine.get(os.path.normpath(frame.path))
             if photo is not None:
@@ -248,19 +248,19 @@ class FolderReader:
             if rejection is None or not rejection.lacks_position:
                 _log.warning("%s: %s", self._name(path), rejection.reason if rejection else "it gives no picture")
                 continue
-            pose = None if rejection.time_s is None else self._desk.pose_at(rejection.time_s)
+            pose = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
             values = None if pose is None else pose_values(pose)
             if values is None:
                 self.poseless.add(path)
                 continue
             name = self._taken.name(self._name(path), digest)
-            self._desk.keep(PostedPose(self._desk.vehicle, name, rejection.time_s, values), data)
+            self._intake.keep(PostedPose(self._intake.vehicle, name, rejection.time_s, values), data)
             self._done(path, digest)
 
     def _take_video(self, path: Path, now: float) -> None:
         """Take the pictures of a video in."""
         try:
-            if not is_video_whole(path):
+            if not is_video_complete(path):
                 self._wait_for(path, now)
                 return
             digest = video_digest(path)
@@ -280,10 +280,10 @@ class FolderReader:
     def _keep_video(self, path: Path, found: "Ingest", digest: str) -> None:
         name = self._taken.name(self._name(path), digest)
         for frame in found.frames:
-            if self._desk.stop.is_set():
+            if self._intake.stop.is_set():
                 return
             self._keep(frame, f"{name}#{frame.image.partition('#')[2]}", frame.path.read_bytes())
-            if frame.path.is_relative_to(self._desk.cache):
+            if frame.path.is_relative_to(self._intake.cache):
                 frame.path.unlink(missing_ok=True)
         if found.frames:
             self._done(path, digest)
@@ -296,31 +296,31 @@ class FolderReader:
 
     def _keep(self, frame: "Frame", name: str, data: bytes) -> None:
         """Take a frame in; height and angles that it lacks come from the link, if that agrees where it was."""
-        posted = posted_frame(frame, self._desk.vehicle, name)
+        posted = posted_frame(frame, self._intake.vehicle, name)
         if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
-            linked = self._desk.pose_at(posted.time_s)
+            linked = self._intake.pose_at(posted.time_s)
             values = None if linked is None else pose_values(linked)
             if values is not None and apart_m(values, posted.values) < _NEAR_M:
                 for key in ("lat_deg", "lon_deg", "position_sigma_m", "altitude_m"):
                     values.pop(key, None)
                 posted = PostedPose(posted.vehicle, posted.image, posted.time_s, values | posted.values)
-        self._desk.keep(posted, data)
+        self._intake.keep(posted, data)
 
     def _done(self, path: Path, digest: str) -> None:
         file = self._files[path]
         file.done = True
         self.poseless.discard(path)
         self._fresh_at = time.monotonic()
-        if not self._desk.stop.is_set():
+        if not self._intake.stop.is_set():
             self._taken.add(self._name(path), file.stamp, digest)
 
     def _load(self, paths: Sequence[Path]) -> "Ingest | None":
         import telemetry
 
         try:
-            return telemetry.load(paths, options=telemetry.LoadOptions(cache=self._desk.cache, workers=1))
+            return telemetry.load(paths, options=telemetry.LoadOptions(cache=self._intake.cache, workers=1))
         except OrthoSwarmError as error:
-            _log.warning("%s: %s", self._desk.vehicle, error)
+            _log.warning("%s: %s", self._intake.vehicle, error)
             return None
 
     def _tables(self, photos: Iterable[Path]) -> list[Path]:
@@ -343,18 +343,20 @@ class FolderReader:
             return
         self._tried, self._again_at = state, now + self._again_s
         self._again_s = min(_AGAIN_S[1], 2.0 * self._again_s)
-        self._desk.cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="pairing-", dir=self._desk.cache) as name:
+        self._intake.cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="pairing-", dir=self._intake.cache) as name:
             desk = Path(name)
             for path in [*waiting, *sides]:
                 _stand_in(path, desk / path.relative_to(self.folder))
-            self._desk.link_log(desk / "link.tlog")
+            self._intake.link_log(desk / "link.tlog")
             found = self._load([desk])
             if found is not None:
                 self._take_paired(waiting, found, desk)
         if self.poseless and state[0] == tuple(waiting):
             count = len(self.poseless)
-            self._desk.tell(f"{count} files of {self._desk.vehicle} wait for poses; put the flight's log beside them")
+            self._intake.tell(
+                f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log beside them"
+            )
 
     def _take_paired(self, waiting: Sequence[Path], found: "Ingest", desk: Path) -> None:
         frames: dict[str, list[Frame]] = {}

@@ -25,7 +25,7 @@ _KEPT: Final = 1000
 _BACKGROUND: Final = frozenset({"coarse", "together", "redraw", "export"})
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
-_GIVES_WAY: Final = frozenset({"coarse", "together"})
+_PREEMPTED: Final = frozenset({"coarse", "together"})
 _WAITING_THREADS: Final = 2
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
@@ -75,13 +75,13 @@ class Job:
         }  # fmt: skip
 
 
-class GaveWay(Exception):
+class Preempted(Exception):
     """A handler's way to say that its work was taken away: to be done again later."""
 
 
-Tell = Callable[[float, str], None]
+ReportProgress = Callable[[float, str], None]
 """Told a job's progress, 0 to 1, and what is being done."""
-Handler = Callable[[Job, Tell], Change]
+Handler = Callable[[Job, ReportProgress], Change]
 """Does a job, telling its progress; gives the change that makes its result so. That the job is done is written with
 it, in one transaction."""
 After = Callable[[Job], None]
@@ -146,7 +146,7 @@ class Jobs:
             self._condition.notify_all()
 
     def close(self) -> None:
-        """Begin nothing more; what runs is given up by its crew and is queued again at the next start."""
+        """Begin nothing more; what runs is given up by its workers and is queued again at the next start."""
         self.give_up()
         for thread in self._threads:
             if thread.ident is not None:
@@ -228,7 +228,7 @@ class Jobs:
             job = Job.of(row)
             if (job.kind in _BACKGROUND) != background or row["id"] in self._running or _lane(job) in busy:
                 continue
-            if refining and job.kind in _GIVES_WAY:
+            if refining and job.kind in _PREEMPTED:
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
             self._running[job.id] = job
@@ -265,7 +265,7 @@ class Jobs:
             except OrthoSwarmError as error:
                 _log.error("after job %d: %s", job.id, error)
 
-    def _outcome(self, job: Job, progress: Tell) -> tuple[Job, Change] | None:
+    def _outcome(self, job: Job, progress: ReportProgress) -> tuple[Job, Change] | None:
         """Do a job; gives the job as it ended and the change that makes it so, None if the daemon ends."""
         try:
             change = self._handlers[job.kind](job, progress)
@@ -278,7 +278,7 @@ class Jobs:
                 return None
             if job.id in self._unwanted:
                 ended = replace(job, state="done", progress=1.0, message=self._unwanted[job.id], ended=time.time())
-            elif isinstance(error, GaveWay):
+            elif isinstance(error, Preempted):
                 ended = replace(job, state="queued", progress=0.0, started=None, attempts=job.attempts - 1)
             else:
                 ended = _failed(job, error)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell, new_job
+from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress, new_job
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
-from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import AgainTask, Solved, solve_again
+from gcs_plugin.daemon.jobs.worker_tasks import JointTask, SortieResult, refine_jointly
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
 from orthoswarm.model.bounding_box import BoundingBox
@@ -37,25 +37,25 @@ def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable
 
 
 @dataclass(slots=True)
-class Together:
+class JointRefinement:
     """Does the jobs `together`.
 
     Attributes:
-        journal, press: what there is. crew: where the work runs; it is this one's alone while a job runs.
+        journal, publisher: what there is. workers: where the work runs; it is this one's alone while a job runs.
         basemap: the map. on_published: called with layer and job when pixels have changed.
     """
 
     journal: Journal
-    press: Press
-    crew: WorkerPool
+    publisher: Publisher
+    workers: WorkerPool
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     _working: bool = False
     _aside: bool = False
 
-    def solve(self, job: Job, tell: Tell) -> Change:
+    def solve(self, job: Job, tell: ReportProgress) -> Change:
         """The handler of `together`."""
-        target = self.press.kept / f"{new_name('solution')}.pickle"
+        target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         began = time.monotonic()
         self._working, self._aside = True, False
         try:
@@ -64,7 +64,7 @@ class Together:
         except OrthoSwarmError:
             target.unlink(missing_ok=True)
             if self._aside:
-                raise GaveWay from None
+                raise Preempted from None
             raise
         finally:
             self._working = False
@@ -75,22 +75,22 @@ class Together:
         """Stop what is under way; it is done later."""
         if self._working:
             self._aside = True
-            self.crew.abandon()
+            self.workers.abandon()
 
-    def _solve(self, job: Job, tell: Tell, target: Path) -> bool:
+    def _solve(self, job: Job, tell: ReportProgress, target: Path) -> bool:
         """Solve and publish; False if everything stays as it is."""
         row = solution_row(self.journal, job)
         if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
             return _note(job, "it was not refined on the map")
         detail = json.loads(row["detail"])
         bounds = BoundingBox(*detail["bounds"])
-        others = [self.press.kept / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
+        others = [self.publisher.solutions / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
         if not others:
             return _note(job, "it has no neighbours")
         tell(0.05, f"solving again beside {len(others)} neighbour{'s' * (len(others) > 1)}")
-        area = self.press.area()
-        task = AgainTask(self.press.kept / row["path"], others, target, area.epsg, area.origin, self.basemap)
-        found = self.crew.run(solve_again, task)
+        area = self.publisher.area()
+        task = JointTask(self.publisher.solutions / row["path"], others, target, area.epsg, area.origin, self.basemap)
+        found = self.workers.run(refine_jointly, task)
         if found is None:
             return _note(job, "nothing of it is to be solved again")
         solved, moved_m = found
@@ -100,22 +100,22 @@ class Together:
         }  # fmt: skip
         if moved_m < _LEAST_PX * area.gsd_m:
             return _note(job, "it lies well beside its neighbours")
-        with self.press.turn("fine"):
+        with self.publisher.turn("fine"):
             now = solution_row(self.journal, job)
             if now is None or now["path"] != row["path"]:
                 return _note(job, "it was refined anew meanwhile")
             tell(0.7, "drawing")
             self._print(job, target, solved, detail)
-        self.press.retire(self.press.kept / row["path"])
+        self.publisher.retire(self.publisher.solutions / row["path"])
         self.on_published("fine", job)
         return True
 
-    def _print(self, job: Job, target: Path, solved: Solved, before: dict[str, Any]) -> None:
+    def _print(self, job: Job, target: Path, solved: SortieResult, before: dict[str, Any]) -> None:
         def change(rejected: dict[str, str]) -> Change:
             return refined_change(job, solved, rejected, target.name, before | detail_of(solved, solved.legs))
 
-        job.detail["version_before"], job.detail["version"] = self.press.print(
-            "fine", self.crew, (str(job.vehicle), job.sortie), target, solved.changed, change
+        job.detail["version_before"], job.detail["version"] = self.publisher.publish(
+            "fine", self.workers, (str(job.vehicle), job.sortie), target, solved.changed, change
         )
 
 

@@ -16,11 +16,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.jobs.job_queue import GaveWay, Job, Tell
+from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, sortie_frames
-from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, coarse_after, near, place
+from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
@@ -38,26 +38,26 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class Coarse:
+class LegPlacement:
     """Does the jobs `coarse`.
 
     Attributes:
-        journal, store, press: what there is. crew: where the work runs; it is this one's alone while a job runs.
+        journal, store, publisher: what there is. workers: where the work runs; it is this one's alone while a job runs.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
     """
 
     journal: Journal
     store: PictureStore
-    press: Press
-    crew: WorkerPool
+    publisher: Publisher
+    workers: WorkerPool
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     _working: str | None = None
     _aside: bool = False
 
-    def make(self, job: Job, tell: Tell) -> Change:
+    def make(self, job: Job, tell: ReportProgress) -> Change:
         """The handler of `coarse`."""
-        target = self.press.kept / f"{new_name('coarse')}.pickle"
+        target = self.publisher.solutions / f"{new_name('coarse')}.pickle"
         self._working, self._aside = str(job.vehicle), False
         began = time.monotonic()
         try:
@@ -65,7 +65,7 @@ class Coarse:
         except OrthoSwarmError as error:
             target.unlink(missing_ok=True)
             if self._aside:
-                raise GaveWay from None
+                raise Preempted from None
             if isinstance(error, WorkerStoppedError | StorageError):
                 raise
             job.detail["note"] = str(error)  # the map in flight stays as it is; the refinement will see
@@ -79,14 +79,14 @@ class Coarse:
         """Stop what is under way for a vehicle (None: any), or what holds a layer."""
         if self._working is None or (vehicle is not None and vehicle != self._working):
             return
-        if layer is None or layer in self.press.printing:
+        if layer is None or layer in self.publisher.drawing:
             self._aside = True
-            self.crew.abandon()
+            self.workers.abandon()
 
     # -- in flight ------------------------------------------------------------------------------------------------
 
-    def _legs(self, job: Job, tell: Tell, target: Path) -> Change:
-        vehicle, area = str(job.vehicle), self.press.area()
+    def _legs(self, job: Job, tell: ReportProgress, target: Path) -> Change:
+        vehicle, area = str(job.vehicle), self.publisher.area()
         if self._is_refined(job):
             job.detail["note"] = "it is refined already"
             return lambda db: None
@@ -99,21 +99,21 @@ class Coarse:
         small = {f.image: thumbnails[f.image] for f in frames if f.image in thumbnails}
         task = SolveTask(
             frames, area.epsg, area.origin, self.basemap, small, self._others(job, frames), target,
-            None if before is None else self.press.kept / before["path"],
+            None if before is None else self.publisher.solutions / before["path"],
         )  # fmt: skip
-        solved = self.crew.run(place, task)
+        solved = self.workers.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}
         fresh = {leg["images"][0] for leg in solved.legs if "images" in leg}
         mine = {frame.image for frame in frames}
         earlier = [] if before is None else json.loads(before["detail"])["legs"]
         legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]
-        return self._print(job, tell, target, solved, [*legs, *solved.legs])
+        return self._publish(job, tell, target, solved, [*legs, *solved.legs])
 
     def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
         """Kept sorties nearby, whose exposure is drawn already."""
-        box = near(frames, self.press.area().epsg)
+        box = near(frames, self.publisher.area().epsg)
         mine = (packed(str(job.vehicle)), job.sortie)
-        shown = self.press.shown("coarse").items()
+        shown = self.publisher.shown("coarse").items()
         return [path for key, (path, bounds) in shown if key != mine and bounds.gap_m(box) < _REACH_M]
 
     def _is_refined(self, job: Job) -> bool:
@@ -131,7 +131,7 @@ class Coarse:
 
     # -- after a refinement ---------------------------------------------------------------------------------------
 
-    def _after(self, job: Job, tell: Tell, target: Path) -> Change:
+    def _after(self, job: Job, tell: ReportProgress, target: Path) -> Change:
         """The whole sortie on the coarse layer, by what its refinement began from."""
         row = self.journal.one(
             "SELECT path, detail FROM solutions WHERE vehicle = ? AND sortie = ?",
@@ -140,8 +140,10 @@ class Coarse:
         if row is None or json.loads(row["detail"])["layer"] != "fine":
             return lambda db: None
         tell(0.1, "the coarse layer beside the refined one")
-        solved = self.crew.run(coarse_after, (self.press.kept / row["path"], self.press.area().origin, target))
-        return self._print(job, tell, target, solved, json.loads(row["detail"])["legs"])
+        solved = self.workers.run(
+            coarse_after, (self.publisher.solutions / row["path"], self.publisher.area().origin, target)
+        )
+        return self._publish(job, tell, target, solved, json.loads(row["detail"])["legs"])
 
     # -- both -----------------------------------------------------------------------------------------------------
 
@@ -150,7 +152,9 @@ class Coarse:
             "SELECT * FROM coarse WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
         )
 
-    def _print(self, job: Job, tell: Tell, target: Path, solved: Solved, legs: list[dict[str, Any]]) -> Change:
+    def _publish(
+        self, job: Job, tell: ReportProgress, target: Path, solved: SortieResult, legs: list[dict[str, Any]]
+    ) -> Change:
         vehicle = packed(str(job.vehicle))
         old = self._row(job)
         changed = solved.changed
@@ -177,15 +181,15 @@ class Coarse:
 
             return both
 
-        with self.press.turn("coarse"):
+        with self.publisher.turn("coarse"):
             tell(0.7, "drawing")
             if self._aside or ("after" not in job.detail and self._is_refined(job)):
                 raise OrthoSwarmError("a refinement takes its place")
-            job.detail["version_before"], job.detail["version"] = self.press.print(
-                "coarse", self.crew, (str(job.vehicle), job.sortie), target, changed, change
+            job.detail["version_before"], job.detail["version"] = self.publisher.publish(
+                "coarse", self.workers, (str(job.vehicle), job.sortie), target, changed, change
             )
         if old is not None:
-            self.press.retire(self.press.kept / old["path"])
+            self.publisher.retire(self.publisher.solutions / old["path"])
         self.on_published("coarse", job)
         return lambda db: None
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.solution_file import Bytes, thumbnail_of
-from gcs_plugin.daemon.jobs.worker_tasks import Solved
+from gcs_plugin.daemon.jobs.worker_tasks import SortieResult
 from gcs_plugin.daemon.layers.realtime_layer import frame_of_row
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
@@ -38,7 +38,7 @@ def sortie_frames(
     return frames, small
 
 
-def detail_of(solved: Solved, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def detail_of(solved: SortieResult, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """What the journal keeps of a placed sortie, as JSON values."""
     return {
         "bounds": solved.bounds,
@@ -66,12 +66,14 @@ def others_near(journal: Journal, job: Job, box: BoundingBox, reach_m: float) ->
     ]
 
 
-def refined_change(job: Job, solved: Solved, rejected: dict[str, str], name: str, detail: dict[str, Any]) -> Change:
+def refined_change(
+    job: Job, solved: SortieResult, rejected: dict[str, str], name: str, detail: dict[str, Any]
+) -> Change:
     """The change by which a refinement stands: its frames' stages, what is kept, and that its job is done.
 
     Args:
         job: whose vehicle and sortie it is. solved: with stages and sigmas of what is new.
-        rejected: image -> why it could not be drawn. name: of the kept file. detail: what stands beside it.
+        rejected: image -> why it could not be drawn. name: of the solution file. detail: what stands beside it.
     """
     vehicle = packed(str(job.vehicle))
     dropped = {**solved.dropped, **rejected}

@@ -1,4 +1,4 @@
-"""Printing: the next generation of a refined layer is drawn beside the present one and takes its place at once.
+"""Publishing: the next generation of a refined layer is drawn beside the present one and takes its place at once.
 
 Until the last step nothing of what the map shows changes; the last step is one transaction of the journal, which names
 the layer's new generation and whatever else became true with it.
@@ -28,28 +28,41 @@ REFINED = ("coarse", "fine")
 _log = logging.getLogger(__name__)
 
 
-class Press:
+class Publisher:
     """Draws generations of the layers `coarse` and `fine`, one of each at a time.
 
     Attributes:
-        folder: of the layers' canvases. kept: folder of kept sorties.
+        folder: of the layers' canvases. solutions: folder of the solution files.
         lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
         outdated: vehicle and sortie of those that were refined by another version of the program, and are to be
             refined again from their pictures.
     """
 
     def __init__(
-        self, journal: Journal, layers: dict[str, Layer], folder: Path, kept: Path, drawer: Drawer, *, trusted: bool
+        self,
+        journal: Journal,
+        layers: dict[str, Layer],
+        folder: Path,
+        solutions: Path,
+        drawer: Drawer,
+        *,
+        trusted: bool,
     ) -> None:
         """Remove what a killed daemon left half made, and open what it had published.
 
         Args:
             trusted: False after a power cut: canvases are not synced, for speed.
         """
-        self.journal, self.layers, self.folder, self.kept, self._drawer = journal, layers, folder, kept, drawer
+        self.journal, self.layers, self.folder, self.solutions, self._drawer = (
+            journal,
+            layers,
+            folder,
+            solutions,
+            drawer,
+        )
         self._turns = {name: threading.Lock() for name in REFINED}
-        self.printing: set[str] = set()
-        self.kept.mkdir(parents=True, exist_ok=True)
+        self.drawing: set[str] = set()
+        self.solutions.mkdir(parents=True, exist_ok=True)
         self.outdated = self._forget_outdated()
         begun = journal.fact("lost") or []
         self.lost = [name for name in REFINED if not self._opened(name, trusted) or name in begun]
@@ -74,7 +87,7 @@ class Press:
     def _forget_outdated(self) -> list[tuple[str, int]]:
         """Forget solution files that cannot be read, and the layers that show them; gives the refined ones."""
         outdated = {
-            table: [row for row in self._rows(table) if not is_readable(self.kept / row["path"])]
+            table: [row for row in self._rows(table) if not is_readable(self.solutions / row["path"])]
             for table in ("solutions", "coarse")
         }
         keys = [(row["vehicle"], row["sortie"]) for rows in outdated.values() for row in rows]
@@ -99,8 +112,8 @@ class Press:
         )
         return refined
 
-    def draw_again(self, crew: WorkerPool, tell: Callable[[float, str], None]) -> Change:
-        """Draw the layers that were lost from the kept sorties, one after the other; gives the change that says so."""
+    def draw_again(self, workers: WorkerPool, tell: Callable[[float, str], None]) -> Change:
+        """Draw the layers that were lost from the solution files; gives the change that says so."""
         todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
         for n, (layer, (vehicle, sortie)) in enumerate(todo):
             with self.turn(layer):
@@ -109,17 +122,17 @@ class Press:
                     continue  # refined, or drawn anew, meanwhile
                 tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
                 whose = (unpacked(vehicle), sortie)
-                self.print(layer, crew, whose, row[0], row[1], lambda rejected: lambda db: None)
+                self.publish(layer, workers, whose, row[0], row[1], lambda rejected: lambda db: None)
         return fact_change("lost", [])
 
     def sweep(self) -> None:
-        """Remove canvases and pickles that nothing names."""
+        """Remove canvases and solution files that nothing names."""
         named = {self.journal.fact(name) for name in ("realtime", *REFINED)}
         for path in self.folder.iterdir():
             if path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
         known = {row["path"] for table in ("solutions", "coarse") for row in self._rows(table)}
-        for path in self.kept.iterdir():
+        for path in self.solutions.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
 
@@ -137,26 +150,26 @@ class Press:
     def turn(self, layer: str) -> Iterator[None]:
         """Wait for a layer, and have it for oneself."""
         with self._turns[layer]:
-            self.printing.add(layer)
+            self.drawing.add(layer)
             try:
                 yield
             finally:
-                self.printing.discard(layer)
+                self.drawing.discard(layer)
 
-    def print(
+    def publish(
         self,
         layer: str,
-        crew: WorkerPool,
+        workers: WorkerPool,
         sortie: tuple[str, int | None],
         target: Path,
         changed: BoundingBox,
         change: Callable[[dict[str, str]], Change],
     ) -> tuple[int, int]:
-        """Draw a kept sortie into the next generation of a layer and publish it; the layer's turn must be held.
+        """Draw a placed sortie into the next generation of a layer and publish it; the layer's turn must be held.
 
         Args:
-            layer: coarse or fine. crew: where the work runs. sortie: vehicle and number.
-            target: the kept sortie. changed: ground that it shows otherwise than before.
+            layer: coarse or fine. workers: where the work runs. sortie: vehicle and number.
+            target: its solution file. changed: ground that it shows otherwise than before.
             change: gives, for image -> why it could not be drawn, what else becomes true in the journal.
 
         Returns:
@@ -167,7 +180,7 @@ class Press:
         """
         name = new_name(layer)
         try:
-            rejected = crew.run(draw, self._task(layer, name, sortie, target, changed))
+            rejected = workers.run(draw, self._task(layer, name, sortie, target, changed))
             fact, other = fact_change(layer, name), change(rejected)
 
             def both(db: sqlite3.Connection) -> None:
@@ -183,15 +196,15 @@ class Press:
         return before, self.layers[layer].version
 
     def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, BoundingBox]]:
-        """(vehicle, sortie) -> kept file and bounds of all that show on a layer; a refined one hides its coarse one."""
+        """(vehicle, sortie) -> solution file and bounds of what shows on a layer; refined ones hide coarse ones."""
         refined = {(r["vehicle"], r["sortie"]): r for r in self._rows("solutions")}
         rows = {key: row for key, row in refined.items() if json.loads(row["detail"])["layer"] == layer}
         if layer == "coarse":
             rows = {(r["vehicle"], r["sortie"]): r for r in self._rows("coarse")} | rows
-        return {key: (self.kept / row["path"], _bounds(row)) for key, row in sorted(rows.items())}
+        return {key: (self.solutions / row["path"], _bounds(row)) for key, row in sorted(rows.items())}
 
     def retire(self, path: Path) -> None:
-        """Remove a kept file later: others may be reading it."""
+        """Remove a solution file later: others may be reading it."""
         later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
         later.daemon = True
         later.start()

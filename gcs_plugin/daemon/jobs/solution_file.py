@@ -108,14 +108,14 @@ def thumbnail_of(data: bytes) -> Bytes:
     return np.frombuffer(data, np.uint8).reshape(_THUMBNAIL)
 
 
-def seen(placed: list[PlacedFrame], terrain: Terrain) -> BoundingBox:
+def visible_ground(placed: list[PlacedFrame], terrain: Terrain) -> BoundingBox:
     """The ground that frames see."""
     boxes = footprint_boxes([p.camera for p in placed], float(terrain.z.min()), float(terrain.z.max()))
     boxes = boxes[np.isfinite(boxes).all(1)]
     return BoundingBox.around(boxes) if len(boxes) else BoundingBox(0.0, 0.0, 0.0, 0.0)
 
 
-def touches(placed: PlacedFrame, bounds: BoundingBox) -> bool:
+def may_see(placed: PlacedFrame, bounds: BoundingBox) -> bool:
     """Whether a frame may see ground within bounds; generous."""
     reach = 3.0 * float(placed.camera.position[2]) + _OVERLAP_M
     x, y = (float(v) for v in placed.camera.position[:2])
@@ -123,7 +123,7 @@ def touches(placed: PlacedFrame, bounds: BoundingBox) -> bool:
     return west - reach < x < east + reach and south - reach < y < north + reach
 
 
-def marked(placed: PlacedFrame, number: int, *, own: bool) -> PlacedFrame:
+def uniquely_named(placed: PlacedFrame, number: int, *, own: bool) -> PlacedFrame:
     """A frame under a name of its own: vehicles may use the same names, the renderer tells frames apart by them."""
     frame = placed.frame
     return replace(placed, frame=replace(frame, image=f"{number} {OWN if own else OTHER} {frame.image}"))
@@ -142,7 +142,7 @@ def gains_of(
         others: sorties nearby; they stay as they are. held: image -> gain of own frames that stay, too.
     """
     terrain = solution.terrain or Terrain.flat(solution.ground_z_m)
-    bounds = seen(solution.placed, terrain)
+    bounds = visible_ground(solution.placed, terrain)
     frames: list[PlacedFrame] = []
     small: dict[str, Bytes] = {}
     fixed: dict[str, Gain] = {}
@@ -150,7 +150,7 @@ def gains_of(
 
     def put(placed: PlacedFrame, own: bool, pictures: Mapping[str, Bytes], gains: Mapping[str, Gain]) -> None:
         image = placed.frame.image
-        frame = marked(placed, len(frames), own=own)
+        frame = uniquely_named(placed, len(frames), own=own)
         frames.append(frame)
         name = frame.frame.image
         if own:
@@ -164,7 +164,7 @@ def gains_of(
         put(placed, True, thumbnails, held or {})
     for other in others:
         for placed in other.solution.placed:
-            if placed.frame.image in other.gains and touches(placed, bounds):
+            if placed.frame.image in other.gains and may_see(placed, bounds):
                 put(placed, False, other.thumbnails, other.gains)
     found = estimate_fields(frames, small, terrain, fixed)
     return {names[name]: gain for name, gain in found.items() if name in names}

@@ -9,12 +9,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
-from gcs_plugin.daemon.jobs.job_queue import Job, Tell, new_job
+from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress, new_job
 from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
-from gcs_plugin.daemon.jobs.publisher import Press
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import Solved, SolveTask, lay_beside, near, solve
+from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, near, register_late, solve
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
@@ -31,26 +31,26 @@ _AGAIN: Final = 10
 
 
 @dataclass(slots=True)
-class Refinement:
+class SortieRefinement:
     """Does the jobs `refine`.
 
     Attributes:
-        journal, store, press: what there is. crew: where the work runs. drawer: of the real-time layer.
+        journal, store, publisher: what there is. workers: where the work runs. drawer: of the real-time layer.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
         make_way: called with vehicle and layer before the work begins, and before the layer is needed.
     """
 
     journal: Journal
     store: PictureStore
-    press: Press
-    crew: WorkerPool
+    publisher: Publisher
+    workers: WorkerPool
     drawer: Drawer
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     make_way: Callable[[str, str | None], None] = lambda vehicle, layer: None
     stopped: Callable[[], bool] = lambda: False
 
-    def refine(self, job: Job, tell: Tell) -> Change:
+    def refine(self, job: Job, tell: ReportProgress) -> Change:
         """The handler of `refine`."""
         vehicle = str(job.vehicle)
         began = time.monotonic()
@@ -62,7 +62,7 @@ class Refinement:
         if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
             return _nothing_came(job)
         tell(0.03, "waiting for a free worker process")
-        with self.crew.reserved():
+        with self.workers.reserved():
             before, target, frames, solved = self._solve(job, tell)
         if before is not None:
             job.detail["beside"] = len(solved.stages)
@@ -77,7 +77,7 @@ class Refinement:
         job.detail["seconds"] = round(time.monotonic() - began, 3)
         return lambda db: None
 
-    def _solve(self, job: Job, tell: Tell) -> tuple[Any, Path, int, Solved]:
+    def _solve(self, job: Job, tell: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
         """Solve what has come by now in the process that is reserved.
 
         Returns:
@@ -85,30 +85,30 @@ class Refinement:
             file, how many pictures there are, and what became of them.
         """
         job.detail["refine_started_s"] = time.time()  # what arrives later is late
-        area = self.press.area()
+        area = self.publisher.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
         before = self._beside(job, len(frames))
         tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
-        target = self.press.kept / f"{new_name('solution')}.pickle"
+        target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         task = SolveTask(
             frames, area.epsg, area.origin, self.basemap, thumbnails, self._neighbours(job, near(frames, area.epsg)),
-            target, None if before is None else self.press.kept / before["path"],
+            target, None if before is None else self.publisher.solutions / before["path"],
         )  # fmt: skip
-        return before, target, len(frames), self.crew.run(solve if before is None else lay_beside, task)
+        return before, target, len(frames), self.workers.run(solve if before is None else register_late, task)
 
-    def _show(self, job: Job, tell: Tell, target: Path, solved: Solved, before: Any) -> None:
+    def _show(self, job: Job, tell: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:
         """Draw and publish what was solved."""
         vehicle, layer = str(job.vehicle), "fine" if self.basemap is not None else "coarse"
         job.detail["layer"] = layer
         self.make_way(vehicle, layer)
-        with self.press.turn(layer):
+        with self.publisher.turn(layer):
             tell(0.7, "drawing")
-            shown = self.press.shown(layer).get((packed(vehicle), job.sortie or 0))
+            shown = self.publisher.shown(layer).get((packed(vehicle), job.sortie or 0))
             changed = solved.changed
             if before is None and shown is not None:  # it leaves where it was
                 changed = BoundingBox.around([changed, shown[1]])
-            job.detail["version_before"], job.detail["version"] = self.press.print(
-                layer, self.crew, (vehicle, job.sortie), target, changed,
+            job.detail["version_before"], job.detail["version"] = self.publisher.publish(
+                layer, self.workers, (vehicle, job.sortie), target, changed,
                 lambda rejected: self._publish(job, layer, target, solved, rejected, before),
             )  # fmt: skip
         job.detail["published_s"] = time.time()
@@ -134,7 +134,7 @@ class Refinement:
             time.sleep(0.05)
 
     def _beside(self, job: Job, count: int) -> Any:
-        """The kept refinement beside which late pictures are laid; None if all are to be refined."""
+        """The refinement beside which late pictures are laid; None if all are to be refined."""
         if job.detail.get("trigger") != "late":
             return None
         row = solution_row(self.journal, job)
@@ -143,10 +143,10 @@ class Refinement:
 
     def _neighbours(self, job: Job, box: BoundingBox) -> list[Path]:
         """Solutions of others whose ground comes near."""
-        return [self.press.kept / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
+        return [self.publisher.solutions / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
 
     def _publish(
-        self, job: Job, layer: str, target: Path, solved: Solved, rejected: dict[str, str], before: Any
+        self, job: Job, layer: str, target: Path, solved: SortieResult, rejected: dict[str, str], before: Any
     ) -> Change:
         if before is None:
             count = len(solved.stages) - len(rejected)
@@ -167,7 +167,7 @@ class Refinement:
                 queue(db)
 
         if old is not None:
-            self.press.retire(self.press.kept / old["path"])
+            self.publisher.retire(self.publisher.solutions / old["path"])
         return change
 
 

@@ -16,10 +16,10 @@ from gcs_plugin.daemon.jobs.solution_file import (
     Bytes,
     SolutionFile,
     gains_of,
-    marked,
+    may_see,
     read_solution,
-    seen,
-    touches,
+    uniquely_named,
+    visible_ground,
 )
 from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
 from orthoswarm.batch.refiners import make_refiner
@@ -41,7 +41,7 @@ class SolveTask:
     Attributes:
         frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
         thumbnails: image -> uint8 (12, 16, 3).
-        neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        neighbours: solution files nearby, held as they are. target: where the new one goes.
         before: in flight, what was kept of the sortie's earlier legs; for late pictures, of its refinement.
     """
 
@@ -56,7 +56,7 @@ class SolveTask:
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class SortieResult:
     """What became of it.
 
     Attributes:
@@ -82,16 +82,18 @@ class _Watch:
     def __init__(self) -> None:
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def solved(self, solution: Solution, frames: Sequence[Frame], kept: SolutionFile, changed: BoundingBox) -> Solved:
-        return Solved(
+    def solved(
+        self, solution: Solution, frames: Sequence[Frame], sortie: SolutionFile, changed: BoundingBox
+    ) -> SortieResult:
+        return SortieResult(
             {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
             [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
-            list(solution.warnings), seen(kept.solution.placed, kept.terrain), changed,
+            list(solution.warnings), visible_ground(sortie.solution.placed, sortie.terrain), changed,
             time.process_time() - self._cpu, time.monotonic() - self._wall,
         )  # fmt: skip
 
 
-def solve(task: SolveTask) -> Solved:
+def solve(task: SolveTask) -> SortieResult:
     """Refine one vehicle.
 
     Raises:
@@ -100,13 +102,13 @@ def solve(task: SolveTask) -> Solved:
     watch = _Watch()
     others = [read_solution(path) for path in task.neighbours]
     refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
-    solution = without_strays(refiner.refine(task.frames, [kept.solution for kept in others], _basemap(task)))
-    kept = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
-    kept.write(task.target)
-    return watch.solved(solution, _in_units(task.frames), kept, seen(solution.placed, kept.terrain))
+    solution = without_strays(refiner.refine(task.frames, [sortie.solution for sortie in others], _basemap(task)))
+    sortie = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
+    sortie.write(task.target)
+    return watch.solved(solution, _in_units(task.frames), sortie, visible_ground(solution.placed, sortie.terrain))
 
 
-def lay_beside(task: SolveTask) -> Solved:
+def register_late(task: SolveTask) -> SortieResult:
     """Lay pictures that came late beside the others of their sortie, which was refined without them."""
     from orthoswarm.refine.registration.late_pictures import lay_late
     from orthoswarm.refine.strategy.vehicle_passes import read_frame
@@ -120,10 +122,10 @@ def lay_beside(task: SolveTask) -> Solved:
     whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
     thumbnails = before.thumbnails | task.thumbnails
     gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)
-    kept = SolutionFile(whole, thumbnails, gains)
-    kept.write(task.target)
+    sortie = SolutionFile(whole, thumbnails, gains)
+    sortie.write(task.target)
     new = replace(whole, placed=placed, dropped=dropped, legs=[])
-    return watch.solved(new, [], kept, seen(placed, kept.terrain))
+    return watch.solved(new, [], sortie, visible_ground(placed, sortie.terrain))
 
 
 def without_strays(solution: Solution) -> Solution:
@@ -140,11 +142,11 @@ def without_strays(solution: Solution) -> Solution:
 
 
 @dataclass(frozen=True, slots=True)
-class AgainTask:
+class JointTask:
     """A refined sortie, to be solved once more beside neighbours.
 
     Attributes:
-        before: the kept sortie. neighbours: kept sorties nearby, held as they are. target: where the new one goes.
+        before: the solution file. neighbours: solution files nearby, held as they are. target: where the new one goes.
         epsg, origin: the area's. basemap: the map.
     """
 
@@ -156,7 +158,7 @@ class AgainTask:
     basemap: Path
 
 
-def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
+def refine_jointly(task: JointTask) -> tuple[SortieResult, float] | None:
     """Solve a refined sortie again; gives how far its pictures moved (metres, 95 %), None if nothing was to be solved.
 
     Its exposure stays as it is: its neighbours were drawn to agree with it.
@@ -173,10 +175,10 @@ def solve_again(task: AgainTask) -> tuple[Solved, float] | None:
     solution = make_refiner("swarm", task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
     if solution is before.solution:
         return None
-    kept = replace(before, solution=solution)
-    kept.write(task.target)
-    changed = BoundingBox.around([seen(p.solution.placed, p.terrain) for p in (before, kept)])
-    return watch.solved(solution, frames, kept, changed), _moved_m(before.solution, solution)
+    sortie = replace(before, solution=solution)
+    sortie.write(task.target)
+    changed = BoundingBox.around([visible_ground(p.solution.placed, p.terrain) for p in (before, sortie)])
+    return watch.solved(solution, frames, sortie, changed), _moved_m(before.solution, solution)
 
 
 def _moved_m(before: Solution, now: Solution) -> float:
@@ -196,7 +198,7 @@ def _ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float6
     return np.vstack([camera.to_ground(np.array(camera.lens.principal_point), z_m), camera.corners(z_m)])
 
 
-def place(task: SolveTask) -> Solved:
+def place(task: SolveTask) -> SortieResult:
     """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
 
     Raises:
@@ -214,17 +216,17 @@ def place(task: SolveTask) -> Solved:
     stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
     thumbnails = before.thumbnails | task.thumbnails
     gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], stays)
-    kept = SolutionFile(whole, thumbnails, gains)
-    kept.write(task.target)
-    changed = seen([*solution.placed, *moved], kept.terrain)
-    return watch.solved(solution, _in_units(task.frames), kept, changed)
+    sortie = SolutionFile(whole, thumbnails, gains)
+    sortie.write(task.target)
+    changed = visible_ground([*solution.placed, *moved], sortie.terrain)
+    return watch.solved(solution, _in_units(task.frames), sortie, changed)
 
 
-def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
+def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> SortieResult:
     """The coarse placement that a refined sortie began from, for the coarse layer.
 
     Args:
-        task: the kept refined sortie, the area's origin, where the coarse one goes.
+        task: the refined sortie's solution file, the area's origin, where the coarse one goes.
 
     Raises:
         OrthoSwarmError: the refined one does not know any more.
@@ -237,9 +239,9 @@ def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> Solved:
     solution = coarse_of(fine.solution, np.array(origin))
     there = {p.frame.image for p in solution.placed}
     solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # laid beside the others
-    kept = replace(fine, solution=solution)
-    kept.write(target)
-    return watch.solved(replace(solution, legs=[]), [], kept, seen(solution.placed, kept.terrain))
+    sortie = replace(fine, solution=solution)
+    sortie.write(target)
+    return watch.solved(replace(solution, legs=[]), [], sortie, visible_ground(solution.placed, sortie.terrain))
 
 
 def _basemap(task: SolveTask) -> Basemap | None:
@@ -279,7 +281,7 @@ class DrawTask:
     Attributes:
         old: folder of the present generation, None for the first. new: folder of the next.
         grid: where the layer lies.
-        solutions: kept sorties, in the order that breaks ties; all that show on the layer near the changed ground.
+        solutions: solution files, in the order that breaks ties; all that show on the layer near the changed ground.
         changed: the one whose ground is drawn anew. bounds: that ground.
     """
 
@@ -301,13 +303,13 @@ def draw(task: DrawTask) -> dict[str, str]:
     gains: dict[str, Any] = {}
     terrain = read_solution(task.changed).terrain
     for path in task.solutions:
-        kept = read_solution(path)
-        for p in kept.solution.placed:
-            if touches(p, task.bounds):
-                frame = marked(p, len(placed), own=path == task.changed)
+        sortie = read_solution(path)
+        for p in sortie.solution.placed:
+            if may_see(p, task.bounds):
+                frame = uniquely_named(p, len(placed), own=path == task.changed)
                 placed.append(frame)
-                if p.frame.image in kept.gains:
-                    gains[frame.frame.image] = kept.gains[p.frame.image]
+                if p.frame.image in sortie.gains:
+                    gains[frame.frame.image] = sortie.gains[p.frame.image]
     old = None if task.old is None else Canvas.open(task.old, writable=False)
     canvas = successor(old, task.new, task.grid, "frame", share=True)
     try:

@@ -30,7 +30,7 @@ class ExportTask:
         workspace: the daemon's folder. formats: some of FORMATS.
         canvases: layer -> its canvas's folder, those that there are. epsg, gsd_m: the area's.
         frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
-        coarse, solutions: kept sorties, those only placed in flight and those refined.
+        coarse, solutions: solution files, those only placed in flight and those refined.
         basemap: the map, or None. fov_rad: theta-hat.
     """
 

@@ -29,7 +29,7 @@ class Pending:
     frame: Frame
 
 
-class Waiting:
+class DrawQueue:
     """The queue; whoever uses it sees to it that one thread does at a time.
 
     Args:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, is_position
 from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
-from gcs_plugin.daemon.layers.draw_queue import Pending, Waiting
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, Pending
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Drawn, Journal, fact_change, frames_drawn, packed, unpacked
@@ -93,7 +93,7 @@ class Drawer:
         self._anchor, self._on_rejected = anchor, on_rejected
         self._far: list[tuple[float, float]] | None = None
         self._begun = 0
-        self._queue = Waiting(_IN_MEMORY)
+        self._queue = DrawQueue(_IN_MEMORY)
         self._waiting: set[int] = set()
         self._looked = 0.0
         self._more, self._looking = True, False
@@ -274,7 +274,7 @@ class Drawer:
             place = self._place(frame)
             if isinstance(place, str):
                 self._on_rejected(frame, place, True)
-                return self._told(pending, Drawn(pending.seq, place, None), None)
+                return self._report(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
             picture = read_rgba(frame.path)
             mosaic = self._mosaic
@@ -285,12 +285,12 @@ class Drawer:
         except OrthoSwarmError as error:
             reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
             self._on_rejected(frame, reason, False)
-            return self._told(pending, Drawn(pending.seq, reason, None), None)
+            return self._report(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
-            return self._told(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
-        return self._told(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
+            return self._report(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
+        return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
 
-    def _told(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
+    def _report(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
         outline = None
         if camera is not None and self._grid is not None and drawn.reason is None:

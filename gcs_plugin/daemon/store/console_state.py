@@ -1,4 +1,4 @@
-"""What the operator works on, the same for every page: the plan with its settings, and marked finds."""
+"""What the operator works on, the same for every page: the plan with its settings, and uniquely_named finds."""
 
 import threading
 import time

@@ -49,7 +49,7 @@ class Events:
         self._listeners: set[Subscription] = set()
 
     def publish(self, kind: str, /, **fields: Any) -> None:
-        """Tell all listeners; any thread."""
+        """ReportProgress all listeners; any thread."""
         with self._lock:
             listeners = list(self._listeners)
         for listener in listeners:
