@@ -47,7 +47,7 @@ def frames_at(positions, first_s=1e9):
 @given(legs=st.integers(1, 4), per_leg=st.integers(8, 30), seen=st.integers(2, 120))
 def test_a_leg_that_is_over_stays_as_it_is(legs, per_leg, seen):
     path = lawn(legs, per_leg)
-    early = ended_legs(path[: min(visible_ground, len(path))])
+    early = ended_legs(path[: min(seen, len(path))])
     assert early == ended_legs(path)[: len(early)]
 
 
