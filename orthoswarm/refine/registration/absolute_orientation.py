@@ -43,7 +43,6 @@ class Settled:
     Attributes:
         surface: the ground. ties: the last round's. matches: the matches they come from.
         roofs: matches of raised points and their heights, for a vote over several vehicles.
-        ground_shift: (2,) what ground points were off by when the roofs were matched.
         links: observations added between legs.
     """
 
@@ -51,7 +50,6 @@ class Settled:
     ties: MapTies
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
-    ground_shift: Array
     links: int
 
 
@@ -277,12 +275,11 @@ def settle(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: Grou
         if k in (1, 3):
             surface = refit_ground(flight, surface, as_smooth=k == 3)
     roofs = roof_round(flight, surface, ground)
-    ground_shift = mode_shift(ties.xy - flight.adjustment.points[ties.point, :2])
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 6.0)
     surface = refit_ground(flight, surface, as_smooth=True)
     surface, ties, matches = _second_round(flight, ground, surface, 3)
-    return Settled(surface, ties, matches, roofs, ground_shift, links)
+    return Settled(surface, ties, matches, roofs, links)
 
 
 def resettle(

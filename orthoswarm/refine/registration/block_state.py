@@ -36,8 +36,7 @@ class VehicleState:
         vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
             ground below them in the same frame.
         surface: its ground. ties, matches: of the last round (empty without a map).
-        roofs: raised points on the map and their heights;
-            ground_shift: float64 (2,) what ground points were off by then.
+        roofs: raised points on the map and their heights.
         unfound: True where there is a map and the flight was not found on it yet.
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
@@ -62,7 +61,6 @@ class VehicleState:
     coarse_sigma_m: Array
     fov_sigma_deg: float
     timings: dict[str, float] = field(default_factory=dict)
-    ground_shift: Array = field(default_factory=lambda: np.zeros(2))
     had_map: bool = False
     carried: bool = False
     map_shift: Array = field(default_factory=lambda: np.zeros(2))

@@ -44,12 +44,11 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     mapped = [s for s in states if s.on_map]
     if not mapped:
         return (0.0, 0.0)
-    shifts = [s.roofs[0].shift - s.ground_shift for s in mapped]
     roofs = [s.roofs[0] for s in mapped]
     joint = MapMatches(
         np.concatenate([r.point for r in roofs]),
         np.concatenate([r.camera for r in roofs]),
-        np.concatenate(shifts),
+        np.concatenate([r.shift for r in roofs]),
         np.concatenate([r.peak for r in roofs]),
         np.concatenate([r.ratio for r in roofs]),
     )
