@@ -20,6 +20,8 @@ FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsa
 DESK, TABLET, PHONE = (1440, 900), (1024, 768), (390, 844)
 LIMIT_MS = 600_000
 DRAWN_MS = 4000
+TILES = "[...document.querySelectorAll('.tile .pictures')]"
+COME = TILES + ".reduce((n, e) => n + parseInt(e.textContent.split('/')[1]), 0)"
 
 
 class Program:
@@ -62,13 +64,10 @@ def opened(browser: Any, url: str, size: tuple[int, int], theme: str = "dark") -
 
 
 def flight(browser: Any, demo: Program, out: Path) -> None:
-    """While vehicles fly: some legs are over, no vehicle is complete."""
+    """While vehicles fly: their first pictures are on the map."""
     page = opened(browser, demo.url, DESK)
     phone = opened(browser, demo.url, PHONE, "sunlight")
-    legs = (
-        "() => document.querySelectorAll('.leg b').length && /[1-9]/.test(document.querySelector('.leg b').textContent)"
-    )
-    page.wait_for_function(legs, timeout=LIMIT_MS)
+    page.wait_for_function(f"() => ({COME}) > 60", timeout=LIMIT_MS)
     page.click(".tile >> nth=1")
     shoot(page, out / "daemon-flight.jpg")
     shoot(phone, out / "daemon-phone.jpg")
@@ -98,6 +97,8 @@ def afterwards(browser: Any, served: Program, token: str, out: Path) -> None:
 def plan(page: Any, path: Path) -> None:
     """Draw an area over the one that was flown, and plan it."""
     page.click("#tab-plan")
+    if page.is_visible("text=Clear >> nth=0"):  # a workspace that is shown again has an area
+        page.click("text=Clear >> nth=0")
     page.click("text=Draw area")
     for x, y in ((560, 200), (1180, 170), (1260, 640), (620, 690)):
         page.mouse.click(x, y)

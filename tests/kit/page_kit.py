@@ -16,7 +16,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
 FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"]
 DESK, TABLET, PHONE = (1440, 900), (1024, 768), (390, 844)
-LIMIT_MS = 60_000
+LIMIT_MS = 120_000
 
 # Stands in for the station's event stream: the test sends each message, and decides whether the heart beats.
 SOCKET = """

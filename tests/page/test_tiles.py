@@ -138,3 +138,13 @@ def test_the_map_is_not_repainted_when_nothing_changes(browser):
             if page.evaluate("window.paints") == 0:
                 return
         raise AssertionError("the map is repainted all the time")
+
+
+def test_what_came_before_the_map_was_there_is_shown(browser):
+    layer = {"name": "fine", "version": 3, "empty": False, "bounds": [8.54, 47.39, 8.56, 47.41]}
+    with standing(vehicle(1)) as station:
+        station.gets["/api/layers"] = [layer]
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            page.wait_for_selector("[data-layer=fine][data-empty=false]")
+            page.wait_for_function("() => orthoswarm.map.getZoom() > 12 && orthoswarm.map.getLayer('fine')")

@@ -28,6 +28,7 @@ export function subscribe(topics, name, work) {
   for (const topic of topics.split(" ")) {
     if (!listeners.has(topic)) listeners.set(topic, []);
     listeners.get(topic).push(run);
+    changed(topic); // what came before somebody listened is heard as well
   }
   return run;
 }

@@ -5,7 +5,7 @@ import { tileRequest } from "/static/core/api.js";
 import { guarded } from "/static/core/guard.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { FIRST_OVERLAY, FLIGHT_LAYERS, fit, isMoved, map } from "/static/map/map.js";
+import { FIRST_OVERLAY, FLIGHT_LAYERS, fit, isMoved, isReady, map } from "/static/map/map.js";
 
 export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 const address = (name) => tileRequest(`/tiles/${name}/{z}/{x}/{y}.webp`).url.replaceAll("%7B", "{").replaceAll("%7D", "}");
@@ -60,9 +60,9 @@ export function layerPanel() {
   return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line), make("label", { class: "check" }, over, make("span", {}, t("layers.flight"))));
 }
 
-subscribe("layers", "layers", () => {
+subscribe("layers ready", "layers", () => {
   for (const layer of state.layers) {
-    guarded(`layer ${layer.name}`, () => {
+    guarded(`layer ${layer?.name}`, () => {
       setVersion(layer.name, layer.version);
       const line = rows.get(layer.name);
       if (!line) return;
@@ -71,7 +71,8 @@ subscribe("layers", "layers", () => {
       setHidden(line.about, false);
     })();
   }
-  const full = state.layers.filter((layer) => Array.isArray(layer.bounds));
+  if (!isReady()) return;
+  const full = state.layers.filter((layer) => Array.isArray(layer?.bounds));
   const best = full.find((layer) => layer.name === "best") ?? full.find((layer) => layer.name === "basemap");
   if (best && String(best.bounds) !== fitted && !isMoved()) {
     fit(best.bounds);
@@ -80,4 +81,7 @@ subscribe("layers", "layers", () => {
   for (const layer of full) if (RASTERS.includes(layer.name)) guarded(`layer ${layer.name} on the map`, showRaster)(layer.name);
 });
 
-export const mappedBounds = () => (state.layers.find((layer) => layer.name === "best" && layer.bounds) ?? state.layers.find((layer) => layer.bounds))?.bounds ?? null;
+export function mappedBounds() {
+  const full = state.layers.filter((layer) => layer?.bounds?.length === 4 && layer.bounds.every(Number.isFinite));
+  return (full.find((layer) => layer.name === "best") ?? full[0])?.bounds ?? null;
+}

@@ -43,12 +43,15 @@ map.addControl(new maplibregl.NavigationControl({ showCompass: false }), "top-ri
 map.touchZoomRotate.disableRotation();
 map.keyboard.disableRotation();
 
+let loaded = false;
+export const isReady = () => loaded;
 export const ready = new Promise((resolve) => {
   map.on("load", () => {
     for (const id of new Set(OVERLAYS.map(([name, , , , source]) => source || name))) map.addSource(id, { type: "geojson", data: EMPTY });
     for (const [id, type, paint, filter, source] of OVERLAYS) {
       map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}) });
     }
+    loaded = true;
     resolve();
   });
 });

@@ -9,7 +9,7 @@ import { preflightDialog } from "/static/fly/preflight.js";
 import { cursorLine } from "/static/map/cursor.js";
 import { layerPanel, mappedBounds } from "/static/map/layers.js";
 import { legPanel } from "/static/map/legs.js";
-import { boundsOf, fit, map, ready } from "/static/map/map.js";
+import { boundsOf, fit, isReady, map, ready } from "/static/map/map.js";
 import { measurePanel } from "/static/map/measure.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
 import "/static/map/vehicle_markers.js";
@@ -31,9 +31,8 @@ function showAll() {
 
 // Before anything is mapped the map goes once to where the vehicles are.
 let went = false;
-let isReady = false;
 subscribe("vehicles ready", "first look", () => {
-  if (went || !isReady || mappedBounds() || ![...state.vehicles.values()].some((row) => row.position)) return;
+  if (went || !isReady() || mappedBounds() || ![...state.vehicles.values()].some((row) => row.position)) return;
   went = true;
   showAll();
 });
@@ -45,7 +44,6 @@ export async function withMap(panels) {
   panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog());
   await ready;
-  isReady = true;
   subscribe("plan", "the shared plan", () => loadPlan());
   subscribe("finds-changed", "finds of others", () => loadFinds());
   guarded("the plan", loadPlan)();
