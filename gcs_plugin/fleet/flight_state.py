@@ -3,14 +3,12 @@
 import enum
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.mission.completion import Phase
-from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.mission.completion import CompletionDetector, Phase
+from gcs_plugin.mission.flight_modes import Modes
+from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT, Mission
 
 STILL_S: Final = 2.5
 """How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
@@ -65,14 +63,44 @@ class FlightState:
         return {"state": self.word.value, "text": self.text, "item": self.item, "items": self.items}
 
 
-def flight_state(vehicle: "Vehicle") -> FlightState:
+class Observed(Protocol):
+    """What has to be known of a vehicle; see vehicle_state.Vehicle."""
+
+    autopilot: Autopilot
+    modes: Modes
+    detector: CompletionDetector
+    lost: bool
+    armed: bool
+    custom_mode: int
+    velocity_m_s: tuple[float, float, float]
+    height_m: float
+    landed: str
+    mission: Mission | None
+    mission_state: int
+    mission_seq: int
+    mission_total: int
+
+    @property
+    def mode(self) -> str:
+        """Its mode in words."""
+
+    @property
+    def flying(self) -> bool:
+        """True if it is armed and, as far as is known, off the ground."""
+
+    @property
+    def still_s(self) -> float:
+        """How long it has stood still."""
+
+
+def flight_state(vehicle: Observed) -> FlightState:
     """What a vehicle is doing, as far as its messages tell."""
     items = vehicle.mission_total
     first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
     return FlightState(_word(vehicle), min(vehicle.mission_seq + first, items), items)
 
 
-def _word(vehicle: "Vehicle") -> Word:
+def _word(vehicle: Observed) -> Word:
     if vehicle.lost:
         return Word.LOST
     if not vehicle.flying:
@@ -94,7 +122,7 @@ def _word(vehicle: "Vehicle") -> Word:
     return Word.FLYING
 
 
-def _on_mission(vehicle: "Vehicle") -> Word:
+def _on_mission(vehicle: Observed) -> Word:
     command, waits = _item(vehicle)
     if command == RTL:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
@@ -112,7 +140,7 @@ def _on_mission(vehicle: "Vehicle") -> Word:
     return Word.ON_MISSION
 
 
-def _item(vehicle: "Vehicle") -> tuple[int | None, bool]:
+def _item(vehicle: Observed) -> tuple[int | None, bool]:
     """The present item's command, and whether it lets the vehicle wait; None where the mission is not known."""
     mission = vehicle.mission
     if mission is None or not 0 <= vehicle.mission_seq < len(mission.items):
@@ -121,6 +149,6 @@ def _item(vehicle: "Vehicle") -> tuple[int | None, bool]:
     return item.command, item.command in _TIMED or (item.command == WAYPOINT and item.params[0] > 0.0)
 
 
-def _comes_down(vehicle: "Vehicle") -> bool:
+def _comes_down(vehicle: Observed) -> bool:
     sinks = vehicle.velocity_m_s[2] > _SINKS_M_S and math.hypot(*vehicle.velocity_m_s[:2]) < _SLOW_M_S
     return vehicle.landed == "landing" or sinks
