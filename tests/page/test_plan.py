@@ -105,3 +105,25 @@ def test_units_and_coordinates_are_the_persons(browser):
         page.wait_for_selector(".details:has-text('32T MT 65741 49460')")
         planning(page)
         assert "262" in page.input_value("[name=altitude_m]")
+
+
+def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
+    """GIVEN a plan of version 3 WHEN this page saves a change and the station has version 4 THEN that one is shown."""
+    outline = {"type": "Polygon", "coordinates": [[[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]]}
+    theirs = {"area": outline, "settings": {"altitude_m": 120}, "plan": None, "vehicles": {}, "version": 4}
+    with standing(vehicle(1)) as station:
+
+        def answer(method, path, body):
+            station.gets["/api/plan"] = theirs
+            return 409, {"detail": "the plan was changed elsewhere (version 4); load it and change it again"}
+
+        station.gets["/api/plan"] = theirs | {"area": None, "settings": {"altitude_m": 60}, "version": 3}
+        station.answer = answer
+        with opened(browser, station.url) as page:
+            planning(page)
+            page.wait_for_function("document.querySelector('[name=altitude_m]').value === '60'")
+            draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+            page.wait_for_selector(".notice:has-text('changed elsewhere')")
+            page.wait_for_function("document.querySelector('[name=altitude_m]').value === '120'")
+            assert [body["version"] for _, path, body in station.heard if path == "/api/plan"] == [3]
+            assert corners(page) == 3

@@ -23,6 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--fov-min", type=float, metavar="DEG", help="field of view assumed in real time (default: photo tags, else 70)"
     )
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
+    add("--sei-layout", type=Path, action="append", default=[], metavar="FILE", help="layout of a maker's private SEI")
     add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
     add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
     add(
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     def load(progress: pipeline.Progress) -> Ingest:
         reading = telemetry.LoadOptions(
             args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,),
+            sei_layouts=tuple(args.sei_layout),
             run=None if args.cluster or pool is None else pool.map,
         )  # fmt: skip
         return telemetry.load(args.inputs, progress=progress, options=reading)

@@ -12,7 +12,7 @@ import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
 import { acceptDrops, readArea } from "/static/plan/import.js";
 import { planResult, showPlan } from "/static/plan/result.js";
-import { isSaving, loadShared, saveShared } from "/static/plan/shared.js";
+import { isSaving, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 // key: [smallest, largest, start value, is a length]
@@ -71,6 +71,7 @@ export async function loadPlan() {
   }
 }
 
+whenChangedElsewhere(loadPlan);
 const onNames = (chosen) => { names = chosen; save(); };
 
 export function planPanel() {

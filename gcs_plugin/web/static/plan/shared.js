@@ -9,6 +9,10 @@ let timer = null;
 let there = true; // whether this daemon keeps plans
 let version = null;
 let saving = false;
+let reload = () => {};
+
+// Called when somebody else has changed the plan meanwhile: theirs stands, and is to be shown.
+export function whenChangedElsewhere(action) { reload = action; }
 
 export async function loadShared() {
   try {
@@ -30,14 +34,20 @@ export function saveShared(body) {
   timer = setTimeout(async () => {
     timer = null;
     saving = true;
+    let outdated = false;
     try {
-      const answer = await request("PUT", "/api/plan", body);
+      const answer = await request("PUT", "/api/plan", version == null ? body : { ...body, version });
       version = answer?.version ?? version;
     } catch (error) {
       if (error.status === 404) there = false;
       else notice("warn", t("plan.unsaved", { why: error.message }));
+      outdated = error.status === 409;
     } finally {
       saving = false;
+    }
+    if (outdated) {
+      version = null;
+      reload();
     }
   }, SAVE_MS);
 }
