@@ -1,4 +1,4 @@
-"""Settling one vehicle on the map: ties, roofs, links, and the absolute adjustment (RECIPE.md steps 5 to 8)."""
+"""Absolute orientation of one vehicle: tie points on the map, links between legs, and the adjustment with both."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Bringing one vehicle onto the map: windows by correlation, a consensus line, a smooth correction (RECIPE 4)."""
+"""One vehicle brought near its place on the map: windows by correlation, a consensus line, a smooth correction."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Coarse registration to the map without a network (RECIPE.md step 4): orientation fields of small mosaics, one FFT."""
+"""Correlation of gradient orientations: small mosaics against the map by one FFT, no network, any season."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Ties to the map, roofs that tell the map's lean, and links between legs (RECIPE.md steps 5, 6 and 7)."""
+"""Tie points on the map, roofs that show how the map leans, and links between legs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

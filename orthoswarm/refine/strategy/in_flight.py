@@ -1,7 +1,7 @@
 """The coarse map in flight: pictures of legs that are over, adjusted with each other and laid on the map as a whole.
 
-Tracks and relative adjustment as on completion (RECIPE.md 1 to 3), then the consensus shift of its windows on the map
-(RECIPE.md 4); no ties, no second pass. A single straight run is another matter than a whole flight: it cannot tell
+Tracks and relative adjustment as on completion, then the consensus shift of its windows on the map; no tie points, no
+second pass. A single straight run is another matter than a whole flight: it cannot tell
 the receiver's drift from the camera's tilt, so there the drift is held. Measured on simulated flights with biases and
 drift: one leg is 2 to 4 m off on the map (without the hold up to 12 m, or not found at all), from two legs in opposite
 directions on 0.5 to 2 m.

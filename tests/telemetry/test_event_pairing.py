@@ -1,0 +1,151 @@
+"""Photos and camera events of a log brought together under any clock; what cannot be told is marked."""
+
+import math
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from telemetry.formats.log.flight_logs import read_log
+from telemetry.ingest.event_pairing import by_time, pair
+from telemetry.ingest.ingest import load
+from tests.telemetry.exposure_grid import exposures, scored
+from tests.telemetry.test_photos import gps_exif, jpeg
+
+mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+
+
+# --- pairing ------------------------------------------------------------------------------------------------------
+
+
+def uneven(count: int, seed: int) -> np.ndarray:
+    """Exposure times with the rhythm of a flight: even on legs, pauses at turns."""
+    rng = np.random.default_rng(seed)
+    gaps = np.where(np.arange(count) % 9 == 8, rng.uniform(6, 15, count), 2.0 + rng.normal(0, 0.15, count))
+    return 1.7e9 + np.cumsum(gaps)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    count=st.integers(12, 80),
+    offset=st.floats(-90_000, 90_000),
+    dropped=st.sets(st.integers(0, 79), max_size=6),
+    missing_first=st.integers(0, 3),
+    whole=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_photos_find_their_events_under_any_clock(seed, count, offset, dropped, missing_first, whole):
+    events = uneven(count, seed)
+    kept = [i for i in range(count) if i >= missing_first and i not in dropped]
+    photos = events[kept] + offset
+    photos = np.floor(photos) if whole else photos
+    found = by_time(photos, events)
+    certain = [(i, j) for i, j in found.pairs if i not in found.doubtful]
+    assert all(kept[i] == j for i, j in certain)
+    if not found.ambiguous:
+        assert found.offset_s == pytest.approx(offset, abs=0.6)
+    if not whole:
+        assert len(certain) >= 0.95 * len(kept)
+
+
+# Interval in seconds, whole seconds, share missing, least share that has to be placed without a doubt. With whole
+# seconds and several exposures in each second the times alone cannot tell which of them is missing.
+GRID = [
+    (0.3, False, 0.3, 0.99), (0.7, False, 0.3, 0.99), (1.0, False, 0.3, 0.99), (5.0, False, 0.3, 0.99),
+    (2.0, True, 0.0, 0.99), (2.0, True, 0.1, 0.99), (5.0, True, 0.0, 0.99), (5.0, True, 0.3, 0.99),
+    (1.0, True, 0.0, 0.9), (1.0, True, 0.1, 0.5), (0.7, True, 0.0, 0.0), (0.3, True, 0.1, 0.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("interval", "whole", "missing", "least"), GRID)
+def test_no_photo_is_given_a_wrong_event_without_a_mark(interval, whole, missing, least):
+    placed, total = 0, 0
+    for seed in range(3):
+        flown = exposures(np.random.default_rng(seed), interval, whole=whole, missing=missing)
+        score = scored(flown)
+        assert score.wrong_unmarked == 0
+        placed, total = placed + score.decided, total + score.both
+    assert placed >= least * total
+
+
+def test_extra_photos_stay_alone():
+    events = uneven(30, 1)
+    photos = np.sort(np.concatenate([events + 15.0, [events[0] - 60.0, events[12] + 19.5]]))
+    found = by_time(photos, events)
+    assert found.offset_s == pytest.approx(15.0, abs=0.1)
+    assert len(found.pairs) == 30
+    assert 0 not in {i for i, _ in found.pairs}
+
+
+def test_an_even_rhythm_is_ambiguous():
+    events = 1.7e9 + 3.0 * np.arange(30)
+    assert by_time(events[1:] + 4.0, events).ambiguous
+
+
+def test_without_times_numbers_and_then_order_decide():
+    found = pair([None] * 4, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [101, 102, 104, 106], [1, 2, 3, 4, 5, 6])
+    assert (found.how, found.pairs) == ("number", [(0, 0), (1, 1), (2, 3), (3, 5)])
+    found = pair([None] * 3, [1.0, 2.0, 3.0])
+    assert (found.how, found.pairs, found.ambiguous) == ("order", [(0, 0), (1, 1), (2, 2)], False)
+    assert pair([], [1.0]).pairs == []
+
+
+def photos_of(events, folder, *, offset_s, skip=()):
+    """JPEGs without position, their camera clock off by some seconds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for n, event in enumerate(events):
+        if n not in skip:
+            local = datetime.fromtimestamp(event.time_s + offset_s, UTC)
+            exif = gps_exif(0.0, 0.0, local=local.strftime("%Y:%m:%d %H:%M:%S"), subsec="0")
+            jpeg(folder / f"DSC{n:05d}.JPG", exif_bytes=exif)
+
+
+@pytest.mark.parametrize("name", ["copter_cam_rtl_1x.BIN", "swarm_v2.tlog"])
+def test_photos_beside_a_log_get_the_poses_of_its_camera_events(real_data, tmp_path, name):
+    source = real_data("sitl_logs") / name
+    (log,) = read_log(source)
+    skip = {0, 7, 8}
+    photos_of(log.events, tmp_path / "set" / "photos", offset_s=7200.0 + 15.0, skip=skip)
+    (tmp_path / "set" / name).write_bytes(source.read_bytes())
+    result = load([tmp_path / "set"])
+    assert result.rejected == []
+    assert len(result.frames) == len(log.events) - 3
+    for frame in result.frames:
+        event = log.events[int(frame.image[-9:-4])]
+        assert frame.fix.lat_deg == pytest.approx(event.sample.lat_deg, abs=1e-9)
+        assert frame.fix.height_m == pytest.approx(event.sample.height_m)
+        assert frame.time_s == pytest.approx(event.time_s)
+        assert math.degrees(frame.fix.pitch_rad) == pytest.approx(event.sample.flight_pitch_deg - 90.0, abs=1e-3)
+        assert "camera fixed under the airframe" in frame.origin["angles"]
+    assert any("3 camera events" in w and "1 of them before the first photo" in w for w in result.warnings)
+
+
+def test_three_vehicles_find_their_own_logs(real_data, tmp_path):
+    folder = real_data("sitl_logs")
+    for n in (1, 2, 3):
+        (log,) = read_log(folder / f"swarm_v{n}.tlog")
+        photos_of(log.events, tmp_path / "day" / f"camera{n}", offset_s=3600.0 * n + n)
+        (tmp_path / "day" / f"swarm_v{n}.tlog").write_bytes((folder / f"swarm_v{n}.tlog").read_bytes())
+    result = load([tmp_path / "day"])
+    assert len(result.frames) == 3 * 59
+    for frame in result.frames:
+        assert f"swarm_v{frame.vehicle[-1]}.tlog" in frame.origin["position"]
+
+
+def test_photos_with_their_own_fields_keep_them(real_data, tmp_path):
+    source = real_data("sitl_logs") / "swarm_v1.tlog"
+    (log,) = read_log(source)
+    (tmp_path / "s").mkdir()
+    for n, event in enumerate(log.events[:20]):
+        local = datetime.fromtimestamp(event.time_s + 4.0, UTC).strftime("%Y:%m:%d %H:%M:%S")
+        lat, lon = event.sample.lat_deg + 1e-5, event.sample.lon_deg
+        jpeg(tmp_path / "s" / f"P{n:03d}.JPG", exif_bytes=gps_exif(lat, lon, local=local, subsec="0"))
+    (tmp_path / "s" / "v.tlog").write_bytes(source.read_bytes())
+    frames = load([tmp_path / "s"]).frames
+    assert len(frames) == 20
+    for frame, event in zip(frames, log.events, strict=False):
+        assert frame.fix.lat_deg == pytest.approx(event.sample.lat_deg + 1e-5, abs=1e-8)
+        assert frame.origin["position"] == "EXIF GPS"
+        assert frame.fix.height_m == pytest.approx(60.0, abs=0.5)

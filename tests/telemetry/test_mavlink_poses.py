@@ -1,0 +1,197 @@
+"""MAVLink messages to poses and exposures, live and from logs; gimbals, rangefinders, reboots."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from telemetry.formats.log.dataflash import read_dataflash
+from telemetry.formats.log.flight_logs import read_tlog
+from telemetry.formats.log.mavlink_poses import MavlinkPoses, fixed_camera
+from telemetry.live.live_poses import LivePoses
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+
+mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+
+
+# --- live MAVLink -------------------------------------------------------------------------------------------------
+
+
+def messages_of(path):
+    """Decoded messages of a tlog with their arrival times."""
+    data = path.read_bytes()
+    decoder, at = mavlink.MAVLink(None), 0
+    while at + 20 < len(data):
+        length = 12 + data[at + 9] if data[at + 8] == 0xFD else 8 + data[at + 9]
+        yield decoder.decode(bytearray(data[at + 8 : at + 8 + length])), int.from_bytes(data[at : at + 8], "big") * 1e-6
+        at += 8 + length
+
+
+def test_live_poses_agree_with_the_log_read_afterwards(real_data):
+    path = real_data("sitl_logs") / "copter_cam_rtl_1x.tlog"
+    live, events = LivePoses("one", keep_s=1000.0), []
+    for message, arrival in messages_of(path):
+        event = live.feed(message, arrival)
+        if event is not None:
+            events.append(event)
+    assert len(events) == 29
+    (log,) = read_tlog(path)
+    timeline = Timeline(log.samples)
+    for event in events:
+        now, then = live.at(event.time_s), timeline.at(event.time_s)
+        assert now.lat_deg == pytest.approx(then.lat_deg, abs=3e-6)
+        assert now.height_m == pytest.approx(then.height_m, abs=0.2)
+        assert event.sample.pitch_deg == pytest.approx(event.sample.flight_pitch_deg - 90.0, abs=1e-6)
+        assert event.sample.vehicle == "one"
+
+
+def test_live_memory_is_bounded_and_reading_is_quick(real_data):
+    live = LivePoses("one", keep_s=5.0)
+    for message, arrival in messages_of(real_data("sitl_logs") / "copter_cam_rtl_1x.tlog"):
+        live.feed(message, arrival)
+    assert len(live._position.times) < 100
+    assert live.at(live.latest.time_s).lat_deg is not None
+    assert live.at(live.latest.time_s + 1.0).lat_deg is None
+
+
+def position(boot_ms, lat=47.0, lon=8.0, height=50.0):
+    return mavlink.MAVLink_global_position_int_message(
+        boot_ms, int(lat * 1e7), int(lon * 1e7), 500_000, int(height * 1000), 0, 0, 0, 0
+    )
+
+
+def attitude(boot_ms, yaw=0.0, pitch=0.0, roll=0.0):
+    return mavlink.MAVLink_attitude_message(boot_ms, *np.radians([roll, pitch, yaw]).tolist(), 0, 0, 0)
+
+
+def gimbal(boot_ms, q, flags):
+    return mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, boot_ms, flags, q, 0, 0, 0, 0)
+
+
+def quaternion(yaw, pitch, roll):
+    """w, x, y, z of Rz Ry Rx."""
+    y, p, r = np.radians([yaw, pitch, roll]) / 2
+    cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
+    return [
+        cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("flags", "own_yaw", "expected"),
+    [(32, 10.0, 100.0), (64, 10.0, 10.0), (16, 10.0, 10.0), (0, 10.0, 100.0), (16 | 32, 10.0, 100.0)],
+)
+def test_a_gimbals_yaw_is_read_in_the_frame_its_flags_name(flags, own_yaw, expected):
+    live = LivePoses("g", clock=lambda: 0.0)
+    live.feed(attitude(1000, yaw=90.0), 1000.0)
+    live.feed(gimbal(1000, quaternion(own_yaw, -80.0, 0.0), flags), 1000.0)
+    assert live.has_gimbal
+    assert live.latest.yaw_deg == pytest.approx(expected, abs=1e-3)
+    assert live.latest.pitch_deg == pytest.approx(-80.0, abs=1e-3)
+
+
+def test_a_camera_without_a_gimbal_is_fixed_under_the_airframe():
+    sample = fixed_camera(Sample(flight_yaw_deg=30.0, flight_pitch_deg=5.0, flight_roll_deg=-3.0))
+    assert (sample.yaw_deg, sample.pitch_deg, sample.roll_deg) == pytest.approx((30.0, -85.0, -3.0))
+
+
+def test_a_rangefinder_gives_the_height_above_ground():
+    live = LivePoses("r")
+    for ms in (1000, 1200):
+        live.feed(position(ms), ms / 1000 + 100.0)
+        live.feed(mavlink.MAVLink_rangefinder_message(42.0, 0.0), ms / 1000 + 100.0)
+    sample = live.at(101.1)
+    assert (sample.height_m, sample.height_is_ground) == (42.0, True)
+
+
+def test_an_image_captured_report_with_a_camera_quaternion():
+    poses = MavlinkPoses()
+    poses.feed(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 1000))
+
+    def captured(q, result=1):
+        return mavlink.MAVLink_camera_image_captured_message(
+            2000, 1_700_000_001_000_000, 1, int(47e7), int(8e7), 500_000, 60_000, q, 5, result, b""
+        )
+
+    event = poses.feed(captured(quaternion(20.0, -90.0, 0.0)))
+    assert (event.number, event.time_s) == (5, 1_700_000_001.0)
+    assert event.sample.pitch_deg == pytest.approx(-90.0, abs=1e-3)
+    event = poses.feed(captured(quaternion(20.0, -5.0, 2.0)))
+    assert event.sample.yaw_deg is None
+    assert event.sample.flight_pitch_deg == pytest.approx(-5.0, abs=1e-3)
+    assert poses.feed(captured([0.0] * 4, result=0)) is None
+
+
+def test_a_captured_picture_without_a_known_ground_gets_its_height_from_home_or_from_the_track():
+    """PX4 fills relative_alt with the distance to the ground, and with -1 m where it does not know that."""
+
+    def captured(boot_ms):
+        return mavlink.MAVLink_camera_image_captured_message(
+            boot_ms, 1_700_000_000_000_000 + 1000 * boot_ms, 1, int(47e7), int(8e7), 500_000, -1000,
+            quaternion(20.0, -5.0, 2.0), 5, 1, b"",
+        )  # fmt: skip
+
+    live = LivePoses("px4")
+    live.feed(mavlink.MAVLink_system_time_message(1_700_000_001_000_000, 1000))
+    for boot_ms in range(1000, 3000, 100):
+        live.feed(position(boot_ms, 47.0, 8.0))
+    event = live.feed(captured(2050))
+    assert event.sample.height_m == pytest.approx(live.at(1_700_000_002.05).height_m)
+    poses = MavlinkPoses()
+    poses.feed(mavlink.MAVLink_home_position_message(int(47e7), int(8e7), 440_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
+    assert poses.feed(captured(2050)).sample.height_m == pytest.approx(60.0)
+
+
+def test_positions_without_a_fix_and_not_a_number_are_left_out():
+    live = LivePoses("n")
+    live.feed(position(1000, 0.0, 0.0), 101.0)
+    assert live.latest.lat_deg is None
+    assert live.latest.height_m is None
+    live.feed(attitude(1000, yaw=math.nan), 101.0)
+    assert live.latest.flight_yaw_deg is None
+
+
+def test_a_reboot_and_a_clock_set_back_are_survived():
+    live = LivePoses("b", keep_s=60.0)
+    for ms in range(100_000, 101_000, 100):
+        live.feed(position(ms), ms / 1000 + 1e6)
+    for ms in range(1000, 2000, 100):
+        live.feed(position(ms, 47.5), ms / 1000 + 1e6 + 120)
+    assert live.at(1e6 + 121.5).lat_deg == pytest.approx(47.5)
+
+
+def test_dataflash_heights_of_a_rangefinder_and_gimbal_are_read(tmp_path):
+    out = bytearray()
+
+    def fmt(kind, name, codes, columns):
+        size = 3 + struct.calcsize("<" + codes.replace("L", "i").replace("c", "h").replace("M", "B"))
+        out.extend(b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", kind, size, name, codes.encode(), columns.encode()))
+
+    def row(kind, codes, *values):
+        out.extend(b"\xa3\x95" + bytes([kind]) + struct.pack("<" + codes, *values))
+
+    out.extend(
+        b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
+    )
+    fmt(130, b"GPS", "QBIH", "TimeUS,Status,GMS,GWk")
+    fmt(131, b"POS", "QLLff", "TimeUS,Lat,Lng,Alt,RelHomeAlt")
+    fmt(132, b"RFND", "QfBB", "TimeUS,Dist,Stat,Orient")
+    fmt(133, b"MNT", "Qfff", "TimeUS,Roll,Pitch,YawE")
+    for i in range(20):
+        t = 1_000_000 + 100_000 * i
+        row(130, "QBIH", t, 3, 100_000 + 100 * i, 2300)
+        row(131, "Qiiff", t, int(47e7), int(8e7), 500.0, 60.0)
+        row(132, "QfBB", t, 41.5, 4, 25)
+        row(133, "Qfff", t, 0.0, -90.0, 77.0)
+    (tmp_path / "a.BIN").write_bytes(out)
+    log = read_dataflash(tmp_path / "a.BIN")
+    log.samples.sort(key=lambda s: s.time_s)
+    timeline = log.timeline()
+    sample = timeline.at(timeline.span[0] + 0.55)
+    assert log.has_gimbal
+    assert (sample.height_m, sample.height_is_ground) == (pytest.approx(41.5), True)
+    assert (sample.yaw_deg, sample.pitch_deg) == pytest.approx((77.0, -90.0), abs=1e-4)
+    assert timeline.span[0] == pytest.approx(315_964_800 + 2300 * 604_800 + 100.0 - 18.0, abs=0.01)
