@@ -120,7 +120,7 @@ def test_tiles_keep_their_places_until_the_person_sorts(browser):
         send(page, {"type": "vehicle", "id": "v4", "system": 4, "battery": 0.05})
         page.wait_for_selector(".tile[data-level=bad]")
         assert names.all_inner_texts() == ["v1", "v2", "v3", "v4", "v5"]
-        assert "DANGER v4" in page.inner_text(".alarms")
+        page.wait_for_selector(".alarms:has-text('DANGER v4')")
         page.select_option("select[aria-label=Order]", "need")
         assert names.all_inner_texts() == ["v4", "v1", "v2", "v3", "v5"]
         page.select_option("select[aria-label='Which vehicles']", "need")

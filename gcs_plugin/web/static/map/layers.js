@@ -73,10 +73,10 @@ subscribe("layers ready", "layers", () => {
   }
   if (!isReady()) return;
   const full = state.layers.filter((layer) => Array.isArray(layer?.bounds));
-  const best = full.find((layer) => layer.name === "best") ?? full.find((layer) => layer.name === "basemap");
-  if (best && String(best.bounds) !== fitted && !isMoved()) {
-    fit(best.bounds);
-    fitted = String(best.bounds);
+  const bounds = mappedBounds();
+  if (bounds && String(bounds) !== fitted && !isMoved()) {
+    fit(bounds);
+    fitted = String(bounds);
   }
   for (const layer of full) if (RASTERS.includes(layer.name)) guarded(`layer ${layer.name} on the map`, showRaster)(layer.name);
 });
