@@ -48,7 +48,7 @@ _CLIP = float(np.log(1.8))
 """Greatest log factor: what would need more is another cause (burnt out, cloud shadow)."""
 _ROUNDS, _STEPS, _ENOUGH = 4, 25, 1e-3
 _NODES = 7
-_LENS, _VIEW, _OWN = 6, 11, 3
+_COMMON, _OWN = 11, 3
 """Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain and two slopes."""
 
 
@@ -126,7 +126,7 @@ def _solve(
     prior_f = np.array([_FRAME_SIGMA, _SLOPE_SIGMA, _SLOPE_SIGMA]) ** -2.0
     prior = np.concatenate([np.tile(prior_v, vehicles), np.tile(prior_f, len(vehicle))])[:, None] * np.ones(3)
     of_hue = np.ones(len(prior), bool)
-    of_hue[: vehicles * _VIEW : _VIEW] = False
+    of_hue[: vehicles * _COMMON : _COMMON] = False
     prior[of_hue, 1:] /= _HUE_SHARE**2
     measured = colors.ratio @ _BRIGHTNESS_HUE.T
     x = np.zeros((len(prior), 3))
@@ -168,7 +168,7 @@ def _solve(
             towards = z + product / np.where(last > 0.0, last, 1.0) * towards
         x += step
     x = x @ _BRIGHTNESS_HUE
-    return x[: vehicles * _VIEW].reshape(vehicles, _VIEW, 3), x[vehicles * _VIEW :].reshape(-1, _OWN, 3)
+    return x[: vehicles * _COMMON].reshape(vehicles, _COMMON, 3), x[vehicles * _COMMON :].reshape(-1, _OWN, 3)
 
 
 @kernel
@@ -184,7 +184,7 @@ def _bases(place, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
 @kernel
 def _forward(frame, place, vehicle, free, vehicles, values, out):  # type: ignore[no-untyped-def]
     """Difference of the log factors of the two sides of each sample (M, 3)."""
-    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
     out[:] = 0.0
     for m in range(len(frame)):
         for side in range(2):
@@ -195,17 +195,17 @@ def _forward(frame, place, vehicle, free, vehicles, values, out):  # type: ignor
             _bases(place[m, side], of_vehicle, of_frame)
             for channel in range(3):
                 total = 0.0
-                for q in range(11):
-                    total += of_vehicle[q] * values[11 * vehicle[k] + q, channel]
-                for q in range(3):
-                    total += of_frame[q] * values[11 * vehicles + 3 * k + q, channel]
+                for q in range(_COMMON):
+                    total += of_vehicle[q] * values[_COMMON * vehicle[k] + q, channel]
+                for q in range(_OWN):
+                    total += of_frame[q] * values[_COMMON * vehicles + _OWN * k + q, channel]
                 out[m, channel] += sign * total
 
 
 @kernel
 def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ignore[no-untyped-def]
     """The transpose of `_forward`: samples' values gathered in the unknowns (added to out)."""
-    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
     for m in range(len(frame)):
         for side in range(2):
             k = frame[m, side]
@@ -215,26 +215,26 @@ def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ig
             _bases(place[m, side], of_vehicle, of_frame)
             for channel in range(3):
                 value = sign * weighted[m, channel]
-                for q in range(11):
-                    out[11 * vehicle[k] + q, channel] += of_vehicle[q] * value
-                for q in range(3):
-                    out[11 * vehicles + 3 * k + q, channel] += of_frame[q] * value
+                for q in range(_COMMON):
+                    out[_COMMON * vehicle[k] + q, channel] += of_vehicle[q] * value
+                for q in range(_OWN):
+                    out[_COMMON * vehicles + _OWN * k + q, channel] += of_frame[q] * value
 
 
 @kernel
 def _diagonal(frame, place, vehicle, free, vehicles, weight, out):  # type: ignore[no-untyped-def]
     """The diagonal of the normal matrix, each side of a sample by itself (added to out)."""
-    of_vehicle, of_frame = np.empty(11), np.empty(3)
+    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
     for m in range(len(frame)):
         for side in range(2):
             k = frame[m, side]
             if free[k] == 0.0:
                 continue
             _bases(place[m, side], of_vehicle, of_frame)
-            for q in range(11):
-                out[11 * vehicle[k] + q] += weight[m] * of_vehicle[q] * of_vehicle[q]
-            for q in range(3):
-                out[11 * vehicles + 3 * k + q] += weight[m] * of_frame[q] * of_frame[q]
+            for q in range(_COMMON):
+                out[_COMMON * vehicle[k] + q] += weight[m] * of_vehicle[q] * of_vehicle[q]
+            for q in range(_OWN):
+                out[_COMMON * vehicles + _OWN * k + q] += weight[m] * of_frame[q] * of_frame[q]
 
 
 def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:

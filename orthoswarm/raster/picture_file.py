@@ -31,13 +31,8 @@ def read_gray(path: Path) -> Bytes:
         PictureError: if the file is no picture or is damaged beyond decoding.
     """
     data = _bytes(path)
-    if data[:2] == b"\xff\xd8":
-        import simplejpeg
-
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="GRAY", fastdct=True)[..., 0])
-        except ValueError as error:
-            raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
+    if _is_jpeg(data):
+        return _decode_jpeg(path, data, "GRAY", fast_upsample=False)[..., 0]
     return _decode_other(path, data, gray=True)
 
 
@@ -48,13 +43,8 @@ def read_rgb(path: Path) -> Bytes:
         PictureError: if the file is no picture or is damaged beyond decoding.
     """
     data = _bytes(path)
-    if data[:2] == b"\xff\xd8":
-        import simplejpeg
-
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True, fastupsample=True))
-        except ValueError as error:
-            raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
+    if _is_jpeg(data):
+        return _decode_jpeg(path, data, "RGB", fast_upsample=True)
     return np.ascontiguousarray(_decode_other(path, data, gray=False)[..., ::-1])
 
 
@@ -65,16 +55,25 @@ def read_rgba(path: Path) -> Bytes:
         PictureError: if the file is no picture or is damaged beyond decoding.
     """
     data = _bytes(path)
-    if data[:2] == b"\xff\xd8":
-        import simplejpeg
-
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGBA", fastdct=True, fastupsample=True))
-        except ValueError as error:
-            raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
+    if _is_jpeg(data):
+        return _decode_jpeg(path, data, "RGBA", fast_upsample=True)
     import cv2
 
     return np.asarray(cv2.cvtColor(_decode_other(path, data, gray=False), cv2.COLOR_BGR2RGBA))
+
+
+def _is_jpeg(data: bytes) -> bool:
+    return data[:2] == b"\xff\xd8"
+
+
+def _decode_jpeg(path: Path, data: bytes, colors: str, *, fast_upsample: bool) -> Bytes:
+    """A JPEG's pixels, uint8 (rows, columns, channels) in a colour space of simplejpeg."""
+    import simplejpeg
+
+    try:
+        return np.asarray(simplejpeg.decode_jpeg(data, colorspace=colors, fastdct=True, fastupsample=fast_upsample))
+    except ValueError as error:
+        raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
 
 
 def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int, int, str]:
