@@ -28,6 +28,7 @@ from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer, frame_of_row
 from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.mission_journal import completion_rows, note_completion
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
@@ -35,7 +36,7 @@ from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_fra
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
-from gcs_plugin.daemon.vehicles import VehicleLinks, completion_rows, note_completion
+from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.model.errors import InputError

@@ -1,7 +1,6 @@
 """The vehicles on the daemon's links: their state and poses, their sorties, and what follows when one completes.
 
-A fleet is polled by one thread. What must not be forgotten (a new sortie, a completion with the refinement that it
-asks for, the completion detector's state) goes to the journal in one transaction before anything is done about it.
+A fleet is polled by one thread. What must survive a restart goes to the journal first, see `daemon.mission_journal`.
 
 What the HTTP API and the page build on, all in JSON values:
 
@@ -20,19 +19,18 @@ What the HTTP API and the page build on, all in JSON values:
 """
 
 import contextlib
-import json
 import logging
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.daemon.jobs.job_queue import Jobs, new_job
+from gcs_plugin.daemon.jobs.job_queue import Jobs
+from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.mission.exchange import Verdict
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -83,7 +81,8 @@ class VehicleLinks:
         from gcs_plugin.fleet.fleet import Fleet
         from gcs_plugin.links.signing import find_key
 
-        self._settings, self._journal, self._events, self._jobs = settings, journal, events, jobs
+        self._settings, self._events, self._jobs = settings, events, jobs
+        self._missions = MissionJournal(journal)
         self._titles = {v.id: v.name for v in settings.vehicles}
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._kept: dict[int, _Kept] = {}
@@ -356,9 +355,12 @@ class VehicleLinks:
         kept = self._keep(event.system)
         try:
             if event.kind == "found":
-                self._found(vehicle, name)
+                self._missions.found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
-                self._journal.write(self._mission_change(event, vehicle, name))
+                flying = [
+                    self.name_of(s) for s, v in sorted(self.fleet.vehicles.items()) if s != event.system and _flies(v)
+                ]
+                self._missions.note(event, vehicle, name, flying)
                 if event.kind == "complete":
                     self._jobs.drop("coarse", name, _REPLACED)
                 self._jobs.wake()
@@ -368,47 +370,6 @@ class VehicleLinks:
         self._events.publish("vehicle_event", vehicle=name, kind=event.kind, text=event.text, time=event.time_s)
         if event.kind != "text":
             _log.info("%s", event.text)
-
-    def _found(self, vehicle: "Vehicle", name: str) -> None:
-        """A vehicle that an earlier daemon followed is followed from where that stopped."""
-        from gcs_plugin.mission.completion import CompletionDetector
-
-        row = self._journal.one("SELECT state FROM vehicles WHERE id = ?", (packed(name),))
-        state = {} if row is None else json.loads(row["state"])
-        if state.get("detector") and state["detector"].get("autopilot") == vehicle.autopilot.value:
-            try:
-                vehicle.detector = CompletionDetector.from_state(state["detector"])
-            except (KeyError, TypeError, ValueError):  # of another version
-                _log.warning("%s: what was known about its mission cannot be read", name)
-        self._journal.write(
-            lambda db: db.execute("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (packed(name),)).rowcount
-        )
-
-    def _mission_change(
-        self, event: "FleetEvent", vehicle: "Vehicle", name: str
-    ) -> Callable[[sqlite3.Connection], None]:
-        """The change that a mission's event makes."""
-        detector, kind, key = vehicle.detector.state(), event.kind, packed(name)
-        flying = [self.name_of(s) for s, v in sorted(self.fleet.vehicles.items()) if s != event.system and _flies(v)]
-
-        def change(db: sqlite3.Connection) -> None:
-            db.execute("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (key,))
-            row = db.execute("SELECT sortie, state FROM vehicles WHERE id = ?", (key,)).fetchone()
-            sortie, state = int(row["sortie"]), json.loads(row["state"])
-            if kind == "started":
-                sortie += bool(state.get("flown"))  # a second mission is a sortie of its own
-                state["flown"] = True
-            state |= {"detector": detector, "mission": kind}
-            if kind == "complete":
-                detail = {"complete_s": event.time_s, "still_flying": flying}
-                db.execute(
-                    "INSERT INTO completions (vehicle, sortie, detail) VALUES (?, ?, ?)",
-                    (key, sortie, json.dumps(detail)),
-                )
-                new_job("refine", name, sortie, {"trigger": "complete"})(db)
-            db.execute("UPDATE vehicles SET sortie = ?, state = ? WHERE id = ?", (sortie, json.dumps(state), key))
-
-        return change
 
     # -- what time asks for -----------------------------------------------------------------------------------------
 
@@ -430,17 +391,7 @@ class VehicleLinks:
             if since is None or time.monotonic() - since < self._settings.lost_after_s or not _under_way(vehicle):
                 continue
             kept.lost_since = None
-            key = packed(kept.id)
-
-            def change(db: sqlite3.Connection, key: str = key, name: str = kept.id) -> bool:
-                row = db.execute("SELECT sortie FROM vehicles WHERE id = ?", (key,)).fetchone()
-                sent = db.execute("SELECT 1 FROM frames WHERE vehicle = ? AND sortie = ?", (key, row["sortie"]))
-                if sent.fetchone() is None:
-                    return False
-                new_job("refine", name, int(row["sortie"]), {"trigger": "lost"})(db)
-                return True
-
-            if self._journal.write(change):
+            if self._missions.give_up(kept.id):
                 _log.info("%s has been silent for long; what it sent is refined", kept.id)
                 self._jobs.wake()
 
@@ -468,24 +419,3 @@ def _flies(vehicle: "Vehicle") -> bool:
     from gcs_plugin.mission.completion import Phase
 
     return (vehicle.detector.phase is Phase.ACTIVE or vehicle.flying) and not vehicle.lost
-
-
-def completion_rows(journal: Journal) -> list[dict[str, Any]]:
-    """All completions as JSON values, oldest first."""
-    rows = journal.rows("SELECT * FROM completions ORDER BY id")
-    return [{"vehicle": unpacked(r["vehicle"]), "sortie": r["sortie"], **json.loads(r["detail"])} for r in rows]
-
-
-def note_completion(vehicle: str, sortie: int | None, facts: dict[str, Any]) -> Callable[[sqlite3.Connection], None]:
-    """The change that adds facts to the latest completion of a sortie, if there is one."""
-
-    def change(db: sqlite3.Connection) -> None:
-        row = db.execute(
-            "SELECT id, detail FROM completions WHERE vehicle = ? AND sortie IS ? ORDER BY id DESC LIMIT 1",
-            (packed(vehicle), sortie),
-        ).fetchone()
-        if row is not None:
-            detail = json.loads(row["detail"]) | facts
-            db.execute("UPDATE completions SET detail = ? WHERE id = ?", (json.dumps(detail), row["id"]))
-
-    return change
