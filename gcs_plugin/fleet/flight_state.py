@@ -17,7 +17,6 @@ _STILL_UNKNOWN_S: Final = 8.0
 _SINKS_M_S: Final = 0.3
 _SLOW_M_S: Final = 1.0
 _LOW_M: Final = 1.5
-_MISSION_PAUSED: Final = 4
 _RETURNS: Final = frozenset({"RTL", "SMART_RTL", "AUTO_RTL", "QRTL"})
 _LANDS: Final = frozenset({"LAND", "QLAND"})
 _HOLDS: Final = frozenset({"HOLD", "BRAKE", "LOITER", "POSHOLD", "GUIDED", "QHOVER", "QLOITER"})
@@ -76,9 +75,9 @@ class Observed(Protocol):
     height_m: float
     landed: str
     mission: Mission | None
-    mission_state: int
     mission_seq: int
     mission_total: int
+    paused_in_mission: bool
 
     @property
     def mode(self) -> str:
@@ -135,7 +134,7 @@ def _on_mission(vehicle: Observed) -> Word:
     if command == TAKEOFF or vehicle.landed == "taking off":
         return Word.TAKING_OFF
     still_s = _STILL_UNKNOWN_S if command is None else STILL_S
-    if vehicle.mission_state == _MISSION_PAUSED or (vehicle.still_s >= still_s and not waits):
+    if vehicle.paused_in_mission or (vehicle.still_s >= still_s and not waits):
         return Word.PAUSED
     return Word.ON_MISSION
 

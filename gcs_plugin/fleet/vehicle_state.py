@@ -22,6 +22,7 @@ _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 # EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these. PX4 sets CONST_POS_MODE whenever it stands still.
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
 _EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
+_MISSION_PAUSED: Final = int(dialect.MISSION_STATE_PAUSED)
 _STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
@@ -55,6 +56,8 @@ class Vehicle:
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
+        paused_in_mission: MISSION_CURRENT says "paused", and a HEARTBEAT after it still shows the mission's mode. A
+            change to RTL or hold suspends the mission as well, and its HEARTBEAT may come a second later.
     """
 
     address: Address
@@ -89,6 +92,7 @@ class Vehicle:
     mission_state: int = 0
     mission_seq: int = 0
     mission_total: int = 0
+    paused_in_mission: bool = False
     photos: int = 0
     received: int = 0
     missed: int = 0
@@ -209,6 +213,7 @@ class Vehicle:
         if m.type != self.kind:
             self.kind = int(m.type)
             self.modes = modes_of(self.autopilot, self.kind)
+        self.paused_in_mission = self.mission_state == _MISSION_PAUSED and self.custom_mode == self.modes.mission
 
     def _position(self, m: Message) -> None:
         self.reported = True
@@ -227,6 +232,7 @@ class Vehicle:
 
     def _mission_current(self, m: Message) -> None:
         self.mission_seq, self.mission_state = int(m.seq), int(m.mission_state)
+        self.paused_in_mission &= self.mission_state == _MISSION_PAUSED
         if 0 < m.total < 0xFFFF:
             self.mission_total = int(m.total)
 

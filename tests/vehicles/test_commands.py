@@ -400,6 +400,24 @@ def test_px4_is_returning_and_not_complete_while_it_flies_home(make_world):
     assert flight_state(vehicle).word.value == "complete"
 
 
+@BOTH
+@pytest.mark.parametrize("verb", ["rtl", "land"])
+def test_a_vehicle_that_is_sent_home_is_not_paused_until_its_heartbeat_tells_the_new_mode(make_world, autopilot, verb):
+    world = flying(make_world, autopilot)
+    vehicle = world.fleet.vehicles[1]
+    world.until(lambda: flight_state(vehicle).word.value == "on mission", 60.0)
+    words = set()
+
+    def look():
+        words.add(flight_state(vehicle).word.value)
+        return False
+
+    order = give(world, verb, 1)
+    world.until(look, 5.0)
+    assert order.result().outcome is Verdict.DONE
+    assert "paused" not in words and words & {"returning", "landing"}
+
+
 def test_a_silent_vehicle_is_lost_in_words(make_world):
     world = flying(make_world, AP, down=Faults(silent=((30.0, 1e9),)))
     world.wait(40.0 - world.clock.now)
