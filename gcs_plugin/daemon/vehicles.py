@@ -32,6 +32,7 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
+from gcs_plugin.fleet.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.samples.sample import Sample
@@ -112,8 +113,10 @@ class VehicleLinks:
     # -- asked by others ------------------------------------------------------------------------------------------
 
     def name_of(self, system: int) -> str:
-        """The id of a vehicle with a MAVLink system id."""
-        return self._names.get(system, f"v{system}")
+        """The id of a vehicle with a MAVLink system id; no two have the same."""
+        name = number_name(system)
+        taken = self._names.get(system) is None and name in self._names.values()  # by a vehicle of another system id
+        return f"system-{system}" if taken else self._names.get(system, name)
 
     def system_of(self, vehicle: str) -> int:
         """The MAVLink system id of a vehicle, by its id or that number.
@@ -279,6 +282,7 @@ class VehicleLinks:
                 time.monotonic(),
                 endurance_s=endurance_s or ENDURANCE_S,
                 legal_height_m=legal_height_m or LEGAL_HEIGHT_M,
+                name=self.name_of,
             )
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]
@@ -367,9 +371,21 @@ class VehicleLinks:
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
         kept.lost_since = time.monotonic() if event.kind == "lost" else None
-        self._events.publish("vehicle_event", vehicle=name, kind=event.kind, text=event.text, time=event.time_s)
+        text, pair = self._words(event), [self.name_of(system) for system in event.pair or ()]
+        self._events.publish("vehicle_event", vehicle=name, kind=event.kind, text=text, time=event.time_s, pair=pair)
         if event.kind != "text":
-            _log.info("%s", event.text)
+            _log.info("%s", text)
+
+    def _words(self, event: "FleetEvent") -> str:
+        """An event in words; one about two vehicles names them as the operator does."""
+        if event.pair is None:
+            return event.text
+        near = self.fleet.separation.alarms.get(event.pair)
+        return (
+            apart_text(event.pair, self.name_of)
+            if near is None
+            else near_text(near, self.fleet.separation, self.name_of)
+        )
 
     # -- what time asks for -----------------------------------------------------------------------------------------
 
@@ -398,7 +414,7 @@ class VehicleLinks:
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
         kept = self._keep(vehicle.system)
         row = vehicle.summary(now) | {"id": kept.id, "name": self._titles.get(kept.id, "")}
-        row["alarm"] = self.fleet.separation.text(vehicle.system)
+        row["alarm"] = self.fleet.separation.text(vehicle.system, self.name_of)
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))

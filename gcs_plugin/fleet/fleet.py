@@ -18,7 +18,7 @@ from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams, default_rates
 from gcs_plugin.fleet.routes import Route
-from gcs_plugin.fleet.separation_watch import SeparationWatch, near_text
+from gcs_plugin.fleet.separation_watch import SeparationWatch, apart_text, near_text
 from gcs_plugin.fleet.telemetry_check import has_place, possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
@@ -447,9 +447,9 @@ class Fleet:
             kind, text = mission_event(event)
             self._event(kind, vehicle, text)
 
-    def _event(self, kind: str, vehicle: Vehicle, text: str, *, named: bool = False) -> None:
-        words = text if named else f"vehicle {vehicle.system} {text}"
-        event = FleetEvent(kind, vehicle.system, self._wall(), words)
+    def _event(self, kind: str, vehicle: Vehicle, text: str, pair: tuple[int, int] | None = None) -> None:
+        words = text if pair else f"vehicle {vehicle.system} {text}"
+        event = FleetEvent(kind, vehicle.system, self._wall(), words, pair)
         for listener in self._listeners:
             listener(event)
 
@@ -480,9 +480,9 @@ class Fleet:
     def _watch_separation(self, now: float) -> None:
         new, ended = self.separation.look(self.vehicles.values(), now)
         for near in new:
-            self._event("near", self.vehicles[near.other], near_text(near, self.separation), named=True)
-        for one, other in ended:
-            self._event("apart", self.vehicles[other], f"v{one} and v{other} are apart again", named=True)
+            self._event("near", self.vehicles[near.other], near_text(near, self.separation), near.pair)
+        for pair in ended:
+            self._event("apart", self.vehicles[pair[1]], apart_text(pair), pair)
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Is it one vehicle on two links, or several vehicles with one system id? Their clocks tell."""

@@ -25,12 +25,14 @@ class FleetEvent:
         system: system id.
         time_s: UTC epoch seconds.
         text: one sentence.
+        pair: system ids in order of the two that `near` and `apart` are about.
     """
 
     kind: str
     system: int
     time_s: float
     text: str
+    pair: tuple[int, int] | None = None
 
 
 def mission_event(event: MissionEvent) -> tuple[str, str]:

@@ -6,10 +6,11 @@ pre-arm checks, its filter) is asked for here, so that nobody takes off while an
 
 import enum
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.control import unflyable
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
@@ -132,6 +133,7 @@ def preflight_all(
     *,
     endurance_s: float = ENDURANCE_S,
     legal_height_m: float = LEGAL_HEIGHT_M,
+    name: Callable[[int], str] = number_name,
 ) -> list[Check]:
     """Check vehicles that are to start together.
 
@@ -142,9 +144,10 @@ def preflight_all(
         starts: takeoffs in seconds after the first; 0 where none is said.
         now: the fleet's clock.
         endurance_s, legal_height_m: see Wanted.
+        name: name of a vehicle by its system id.
     """
     flown = {s: m for s, v in vehicles.items() if (m := missions.get(s) or stored.get(s) or v.mission) is not None}
-    near = near_text(flown, starts) if set(flown) - set(missions) else {}
+    near = near_text(flown, starts, name) if set(flown) - set(missions) else {}
     return [
         preflight(
             vehicle,
@@ -155,7 +158,9 @@ def preflight_all(
     ]
 
 
-def near_text(missions: "Mapping[int, Mission]", starts: Mapping[int, float]) -> dict[int, str]:
+def near_text(
+    missions: "Mapping[int, Mission]", starts: Mapping[int, float], name: Callable[[int], str] = number_name
+) -> dict[int, str]:
     """For vehicles whose missions come too near each other with these starts: whom they meet, when, how near.
 
     Missions of one plan with the plan's own starts keep apart by construction and need no check.
@@ -163,7 +168,7 @@ def near_text(missions: "Mapping[int, Mission]", starts: Mapping[int, float]) ->
     found: dict[int, list[str]] = {}
     for one, other, at, metres in Airspace.of(missions).conflicts({s: starts.get(s, 0.0) for s in missions}):
         for mine, theirs in ((one, other), (other, one)):
-            found.setdefault(mine, []).append(f"{metres:.0f} m from v{theirs} after {at:.0f} s")
+            found.setdefault(mine, []).append(f"{metres:.0f} m from {name(theirs)} after {at:.0f} s")
     return {
         s: f"comes within {', '.join(texts[:3])}; start them later, or plan them together" for s, texts in found.items()
     }

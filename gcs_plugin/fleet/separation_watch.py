@@ -1,7 +1,7 @@
 """Vehicles in the air that come nearer than they should: an alarm with a proposal."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -28,6 +28,16 @@ class Near:
     other: int
     metres: float
     height_m: float
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """System ids in order."""
+        return min(self.one, self.other), max(self.one, self.other)
+
+
+def number_name(system: int) -> str:
+    """Name of a vehicle to which the operator gave none."""
+    return f"v{system}"
 
 
 @dataclass(slots=True)
@@ -64,11 +74,11 @@ class SeparationWatch:
         self.alarms = found
         return new, ended
 
-    def text(self, system: int) -> str:
-        """The alarm of a vehicle in words, empty if there is none."""
+    def text(self, system: int, name: Callable[[int], str] = number_name) -> str:
+        """The alarm of a vehicle in words, empty if there is none; `name` gives the names of vehicles."""
         for near in self.alarms.values():
-            if system in (near.one, near.other):
-                return near_text(near, self)
+            if system in near.pair:
+                return near_text(near, self, name)
         return ""
 
     def _at_start(self, one: "Vehicle", other: "Vehicle") -> bool:
@@ -80,12 +90,18 @@ class SeparationWatch:
         return all(launch is not None and _apart(place, launch) < reach for place, launch in here)
 
 
-def near_text(near: Near, watch: SeparationWatch) -> str:
-    """An alarm in words."""
+def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = number_name) -> str:
+    """An alarm in words; `name` gives the names of vehicles."""
+    one, other = name(near.one), name(near.other)
     return (
-        f"v{near.one} and v{near.other} are {near.metres:.0f} m apart and {near.height_m:.0f} m in height "
-        f"(they should keep {watch.distance_m:.0f} m, or {watch.height_m:.0f} m in height): pause v{near.other}"
+        f"{one} and {other} are {near.metres:.0f} m apart and {near.height_m:.0f} m in height "
+        f"(they should keep {watch.distance_m:.0f} m, or {watch.height_m:.0f} m in height): pause {other}"
     )
+
+
+def apart_text(pair: tuple[int, int], name: Callable[[int], str] = number_name) -> str:
+    """The end of an alarm in words."""
+    return f"{name(pair[0])} and {name(pair[1])} are apart again"
 
 
 def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:

@@ -36,7 +36,8 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
     """The module as MAVProxy sees it."""
 
     def __init__(self, mpstate: Any) -> None:
-        super().__init__(mpstate, "orthoswarm", "map disaster areas with a swarm", public=True, multi_vehicle=True)
+        # named as it is loaded: `module unload` and `module reload` take that name, and a second load is refused
+        super().__init__(mpstate, __package__, "map disaster areas with a swarm", public=True, multi_vehicle=True)
         self.commands = Commands(Client())
         self.feed: Feed | None = None
         self.child: Child | None = None

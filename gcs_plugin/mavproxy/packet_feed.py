@@ -77,7 +77,7 @@ class Feed:
 
 
 class Child:
-    """A daemon that was started from the console and ends with it.
+    """A daemon that was started from the console and ends with it, however the console ends (`--end-with-input`).
 
     Args:
         workspace: of the daemon. flags: more for `orthoswarm serve`.
@@ -95,12 +95,13 @@ class Child:
             self.port = int(probe.getsockname()[1])
         link = f"udpin:127.0.0.1:{self.port}"
         command = [
-            sys.executable, "-m", "gcs_plugin.cli", "serve", "--workspace", str(workspace), "--link", link, *flags
+            sys.executable, "-m", "gcs_plugin.cli", "serve", "--workspace", str(workspace), "--link", link,
+            "--end-with-input", *flags
         ]  # fmt: skip
         workspace.mkdir(parents=True, exist_ok=True)
         self._log = (workspace / "serve.log").open("ab")
         self._process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, start_new_session=True
         )
         self.url = self._address(workspace)
         self._wait_until_it_answers(workspace)
@@ -129,8 +130,9 @@ class Child:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
         self._log.close()
 
     def _address(self, workspace: Path) -> str:

@@ -4,8 +4,11 @@ import json
 import signal
 import socket
 import sqlite3
+import subprocess
+import sys
 import time
 
+import httpx
 import pytest
 
 from tests.kit.daemon_kit import line, start, stop
@@ -41,3 +44,24 @@ def test_silent_streams_do_not_hold_it_up(tmp_path, silent_port, told):
         (clean,) = journal.execute("SELECT value FROM meta WHERE key = 'clean'").fetchone()
     journal.close()
     assert json.loads(clean) is True
+
+
+_STARTER = """
+import pathlib, sys, time
+from gcs_plugin.mavproxy.packet_feed import Child
+print(Child(pathlib.Path(sys.argv[1]), ["--port", "0", "--workers", "1"]).url, flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_child_ends_when_the_program_that_started_it_is_killed(tmp_path):
+    starter = subprocess.Popen([sys.executable, "-c", _STARTER, str(tmp_path / "w")], stdout=subprocess.PIPE, text=True)
+    url = starter.stdout.readline().strip()
+    assert httpx.get(f"{url}/healthz", trust_env=False).status_code == 200
+    starter.kill()
+    starter.wait(30)
+    starter.stdout.close()
+    with pytest.raises(httpx.TransportError):
+        for _ in range(300):
+            httpx.get(f"{url}/healthz", trust_env=False)
+            time.sleep(0.2)

@@ -148,3 +148,19 @@ def test_what_came_before_the_map_was_there_is_shown(browser):
             page.click("#tab-map")
             page.wait_for_selector("[data-layer=fine][data-empty=false]")
             page.wait_for_function("() => orthoswarm.map.getZoom() > 12 && orthoswarm.map.getLayer('fine')")
+
+
+def test_the_alarm_of_a_pair_ends_with_that_pair(browser):
+    def event(kind, vehicle, *pair):
+        return {"type": "vehicle_event", "kind": kind, "vehicle": vehicle, "pair": pair, "text": f"{pair} {kind}"}
+
+    with standing(vehicle(1), vehicle(2), vehicle(3)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile >> nth=2")
+        send(page, event("near", "v1", "v1", "v2"))
+        send(page, event("near", "v1", "v1", "v3"))  # two alarms, although one vehicle should be paused for both
+        page.wait_for_function("() => document.querySelectorAll('.alarms li').length == 2")
+        send(page, event("apart", "v2", "v1", "v2"))
+        page.wait_for_function("() => document.querySelectorAll('.alarms li').length == 1")
+        assert "v3" in page.inner_text(".alarms li")
+        send(page, event("apart", "v3", "v1", "v3"))
+        page.wait_for_selector(".alarms", state="hidden")

@@ -5,6 +5,7 @@ import os
 import pickle
 import queue
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -156,18 +157,39 @@ def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
             proxy.type("orthoswarm nonsense", "usage: orthoswarm")
             served.until("/api/jobs", lambda rows: all(r["state"] in ("done", "failed") for r in rows))
             assert (tmp_path / "ws" / "export" / "orthoimage.mbtiles").stat().st_size > 1000
-            proxy.type("module unload orthoswarm", "Unloaded module")
-            ended(served)
+            proxy.type("module unload gcs_plugin.mavproxy", "Unloaded module")
+            ended(served.url)
         finally:
             proxy.close()
 
 
-def ended(served, limit_s=60.0):
+@pytest.mark.parametrize("how", ["unload", "quit", "kill"])
+def test_a_daemon_that_the_console_started_ends_with_it(tmp_path, how):
+    with SimSwarm(make_swarm(1), "tcpin:127.0.0.1:0") as swarm:
+        proxy = MavProxy(tmp_path, swarm.addresses)
+        try:
+            proxy.wait("Loaded module gcs_plugin.mavproxy")
+            proxy.wait("'orthoswarm serve WORKSPACE")
+            proxy.type("module load gcs_plugin.mavproxy", "already loaded")
+            url = proxy.type("orthoswarm serve ws --port 0 --workers 1", r"the daemon runs: (\S+)/")[1]
+            if how == "unload":
+                proxy.type("module unload gcs_plugin.mavproxy", "Unloaded module")
+                ended(url)
+                proxy.type("module load gcs_plugin.mavproxy", "Loaded module gcs_plugin.mavproxy")  # and again
+                proxy.wait("'orthoswarm serve WORKSPACE")
+            else:
+                proxy.process.send_signal(signal.SIGTERM if how == "quit" else signal.SIGKILL)
+                ended(url)
+        finally:
+            proxy.close()
+
+
+def ended(url, limit_s=60.0):
     """The daemon has ended with the module."""
     end = time.monotonic() + limit_s
     while time.monotonic() < end:
         try:
-            served.get("/healthz")
+            httpx.get(f"{url}/healthz", trust_env=False)
         except httpx.TransportError:
             return
         time.sleep(0.2)

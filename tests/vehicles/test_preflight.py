@@ -253,6 +253,7 @@ def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
     assert world.until(lambda: any(e.kind == "near" for e in world.events), 100.0)
     alarm = next(e for e in world.events if e.kind == "near")
     assert "they should keep 10 m" in alarm.text and "pause v" in alarm.text
+    assert alarm.pair == (1, 2)
     assert fleet_.separation.text(1) and fleet_.separation.text(2)
     assert sum(e.kind == "near" for e in world.events) == 1  # said once
 

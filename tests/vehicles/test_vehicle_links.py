@@ -5,11 +5,12 @@ import time
 
 import pytest
 
-from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
+from gcs_plugin.fleet.separation_watch import Near
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
@@ -45,11 +46,11 @@ class PlanFolder:
 def open_links(tmp_path):
     opened = []
 
-    def make(vehicles, *, key=None, speed=10.0):
+    def make(vehicles, *, key=None, speed=10.0, named=()):
         swarm = SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=speed, key=key)
         swarm.__enter__()
         opened.append(swarm)
-        settings = Settings(tmp_path, links=tuple(swarm.addresses))
+        settings = Settings(tmp_path, links=tuple(swarm.addresses), vehicles=named)
         journal = Journal(tmp_path / "journal.sqlite")
         links = VehicleLinks(settings, journal, Events(), NoJobs())
         links.start()
@@ -164,3 +165,13 @@ def test_a_takeoff_that_waits_is_cancelled_by_rtl(open_links, folder):  # noqa: 
     assert row["outcome"] == "done" and "is cancelled" in row["reason"]
     assert "v2" not in takeoffs.rows()
     takeoffs.close()
+
+
+def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_links):
+    """The one with system id 1 is called v2: the one with system id 2 needs another name."""
+    links = open_links(make_swarm(2, home=HOME), named=(VehicleSettings("v2", 1),))
+    assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
+    watch = links.fleet.separation
+    watch.alarms = {(1, 2): Near(2, 1, 4.0, 1.0)}
+    for system in (1, 2):
+        assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4 m apart and 1 m in height")

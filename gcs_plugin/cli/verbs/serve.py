@@ -1,6 +1,7 @@
 """`orthoswarm serve`: the daemon with its web map."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -31,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--workers", type=int, metavar="N", help="processes that refine (default: one less than cores)")
     add("--source", action="append", default=[], metavar="ID=WHERE", help="pictures of a vehicle: stream or folder")
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
+    add("--end-with-input", action="store_true", help="end when standard input ends, so with the program that holds it")
     add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
 
 
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         raise disk_error(error, args.workspace) from None
     settings = settings_of(args)
-    return _show_token(settings) if args.show_token else serve(settings)
+    return _show_token(settings) if args.show_token else serve(settings, end_with_input=args.end_with_input)
 
 
 def _show_token(settings: "Settings") -> int:
@@ -115,8 +117,12 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     return replace(settings, vehicles=tuple(vehicles.values())).check()
 
 
-def serve(settings: "Settings") -> int:
-    """Run daemon and web server until SIGINT or SIGTERM."""
+def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
+    """Run daemon and web server until SIGINT or SIGTERM, or (`end_with_input`) until standard input ends.
+
+    A program that starts the daemon and holds the other end of its standard input takes the daemon with it however
+    it ends, since the operating system closes that end.
+    """
     import logging
     import os
     import sys
@@ -150,6 +156,8 @@ def serve(settings: "Settings") -> int:
             server.force_exit, server.should_exit = bool(server.should_exit), True
 
         server.handle_exit = end
+        if end_with_input:
+            threading.Thread(target=_when_input_ends, args=(end,), name="input", daemon=True).start()
         server.run(sockets=[listener])
     if any(thread.name.startswith(STREAM_THREAD) for thread in threading.enumerate()):
         logging.shutdown()  # a dead stream keeps its reader inside a library; everything else is closed
@@ -157,3 +165,12 @@ def serve(settings: "Settings") -> int:
         sys.stderr.flush()
         os._exit(0)
     return 0
+
+
+def _when_input_ends(end: Callable[[], None]) -> None:
+    """Call a function once standard input has ended."""
+    import os
+
+    while os.read(0, 4096):
+        pass
+    end()

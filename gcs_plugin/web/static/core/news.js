@@ -52,7 +52,7 @@ const KINDS = {
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
     if (row && event.text) { row.texts.push({ text: String(event.text).slice(0, 300), time: event.time ?? null, severity: event.severity ?? 6 }); row.texts.splice(0, row.texts.length - 50); changed("vehicles"); }
-    if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
+    if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${list(event.pair).join("/") || event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
     soon("/api/vehicles");
   },
   frame: (event) => {
