@@ -78,9 +78,11 @@ class Pictures:
             self.damaged[i] = str(error)
             return np.full(self.size[::-1], 127, np.uint8)
         frame = self._frames[i]
-        if picture.shape != (frame.height, frame.width):
+        factor = max(1, round(frame.width / picture.shape[1]))
+        if (picture.shape[0] * factor, picture.shape[1] * factor) != (frame.height, frame.width):
             self.damaged[i] = (
-                f"{frame.image} is {picture.shape[1]}x{picture.shape[0]}, not as its header says; left out"
+                f"{frame.image} is {picture.shape[1] * factor}x{picture.shape[0] * factor}, not as its header says; "
+                "left out"
             )
             return np.full(self.size[::-1], 127, np.uint8)
         if picture.shape[::-1] == self.size:

@@ -9,7 +9,7 @@ wrong map would give. Ties that share ground are not independent; only one of a 
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from orthoswarm.config import active
 
@@ -45,7 +45,7 @@ def false_matches_log10(ground: Array, shift: Array, order: Array, leg: Ints, re
 
 def agreement_probability(agree: int, count: int, within_m: float, reach_m: float) -> float:
     """Probability that so many of `count` ties lie within a distance of their place by chance."""
-    return float(binom.sf(agree - 1, count, _share(within_m, reach_m)))
+    return _binomial_tail(agree, count, _share(within_m, reach_m))
 
 
 def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, ...]) -> float:
@@ -68,9 +68,17 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
     best = 0.0
     for tolerance in tolerances:
         most = int((away < tolerance).sum(1).max())
-        tail = binom.logsf(most - fixed - 1, count - fixed, _share(tolerance, reach_m)) / np.log(10)
-        best = min(best, float(tail) + float(np.log10(len(i) * len(tolerances))))
+        tail = _binomial_tail(most - fixed, count - fixed, _share(tolerance, reach_m))
+        best = min(best, float(np.log10(tail)) + float(np.log10(len(i) * len(tolerances))))
     return best
+
+
+def _binomial_tail(successes: int, trials: int, share: float) -> float:
+    """Probability of at least so many successes; not less than the smallest number, so that it has a logarithm.
+
+    By the incomplete beta function: importing scipy.stats for it would take a third of a second.
+    """
+    return max(float(bdtrc(successes - 1, trials, share)), float(np.finfo(float).tiny)) if successes > 0 else 1.0
 
 
 def _share(within_m: float, reach_m: float) -> float:

@@ -14,7 +14,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.height_model import HeightModel
-from orthoswarm.raster.picture_file import read_gray
+from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import frame_sigmas
@@ -86,8 +86,8 @@ class Options:
 
 
 def read_frame(frame: Frame) -> NDArray[np.uint8]:
-    """A frame's grey picture."""
-    return read_gray(frame.path)
+    """A frame's grey picture, reduced while it is decoded where it is larger than what the refinement works on."""
+    return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
 
 
 def solo(
