@@ -128,8 +128,9 @@ class Flight:
         """Arm; returns why not."""
         if self.armed:
             return ""
-        if self.autopilot is Autopilot.ARDUPILOT and self.mode == self.modes.mission:
-            return "Arm: Auto mode not armable"
+        name = self._unarmable.get(self.mode) if self.autopilot is Autopilot.ARDUPILOT else None
+        if name is not None:
+            return f"Arm: {name} mode not armable"
         self.armed = True
         return ""
 
@@ -227,6 +228,11 @@ class Flight:
             self._photograph()
 
     # --- the mission ---
+
+    @property
+    def _unarmable(self) -> dict[int, str]:
+        """ArduCopter's modes here in which it does not arm."""
+        return {self.modes.mission: "Auto", self.modes.hold: "Brake", self.modes.rtl: "RTL", self.modes.land: "Land"}
 
     @property
     def _first(self) -> int:

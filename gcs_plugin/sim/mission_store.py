@@ -48,12 +48,14 @@ class MissionStore:
         home: ArduPilot's item 0.
         items: the stored mission; for ArduPilot item 0 is home.
         generation: rises whenever an upload or a clear has ended, so that the flight logic can notice.
+        stored_at: when the last upload ended, in the time of `feed`.
     """
 
     autopilot: Autopilot
     home: MissionItem
     items: list[MissionItem] = field(default_factory=list)
     generation: int = 0
+    stored_at: float = -math.inf
     _transfer: _Transfer | None = None
     _sent_to: Address | None = None
     _sent_at: float = 0.0
@@ -83,8 +85,7 @@ class MissionStore:
             case "MISSION_ACK":
                 self._sent_to = None
             case "MISSION_CLEAR_ALL":
-                self.items, self._transfer = [self.home] if self.autopilot is Autopilot.ARDUPILOT else [], None
-                self.generation += 1
+                self.clear()
                 return [self._ack(sender, ACCEPTED)]
         return []
 
@@ -102,6 +103,11 @@ class MissionStore:
     def rebooted(self) -> None:
         """Forget the dialogue; what was stored stays."""
         self._transfer = self._sent_to = None
+
+    def clear(self) -> None:
+        """Forget the mission."""
+        self.items, self._transfer = [self.home] if self.autopilot is Autopilot.ARDUPILOT else [], None
+        self.generation += 1
 
     def _sends(self, to: Address, now: float) -> bool:
         """PX4 gives items out only after a request for the list, and forgets it when it hears nothing for a while."""
@@ -161,7 +167,7 @@ class MissionStore:
             del self.items[transfer.count :]
         else:
             self.items = transfer.items
-        self._transfer = None
+        self._transfer, self.stored_at = None, now
         self.generation += 1
         return [self._ack(sender, ACCEPTED)]
 

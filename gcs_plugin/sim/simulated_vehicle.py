@@ -6,7 +6,7 @@ as a ground station is there. Both answer commands and missions as measured (doc
 
 import heapq
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -28,6 +28,8 @@ _ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
 _CURRENT: Final = int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT)
 _PX4_DEFAULTS: Final = {_POSITION: 50.0, _ATTITUDE: 50.0, _CURRENT: 1.0, 245: 5.0, 1: 1.0, 24: 1.0, 2: 1.0}
 _FIX_SHARE: Final = 0.25
+_TX_BUFFER: Final = 300.0  # bytes
+_CHECKS_MISSION_S: Final = 1.0  # PX4 looks at a new mission for so long, and does not start it meanwhile
 _WHY_S: Final = 30.0
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
@@ -47,6 +49,9 @@ class SimVehicle:
         ready_s: when its filter has a position, so that it lets itself be armed; its receiver has a fix before that.
         seed: of its receiver's errors.
         arms: False for one that refuses to arm although all its checks pass.
+        wipes: True for ArduPilot's simulation with -w, which loses the mission at each restart.
+        tx_bytes_s: what its radio carries. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
+            are sent first.
         on_exposure: called at each picture.
     """
 
@@ -58,6 +63,8 @@ class SimVehicle:
     ready_s: float = 0.0
     seed: int = 0
     arms: bool = True
+    wipes: bool = False
+    tx_bytes_s: float = math.inf
     on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
     flight: Flight = field(init=False)
     store: MissionStore = field(init=False)
@@ -72,6 +79,8 @@ class SimVehicle:
     _photos_sent: int = field(default=0, init=False)
     _told: tuple[bool, int] = field(default=(False, 0), init=False)
     _why_at: float = field(default=0.0, init=False)
+    _tx_room: float = field(default=_TX_BUFFER, init=False)
+    _tx_at: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         """Stand at home with an empty store."""
@@ -108,6 +117,8 @@ class SimVehicle:
         self._off_until = now + silence_s
         self.reboots += 1
         self.store.rebooted()
+        if self.wipes:
+            self.store.clear()
         flight = self.flight
         flight.disarm()
         flight.mode = flight.modes.hold if self.autopilot is Autopilot.PX4 else 0
@@ -161,7 +172,7 @@ class SimVehicle:
             case dialect.MAV_CMD_COMPONENT_ARM_DISARM:
                 return self._arm(bool(p1))
             case dialect.MAV_CMD_MISSION_START:
-                why = flight.start_mission()
+                why = self._mission_unchecked or flight.start_mission()
                 flight.texts += [why] if why else []
                 return (_FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED) if why else _OK
             case dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
@@ -180,6 +191,12 @@ class SimVehicle:
             case dialect.MAV_CMD_DO_SET_MISSION_CURRENT:
                 return _OK if flight.set_current(int(p1)) else _DENIED
         return _UNSUPPORTED
+
+    @property
+    def _mission_unchecked(self) -> str:
+        """What PX4 says to a start right after an upload; empty when it has looked at the mission."""
+        checks = self.autopilot is Autopilot.PX4 and self._now - self.store.stored_at < _CHECKS_MISSION_S
+        return "Mission start denied! No valid mission" if checks else ""
 
     def _arm(self, wanted: bool) -> int:
         if not wanted:
@@ -221,6 +238,7 @@ class SimVehicle:
             self.flight.step(self._stepped - self._booted)
             messages += self._happened()
         messages += self.store.tick(now)
+        self._spend(messages, now)
         if not self._ready and now >= self._why_at:
             self._why_at = now + _WHY_S
             self.flight.texts.append(self._why_not)
@@ -231,8 +249,17 @@ class SimVehicle:
             if hz > 0.0:
                 heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
                 message = _MAKERS[kind](self)
-                messages += [] if message is None else [message]
+                if message is not None and (kind == _HEARTBEAT or self._tx_room >= _bytes(message)):
+                    self._spend([message], now)
+                    messages.append(message)
         return messages
+
+    def _spend(self, messages: Sequence[Message], now: float) -> None:
+        """Take messages from what its radio carries."""
+        if self.tx_bytes_s < math.inf:
+            self._tx_room = min(_TX_BUFFER, self._tx_room + self.tx_bytes_s * (now - self._tx_at))
+            self._tx_room -= sum(_bytes(message) for message in messages)
+            self._tx_at = now
 
     @property
     def next_due(self) -> float:
@@ -395,6 +422,10 @@ _MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): SimVehicle._power,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): SimVehicle._home,
 }
+
+
+def _bytes(message: Message) -> int:
+    return int(message.unpacker.size) + 12  # MAVLink 2's frame, unsigned
 
 
 def _severity(text: str) -> int:

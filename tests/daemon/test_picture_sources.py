@@ -2,6 +2,7 @@
 
 import io
 import os
+import socket
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
+from gcs_plugin.daemon.intake.picture_sources import Source
 from gcs_plugin.daemon.intake.posted_pose import frame_of
 from gcs_plugin.daemon.intake.vehicle_log import write_link_log
 from gcs_plugin.daemon.store.picture_store import frame_key
@@ -61,6 +63,21 @@ def stored(root, vehicle, image):
 
 def source_of(served, vehicle):
     return next(row for row in served.get("/api/vehicles").json() if row["id"] == vehicle)["pictures"]
+
+
+def test_a_stream_without_pictures_is_told_once(tmp_path):
+    """A camera that sends nothing while its drone stands on the ground: each attempt ends, and one is news."""
+    said = []
+    with socket.create_server(("127.0.0.1", 0)) as camera:
+        where = f"tcp://127.0.0.1:{camera.getsockname()[1]}"
+        source = Source("v1", where, lambda *_: (1, True), lambda *_: None, said.append, tmp_path)
+        source.start()
+        camera.settimeout(60.0)
+        for _ in range(3):
+            camera.accept()[0].close()
+        assert said == ["the pictures of v1: lost"]
+        source.stop()
+    assert source.close(30.0)
 
 
 def test_a_copy_that_stalls_is_taken_only_when_it_is_whole(watched):

@@ -83,7 +83,7 @@ def test_any_value_leaves_the_other_vehicles_in_command(browser):
             assert page.locator(".tile").count() == 5
             page.click(".tile:has-text('Falcon')")
             page.wait_for_selector(".details [data-verb=rtl]")
-            assert page.locator(".vehicle:has-text('Falcon')").count() == 1
+            page.wait_for_selector(".vehicle:has-text('Falcon')")
 
 
 def test_a_name_stays_when_news_leave_it_out(browser):

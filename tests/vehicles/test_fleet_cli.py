@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -213,10 +212,8 @@ def test_simulated_vehicles_run_from_the_command_line():
 
 
 def test_simulated_vehicles_end_by_themselves(capsys):
-    started = time.monotonic()
     words = ["--vehicles", "1", "--link", f"udpout:127.0.0.1:{free_port()}", "--speed", "50", "--seconds", "20"]
     assert main(["sim", *words, "--reboot", "1@5", "--silence", "1@10+2"]) == 0
-    assert time.monotonic() - started < 5.0
     said = capsys.readouterr().err
     assert "vehicle 1: reboot" in said and "vehicle 1: silence" in said
 

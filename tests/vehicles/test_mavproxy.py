@@ -147,7 +147,7 @@ def test_a_swarm_is_planned_flown_and_refined_from_mavproxys_console(tmp_path):
                 "/api/completions", lambda rows: len(rows) == 2 and all("version" in r for r in rows), limit_s=600.0
             )
             assert {row["vehicle"] for row in done} == {"v1", "v2"}
-            assert cameras.posted == cameras.count > 10
+            assert cameras.all_posted() > 10
             assert "version" not in served.get("/healthz").json()["problems"]
             proxy.type("orthoswarm refine v1", "refining v1, sortie 1")
             proxy.type("orthoswarm layers", "coarse: [1-9]")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.control import Command
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
@@ -26,6 +27,7 @@ from gcs_plugin.sim.simulated_vehicle import SimVehicle
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
+ACK = int(dialect.MAVLINK_MSG_ID_COMMAND_ACK)
 OPEN = []
 
 
@@ -304,3 +306,62 @@ def test_a_second_station_is_denied_while_one_uploads():
     count = dialect.MAVLink_mission_count_message(1, 1, 5, 0)
     assert vehicle.handle(count, GROUND_STATION, 0.0)[0].get_type() == "MISSION_REQUEST"
     assert vehicle.handle(count, Address(254, 190), 0.1)[0].type == dialect.MAV_MISSION_DENIED
+
+
+# -- what real autopilots did, and simulated ones had not learned -----------------------------------------------------
+
+
+def test_arducopter_stands_in_brake_when_disarmed_and_does_not_arm_there():
+    world = make_world([SimVehicle(1, AP)])
+    world.meet()
+    texts = listen(world, "STATUSTEXT")
+    pilot = world.fleet.vehicles[1].pilot
+    assert world.finish(world.fleet.begin(pilot.set_mode(pilot.modes.hold)))[0].ok
+    arm = Command(pilot.vehicle, pilot.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(1.0,), verb="arm")
+    refused = world.finish(world.fleet.begin(arm))[0]
+    assert not refused.ok and "Arm: Brake mode not armable" in refused.text and texts
+    assert world.finish(world.fleet.upload(1, mission(AP, MissionItem.do(RTL))))[0].ok
+    assert world.finish(world.fleet.start(1))[0].ok  # a start leaves BRAKE for GUIDED before it arms
+    assert world.vehicles[1].flight.armed
+
+
+@pytest.mark.parametrize("wipes", [True, False])
+def test_a_mission_may_be_lost_with_a_reboot(wipes):
+    world = make_world([SimVehicle(1, AP, wipes=wipes)])
+    world.meet()
+    assert world.finish(world.fleet.upload(1, mission(AP, MissionItem.do(RTL))))[0].ok
+    world.wait(20.0)
+    world.vehicles[1].reboot(world.clock.now)
+    assert world.until(lambda: any(event.kind == "rebooted" for event in world.events), 30.0)
+    outcome = world.finish(world.fleet.start(1))[0]
+    assert outcome.ok is not wipes
+    assert not wipes or "has no mission; upload one first" in outcome.text
+
+
+def test_px4_refuses_a_start_right_after_an_upload_and_is_asked_again():
+    world = make_world([SimVehicle(1, PX4)])
+    world.meet()
+    acks = listen(world, "COMMAND_ACK")
+    assert world.finish(world.fleet.upload(1, mission(PX4, MissionItem.do(RTL))))[0].ok
+    outcome = world.finish(world.fleet.start(1))[0]
+    assert outcome.ok, outcome
+    results = [ack.result for ack in acks if ack.command == dialect.MAV_CMD_MISSION_START]
+    assert dialect.MAV_RESULT_DENIED in results and results[-1] == dialect.MAV_RESULT_ACCEPTED
+
+
+@BOTH
+def test_streams_that_starve_cost_no_heartbeat_and_no_completion(autopilot):
+    world = make_world([SimVehicle(1, autopilot, tx_bytes_s=250.0)])
+    world.meet()
+    positions, beats = listen(world, "GLOBAL_POSITION_INT"), listen(world, "HEARTBEAT")
+    asked = []
+    world.fleet.tap(lambda packet, utc: asked.append(packet) if packet.kind == ACK else None)
+    assert world.finish(world.fleet.upload(1, mission(autopilot, MissionItem.do(RTL), length=200.0)))[0].ok
+    assert world.finish(world.fleet.start(1))[0].ok
+    began, had, answers = world.clock.now, (len(positions), len(beats)), len(asked)
+    assert completed(world)
+    seconds = world.clock.now - began
+    assert (len(positions) - had[0]) / seconds < 5.0  # of ten
+    assert (len(beats) - had[1]) / seconds > 0.9
+    assert not any(event.kind == "lost" for event in world.events)
+    assert (len(asked) - answers) / seconds < 0.5  # they are asked for again, ever more seldom

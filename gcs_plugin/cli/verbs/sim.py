@@ -34,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     faults.add_argument(
         "--reboot", action="append", default=[], metavar="ID@S", help="vehicle ID restarts after S seconds"
     )
+    faults.add_argument("--wipe", action="store_true", help="missions are lost at a reboot, as by ArduPilot's -w")
     faults.add_argument(
         "--silence", action="append", default=[], metavar="ID@S+D", help="vehicle ID is silent for D seconds"
     )
@@ -57,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
     vehicles = make_swarm(
         args.vehicles, autopilots=autopilots, home=_home(args.home), spacing_m=args.spacing,
         airframe=Airframe(gps_sigma_m=args.gps_sigma), seed=args.seed, ready_s=args.ready,
+        wipes=args.wipe,
     )  # fmt: skip
     events = sorted([*_events(args.reboot, "reboot"), *_events(args.silence, "silence")])
     for at, system, what, _ in events:

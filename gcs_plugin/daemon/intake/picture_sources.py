@@ -116,8 +116,9 @@ class Source:
         from telemetry.video.extraction import encode_jpeg
 
         def state(text: str) -> None:
-            self._state = text.split(":")[0]
-            self._tell(f"the pictures of {self.vehicle}: {self._state}")
+            before, self._state = self._state, text.split(":")[0]
+            if self._state != before:  # a camera that sends nothing on the ground is lost at every attempt
+                self._tell(f"the pictures of {self.vehicle}: {self._state}")
 
         for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
             if picture.damaged:
