@@ -38,10 +38,14 @@ def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: i
 
 
 @kernel
-def _scharr(gray, field, size):  # type: ignore[no-untyped-def]
-    """Scharr gradients (reflected at the border) into field (rows, columns, 2), and their lengths into size."""
+def _scharr(gray, field, length):  # type: ignore[no-untyped-def]
+    """Scharr gradients (reflected at the border), float32 (rows, columns, 2), and their lengths.
+
+    Returns whether all lengths on every second row and column are known.
+    """
     rows, cols = gray.shape
     three, ten = np.float32(3.0), np.float32(10.0)
+    known = True
     for r in range(rows):
         above = gray[r - 1 if r > 0 else 1]
         here = gray[r]
@@ -51,29 +55,56 @@ def _scharr(gray, field, size):  # type: ignore[no-untyped-def]
             gx = three * (above[e] - above[w] + below[e] - below[w]) + ten * (here[e] - here[w])
             gy = three * (below[w] - above[w] + below[e] - above[e]) + ten * (below[c] - above[c])
             field[r, c, 0], field[r, c, 1] = gx, gy
-            size[r, c] = np.sqrt(gx * gx + gy * gy)
+            length[r, c] = np.sqrt(gx * gx + gy * gy)
+            if (r | c) & 1 == 0 and np.isnan(length[r, c]):
+                known = False
+    return known
 
 
 @kernel
-def _compress(field, size, middle, texture):  # type: ignore[no-untyped-def]
-    """Weigh gradients by their length and the middle one, in place; those of unknown pixels become 0."""
-    rows, cols = size.shape
-    for r in range(rows):
-        for c in range(cols):
-            if np.isnan(size[r, c]):
-                field[r, c, 0] = field[r, c, 1] = np.float32(0.0)
+def _compress(field, length, middle, texture, out):  # type: ignore[no-untyped-def]
+    """Gradients weighed by their length and the middle one, without the border; those of unknown pixels are 0."""
+    rows, cols = length.shape
+    for r in range(1, rows - 1):
+        for c in range(1, cols - 1):
+            size = length[r, c]
+            if np.isnan(size):
+                out[r - 1, c - 1, 0] = out[r - 1, c - 1, 1] = np.float32(0.0)
             else:
-                length = size[r, c]
                 if texture:
-                    share = middle / (length * length + middle * middle)
+                    share = middle / (size * size + middle * middle)
                 else:
-                    share = np.float32(1.0) / (length + middle)
-                field[r, c, 0] *= share
-                field[r, c, 1] *= share
+                    share = np.float32(1.0) / (size + middle)
+                out[r - 1, c - 1, 0] = field[r, c, 0] * share
+                out[r - 1, c - 1, 1] = field[r, c, 1] * share
+
+
+@kernel
+def _peaks(score, exclude):  # type: ignore[no-untyped-def]
+    """Row and column of the highest score, and the highest one farther than `exclude` from it (-1: there is none)."""
+    rows, cols = score.shape
+    r, c, peak = 0, 0, score[0, 0]
+    for i in range(rows):
+        for j in range(cols):
+            if score[i, j] > peak:
+                r, c, peak = i, j, score[i, j]
+    second = np.float32(-1.0)
+    for i in range(rows):
+        for j in range(cols):
+            if score[i, j] > second and (abs(i - r) > exclude or abs(j - c) > exclude):
+                second = score[i, j]
+    return r, c, second
 
 
 def gradient_field(gray: Floats) -> Floats:
-    """Compressed gradients g / (|g| + median |g|): float32 (rows, columns, 2) (x, y); NaN counts as no gradient."""
+    """Compressed gradients g / (|g| + median |g|) of the inner pixels.
+
+    Args:
+        gray: float32 (rows, columns), NaN where it is not known (no gradient there).
+
+    Returns:
+        float32 (rows - 2, columns - 2, 2), (x, y).
+    """
     return _weighed_gradients(gray, False)
 
 
@@ -89,16 +120,20 @@ def texture_field(gray: Floats) -> Floats:
 
 
 def _weighed_gradients(gray: Floats, texture: bool) -> Floats:
-    field, size = np.empty((*gray.shape, 2), np.float32), np.empty(gray.shape, np.float32)
-    _scharr(gray, field, size)
-    sample = size[::2, ::2].ravel()
-    half = len(sample) // 2
-    middle = float(np.partition(sample, half)[half])  # NaN sorts last
-    if np.isnan(sample).any():
+    rows, cols = gray.shape
+    field, length = np.empty((rows, cols, 2), np.float32), np.empty((rows, cols), np.float32)
+    known = _scharr(gray, field, length)
+    sample = length[::2, ::2].ravel()
+    if known:
+        half = len(sample) // 2
+        sample.partition(half)
+        middle = float(sample[half])
+    else:
         sample = sample[np.isfinite(sample)]
         middle = float(np.median(sample)) if len(sample) else 1.0
-    _compress(field, size, np.float32(max(middle, active().features.gradient_floor)), texture)
-    return field
+    out = np.empty((rows - 2, cols - 2, 2), np.float32)
+    _compress(field, length, np.float32(max(middle, active().features.gradient_floor)), texture, out)
+    return out
 
 
 def match(template: Floats, window: Floats, exclude: int | None = None) -> tuple[float, float, float, float]:
@@ -108,19 +143,16 @@ def match(template: Floats, window: Floats, exclude: int | None = None) -> tuple
         template: float32 (n, n, 2). window: float32 (n + 2 s, n + 2 s, 2).
         exclude: the second peak is sought farther than this from the first, pixels (None: as configured).
 
-
     Returns:
         Column and row of the shift from the window's centre (sub-pixel), the peak, the second peak.
     """
     exclude = active().features.peak_exclude_px if exclude is None else exclude
     score = cv2.matchTemplate(window, template, cv2.TM_CCORR_NORMED)
-    _, peak, _, (c, r) = cv2.minMaxLoc(score)
+    r, c, second = _peaks(score, exclude)
     rows, cols = score.shape
-    rest = score.copy()
-    rest[max(0, r - exclude) : r + exclude + 1, max(0, c - exclude) : c + exclude + 1] = -1.0
-    second = float(rest.max())
     if not (0 < c < cols - 1 and 0 < r < rows - 1):
         return 0.0, 0.0, 0.0, 1.0
+    peak = float(score[r, c])
     dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
     dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
-    return c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, float(peak), second
+    return c + dc - (cols - 1) / 2, r + dr - (rows - 1) / 2, peak, float(second)

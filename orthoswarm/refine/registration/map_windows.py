@@ -48,7 +48,7 @@ class LoadedMap:
             return None
         cut = (slice(row - half, row + half + 1), slice(column - half, column + half + 1))
         valid = self.valid[cut]
-        share = float(valid.mean())
+        share = np.count_nonzero(valid) / valid.size
         gray = self.gray[cut].astype(np.float32)
         if share < 1.0:
             gray[~valid] = np.nan

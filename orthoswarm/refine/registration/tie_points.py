@@ -78,8 +78,7 @@ def match_points(
         )
         if seen < 0.85:
             continue
-        template = field(patch)[1:-1, 1:-1]
-        dc, dr, peak, second = match(np.ascontiguousarray(template), field(window[0])[1:-1, 1:-1])
+        dc, dr, peak, second = match(field(patch), field(window[0]))
         if peak > 0:
             rows.append((p, i, dc * ground.gsd_m, -dr * ground.gsd_m, peak, second / peak))
     if not rows:
@@ -166,7 +165,7 @@ def link_legs(
         li = cameras.lens[cameras.lens_id[i]]
         if rectify(cameras.position[i], cameras.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template) < 0.95:
             continue
-        field = np.ascontiguousarray(gradient_field(template)[1:-1, 1:-1])
+        field = gradient_field(template)
         for j in picks:
             lj = cameras.lens[cameras.lens_id[j]]
             tried += 1
@@ -175,7 +174,7 @@ def link_legs(
             )
             if seen < 0.8:
                 continue
-            dc, dr, peak, second = match(field, gradient_field(window)[1:-1, 1:-1], exclude=3)
+            dc, dr, peak, second = match(field, gradient_field(window), exclude=3)
             if peak >= 0.45 and second <= 0.8 * peak:
                 moved = np.array([[x + dc * gsd_m, y - dr * gsd_m, z]])
                 cams.append(int(j))

@@ -236,7 +236,7 @@ def in_light(ground, things, east, north):
 def common_shift(field, pictures, maps):
     shifts = []
     for picture, other in zip(pictures, maps, strict=True):
-        template = np.ascontiguousarray(field(picture)[12:53, 12:53])
+        template = np.ascontiguousarray(field(picture)[11:52, 11:52])
         shifts.append(match(template, field(other))[:2])
     return float(np.hypot(*np.mean(shifts, axis=0)))
 
