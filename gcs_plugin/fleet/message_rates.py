@@ -7,7 +7,7 @@ everything. Acknowledgements do not say which message they are about, so one is 
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 
 _COMMAND: Final = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
@@ -19,6 +19,9 @@ _BACKOFF_S: Final = (3.0, 60.0)
 
 GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
+# What each says of its filter.
+_ARDUPILOT_ONLY: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+_PX4_ONLY: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,12 @@ class Rates:
 
     wanted: dict[int, float]
     optional: dict[int, float] = field(default_factory=dict)
+
+    def of(self, autopilot: Autopilot) -> "Rates":
+        """Without what only the other autopilot has: ArduPilot says so in a text to all stations, at each request."""
+        foreign = _PX4_ONLY if autopilot is Autopilot.ARDUPILOT else _ARDUPILOT_ONLY
+        wanted, optional = ({k: hz for k, hz in r.items() if k != foreign} for r in (self.wanted, self.optional))
+        return Rates(wanted, optional)
 
 
 def default_rates(pose_hz: float = 10.0) -> Rates:
@@ -51,9 +60,8 @@ def default_rates(pose_hz: float = 10.0) -> Rates:
             # A rangefinder that states its limits; a height from a coarse terrain map is worse than none.
             int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
             int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
-            # Each autopilot has one of the two.
-            int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): 1.0,
-            int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): 1.0,
+            _ARDUPILOT_ONLY: 1.0,
+            _PX4_ONLY: 1.0,
         },
     )
 

@@ -1,0 +1,250 @@
+"""What comes from vehicles: finding, losing and telling them apart, their messages, restarts and routes.
+
+`Fleet` owns one of these and polls it; it sends nothing by itself but requests for streams, for a clock, and for the
+reasons why a vehicle would not arm.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from gcs_plugin.fleet.dialogues import Dialogues
+from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
+from gcs_plugin.fleet.link_hub import Hub, Side
+from gcs_plugin.fleet.message_rates import Rates, Streams
+from gcs_plugin.fleet.routes import Route
+from gcs_plugin.fleet.separation_watch import SeparationWatch, apart_text, near_text
+from gcs_plugin.fleet.telemetry_check import has_place, possible
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.links.packets import Packet
+from gcs_plugin.links.transports import Peer
+from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent
+from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.flight_modes import modes_of
+
+Handler = Callable[[Vehicle, Message, float], None]
+
+_LOST_S: Final = 5.0
+_ASK_WHY_S: Final = 10.0
+MESSAGE_IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
+_HEARTBEAT, _ACK, _TEXT = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["COMMAND_ACK"], MESSAGE_IDS["STATUSTEXT"]
+_DETECTED: Final = frozenset(MESSAGE_IDS[name] for name in RELEVANT)
+_REQUESTS: Final = frozenset({MESSAGE_IDS["MISSION_REQUEST"], MESSAGE_IDS["MISSION_REQUEST_INT"]})
+_BOOT_CLOCKS: Final = frozenset({MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["SYSTEM_TIME"]})
+# What a late packet of these says is out of date.
+_STATES: Final = frozenset({_HEARTBEAT, MESSAGE_IDS["MISSION_CURRENT"], MESSAGE_IDS["EXTENDED_SYS_STATE"]})
+# State that comes again by itself: on a second link it may be late, so it is taken from the one in use.
+_REPEATED: Final = frozenset({
+    *_STATES, MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["ATTITUDE"], MESSAGE_IDS["SYS_STATUS"],
+    MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["EKF_STATUS_REPORT"], MESSAGE_IDS["ESTIMATOR_STATUS"],
+})  # fmt: skip
+_POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
+_SAME_TEXT_S: Final = 1.5
+_OVERTAKEN: Final = 64
+_PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]})
+
+
+class Reception:
+    """Takes packets apart and keeps the vehicles' states.
+
+    Args:
+        vehicles: by system id; vehicles that are found are put in.
+        hub: the links. dialogues: those under way. own: our address.
+        rates: what vehicles are asked to send.
+        remembered: what detectors knew before a restart of this program, by system id.
+        event: called with each event. wall: UTC epoch seconds.
+
+    Attributes:
+        separation: watches how near vehicles in the air come.
+        handlers: called for messages, by message id. taps: called for packets, undecoded.
+    """
+
+    def __init__(
+        self, vehicles: dict[int, Vehicle], hub: Hub, dialogues: Dialogues, own: Address, rates: Rates,
+        remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
+        self._rates, self._remembered, self._publish, self._wall = rates, dict(remembered), event, wall
+        self._counters: dict[tuple[Peer, int, int], int] = {}
+        self._said: dict[tuple[int, str], tuple[float, Route]] = {}
+        self.separation = SeparationWatch()
+        self.handlers: dict[int, list[Handler]] = {}
+        self.taps: list[Callable[[Packet, float], None]] = []
+
+    def packet(self, side: Side, peer: Peer, packet: Packet, now: float, utc: float) -> None:
+        """Take a packet.
+
+        Args:
+            side: the link it came on. peer: who sent it there. packet: itself.
+            now: monotonic seconds. utc: UTC epoch seconds.
+        """
+        for listener in self.taps:
+            listener(packet, utc)
+        vehicle = self._vehicles.get(packet.system)
+        if vehicle is None:
+            vehicle = self._found(packet, now)
+            if vehicle is None:
+                return
+        kind = packet.kind
+        late, lost = self._count(vehicle, peer, packet, now)
+        if not possible(packet.message):
+            vehicle.impossible += 1
+            return
+        vehicle.heard, vehicle.signs = now, vehicle.signs or packet.signed
+        if packet.component == vehicle.address.component:
+            route = self._route(vehicle, side, peer, now)
+            route.counted(lost)
+            beside = kind in _REPEATED and vehicle.routes.stale(route, now)
+            self._autopilot_says(vehicle, route, kind, packet.message, now, beside or (late and kind in _STATES))
+            if beside:
+                return
+        elif kind in _PHOTOS:
+            vehicle.update(packet.message)
+        if kind == _POSITION and not has_place(packet.message):
+            return
+        for handler in self.handlers.get(kind, ()):
+            handler(vehicle, packet.message, utc)
+
+    def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> tuple[bool, int]:
+        """Follow a sender's packet counter: whether others have overtaken a packet (or it is a copy), and what is lost.
+
+        Gives True for an overtaken one, and how many packets were lost just before this one.
+        """
+        counter = (peer, packet.system, packet.component)
+        last, lost = self._counters.get(counter), 0
+        vehicle.received += 1
+        if last is not None:
+            gap = (packet.seq - last - 1) & 0xFF
+            if gap >= 256 - _OVERTAKEN and now - vehicle.heard < 1.0:
+                return True, 0
+            lost = gap if gap < 128 else 0
+            vehicle.missed += lost
+        self._counters[counter] = packet.seq
+        return False, lost
+
+    def _route(self, vehicle: Vehicle, side: Side, peer: Peer, now: float) -> Route:
+        """The way on which a packet has come; streams run on the way in use."""
+        route, taken_over = vehicle.routes.heard(side, peer, now)
+        if taken_over:
+            self._taken_over(vehicle, now)
+        return route
+
+    def _taken_over(self, vehicle: Vehicle, now: float) -> None:
+        if vehicle.route is not None:
+            self._event("link", vehicle, f"is commanded over {vehicle.route.address} from now on")
+        self._dialogues.send(vehicle.system, vehicle.streams.start(now))
+
+    def _autopilot_says(
+        self, vehicle: Vehicle, route: Route, kind: int, message: Message, now: float, stale: bool
+    ) -> None:
+        if vehicle.lost or not vehicle.streams.started:
+            if vehicle.lost:
+                vehicle.lost = False
+                self._event("regained", vehicle, "is heard again")
+            self._dialogues.send(vehicle.system, vehicle.streams.start(now))
+        if kind in _BOOT_CLOCKS:
+            self._watch_clock(vehicle, route, message.time_boot_ms / 1e3, now)
+        if stale:
+            return
+        vehicle.streams.seen(kind, now)
+        vehicle.update(message)
+        if kind == _ACK:
+            self._dialogues.send(vehicle.system, vehicle.streams.acknowledged(message, now))
+        elif kind == _TEXT:
+            self._text(vehicle, route, str(message.text).strip("\x00\t "), now)
+        if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self._own.system):
+            self._mission_events(vehicle, vehicle.detector.feed(message))
+        self._dialogues.feed(vehicle, message, now)
+
+    def _text(self, vehicle: Vehicle, route: Route, text: str, now: float) -> None:
+        """Pass a text on once, though it comes on two links."""
+        last = self._said.get((vehicle.system, text))
+        self._said[vehicle.system, text] = now, route
+        if last is not None and last[1] is not route and now - last[0] < _SAME_TEXT_S:
+            return
+        if len(self._said) > 1000:
+            self._said.clear()
+        vehicle.says(text, now)
+        self._event("text", vehicle, f"says: {text}")
+
+    def _found(self, packet: Packet, now: float) -> Vehicle | None:
+        if packet.kind != _HEARTBEAT or not is_autopilot(packet.message):
+            return None
+        heartbeat, address = packet.message, Address(packet.system, packet.component)
+        autopilot = Autopilot.of(heartbeat)
+        vehicle = Vehicle(
+            address, autopilot, modes_of(autopilot, heartbeat.type), CompletionDetector(autopilot),
+            Streams(address, self._own, self._rates.of(autopilot)), heard=now, kind=int(heartbeat.type),
+        )  # fmt: skip
+        before = self._remembered.pop(packet.system, None)
+        if before is not None and before.get("autopilot") == autopilot.value:
+            vehicle.detector = CompletionDetector.from_state(before)
+        self._vehicles[packet.system] = vehicle
+        self._event("found", vehicle, f"was found ({autopilot.value})")
+        return vehicle
+
+    def _watch_clock(self, vehicle: Vehicle, route: Route, time_boot_s: float, now: float) -> None:
+        verdict = route.clock.feed(time_boot_s, now)
+        route.boot, route.boot_at = now - time_boot_s, now
+        vehicle.pace = route.pace(time_boot_s, now) or vehicle.pace
+        if verdict == "mixed":
+            vehicle.routes.mixed(now)
+            self._compare_routes(vehicle, now)
+        elif verdict == "rebooted" and route is vehicle.route:
+            self._event("rebooted", vehicle, "has restarted")
+            vehicle.mission = None
+            self._mission_events(vehicle, vehicle.detector.rebooted())
+            self._dialogues.send(vehicle.system, vehicle.streams.start(now))
+            self._dialogues.rebooted(vehicle, now)
+
+    def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
+        for event in events:
+            kind, text = mission_event(event)
+            self._event(kind, vehicle, text)
+
+    def _event(self, kind: str, vehicle: Vehicle, text: str, pair: tuple[int, int] | None = None) -> None:
+        words = text if pair else f"vehicle {vehicle.system} {text}"
+        self._publish(FleetEvent(kind, vehicle.system, self._wall(), words, pair))
+
+    def tick(self, now: float) -> None:
+        """Look for what has not come, and for who is too near another."""
+        self._watch_separation(now)
+        for vehicle in self._vehicles.values():
+            if vehicle.lost:
+                continue
+            self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
+            self._ask_why(vehicle, now)
+            if now - vehicle.heard > _LOST_S:
+                vehicle.lost = True
+                self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
+            if len(vehicle.routes.known) > 1 or vehicle.claimants:
+                self._compare_routes(vehicle, now)
+
+    def _ask_why(self, vehicle: Vehicle, now: float) -> None:
+        """A vehicle that would refuse to arm, and has not said why, is asked for the reasons."""
+        if vehicle.prearm_ok is not False or vehicle.armed or now < vehicle.ask_why_at or vehicle.prearm_texts(now):
+            return
+        vehicle.ask_why_at = now + _ASK_WHY_S
+        to, command = vehicle.address, dialect.MAV_CMD_RUN_PREARM_CHECKS
+        ask = dialect.MAVLink_command_long_message(to.system, to.component, command, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._dialogues.send(vehicle.system, [ask])
+
+    def _watch_separation(self, now: float) -> None:
+        new, ended = self.separation.look(self._vehicles.values(), now)
+        for near in new:
+            self._event("near", self._vehicles[near.other], near_text(near, self.separation), near.pair)
+        for pair in ended:
+            self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
+
+    def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
+        """Is it one vehicle on two links, or several vehicles with one system id? Their clocks tell."""
+        before = vehicle.claimants
+        if vehicle.routes.compare(now):
+            self._taken_over(vehicle, now)
+        if vehicle.claimants and not before:
+            who = ", ".join(vehicle.claimants)
+            self._event("conflict", vehicle, f"is several vehicles with one system id ({who}); give each its own")
+        elif before and not vehicle.claimants:
+            self._event("single", vehicle, "is one vehicle again")
+        for route in vehicle.routes.unasked(now):
+            self._hub.send(route.side, route.peer, vehicle.streams.ask_clock())
