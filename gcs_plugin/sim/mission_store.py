@@ -59,6 +59,7 @@ class MissionStore:
     _transfer: _Transfer | None = None
     _sent_to: Address | None = None
     _sent_at: float = 0.0
+    _next_sent: int = 0
 
     def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
         """Take a message of the mission protocol that is meant for this vehicle; returns the answers."""
@@ -73,15 +74,12 @@ class MissionStore:
                 if self._transfer is not None:
                     return [self._ack(sender, DENIED if self.autopilot is Autopilot.ARDUPILOT else ERROR)]
                 if self.autopilot is Autopilot.PX4:
-                    self._sent_to, self._sent_at = sender, now
+                    self._sent_to, self._sent_at, self._next_sent = sender, now, 0
                 return [
                     dialect.MAVLink_mission_count_message(sender.system, sender.component, len(self.items), _MISSION)
                 ]
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":
-                if message.seq >= len(self.items) or self._transfer is not None or not self._sends(sender, now):
-                    return [self._ack(sender, ERROR)]
-                self._sent_at = now
-                return [self.items[message.seq].message(message.seq, sender.system, sender.component)]
+                return self._hand_out(int(message.seq), sender, now)
             case "MISSION_ACK":
                 self._sent_to = None
             case "MISSION_CLEAR_ALL":
@@ -109,11 +107,22 @@ class MissionStore:
         self.items, self._transfer = [self.home] if self.autopilot is Autopilot.ARDUPILOT else [], None
         self.generation += 1
 
-    def _sends(self, to: Address, now: float) -> bool:
-        """PX4 gives items out only after a request for the list, and forgets it when it hears nothing for a while."""
-        if self.autopilot is Autopilot.ARDUPILOT:
-            return True
-        return self._sent_to == to and now - self._sent_at < _TIMING[Autopilot.PX4][1]
+    def _hand_out(self, seq: int, to: Address, now: float) -> list[Message]:
+        """An item of the mission.
+
+        PX4 hands items out only after a request for the list, in order. It gives up when it hears nothing for a while
+        or is asked for another item than the next or the last one; then it ignores further requests silently.
+        """
+        if self.autopilot is Autopilot.PX4:
+            if self._sent_to != to or now - self._sent_at >= _TIMING[Autopilot.PX4][1]:
+                return []
+            if seq not in (self._next_sent, self._next_sent - 1):
+                self._sent_to = None
+                return [self._ack(to, ERROR)]
+            self._sent_at, self._next_sent = now, seq + 1
+        if seq >= len(self.items) or self._transfer is not None:
+            return [self._ack(to, ERROR)]
+        return [self.items[seq].message(seq, to.system, to.component)]
 
     @property
     def receiving(self) -> bool:

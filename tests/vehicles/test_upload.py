@@ -376,6 +376,18 @@ def test_a_download_over_a_bad_link_is_complete(autopilot):
         assert difference(mission, reading.items) is None
 
 
+def test_px4_that_has_forgotten_a_transfer_is_asked_for_the_list_again():
+    """Its refusal is lost, and afterwards it ignores requests for items silently."""
+    rig, mission = Rig(PX4), make_mission(PX4)
+    rig.store.items = list(mission.items)
+    reading = rig.join(MissionDownload(VEHICLE))
+    while reading.progress < 0.5:
+        rig.step()
+    rig.store.rebooted()
+    (outcome,) = rig.run(reading)
+    assert outcome.ok and difference(mission, reading.items) is None
+
+
 def test_an_empty_vehicle_has_no_items():
     rig = Rig(PX4)
     reading = rig.join(MissionDownload(VEHICLE))
