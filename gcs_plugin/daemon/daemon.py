@@ -1,5 +1,6 @@
 """The daemon without its web server: owns the workspace, takes pictures and telemetry in, has maps made of them."""
 
+import contextlib
 import json
 import logging
 import math
@@ -402,11 +403,6 @@ class Daemon:
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
         rows = self.journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
-        canvases = {}
-        for name, layer in self.layers.items():
-            with layer.reading() as canvas:
-                if canvas is not None:
-                    canvases[name] = canvas.path
         kept = self.settings.workspace / "solutions"
         solutions = self.journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
         coarse = self.journal.rows(
@@ -417,14 +413,18 @@ class Daemon:
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
             time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
         )  # fmt: skip
-        task = ExportTask(
-            self.settings.workspace, tuple(job.detail["formats"]), canvases, area.epsg, area.gsd_m,
-            [frame_of_row(row, self.store) for row in rows],
-            {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-            [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions], self.settings.basemap,
-            None if self.settings.fov_min_deg is None else math.radians(self.settings.fov_min_deg), facts,
-        )  # fmt: skip
-        job.detail["files"] = self.background.run(write_products, task)
+        with contextlib.ExitStack() as held:  # a generation that another one replaces stays while it is read
+            canvases = {name: held.enter_context(layer.reading()) for name, layer in self.layers.items()}
+            task = ExportTask(
+                self.settings.workspace, tuple(job.detail["formats"]),
+                {name: canvas.path for name, canvas in canvases.items() if canvas is not None}, area.epsg, area.gsd_m,
+                [frame_of_row(row, self.store) for row in rows],
+                {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
+                [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions],
+                self.settings.basemap,
+                None if self.settings.fov_min_deg is None else math.radians(self.settings.fov_min_deg), facts,
+            )  # fmt: skip
+            job.detail["files"] = self.background.run(write_products, task)
         return lambda db: None
 
     # -- health ---------------------------------------------------------------------------------------------------

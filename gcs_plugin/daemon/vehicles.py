@@ -22,6 +22,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -31,6 +32,7 @@ from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.traffic import Traffic
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict
@@ -51,6 +53,8 @@ _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
 _OUTCOME_S: Final = 60.0
 _TRAIL: Final = 600
+_MOST_TEXTS: Final = 50
+_COMPLETE_EVERY: Final = 20
 _REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
 
@@ -62,6 +66,8 @@ class _Kept:
     id: str
     poses: "LivePoses"
     trail: list[tuple[float, float]] = field(default_factory=list)
+    texts: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_MOST_TEXTS))
+    sent: dict[str, Any] = field(default_factory=dict)
     lost_since: float | None = None
 
 
@@ -70,6 +76,7 @@ class VehicleLinks:
 
     Attributes:
         fleet: its vehicles and links.
+        traffic: other aircraft that vehicles have heard of.
         cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
     """
 
@@ -92,6 +99,8 @@ class VehicleLinks:
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
+        self.traffic = Traffic()
+        self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [
             threading.Thread(target=self.fleet.run, args=(self._stop,), name="links", daemon=True),
             threading.Thread(target=self._watch, name="watch", daemon=True),
@@ -372,9 +381,14 @@ class VehicleLinks:
             _log.error("%s", error)
         kept.lost_since = time.monotonic() if event.kind == "lost" else None
         text, pair = self._words(event), [self.name_of(system) for system in event.pair or ()]
-        self._events.publish("vehicle_event", vehicle=name, kind=event.kind, text=text, time=event.time_s, pair=pair)
-        if event.kind != "text":
+        about: dict[str, Any] = {"vehicle": name, "kind": event.kind, "text": text, "time": event.time_s, "pair": pair}
+        if event.kind == "text":
+            said = {"text": vehicle.texts[-1], "severity": event.severity, "time": round(event.time_s, 1)}
+            kept.texts.append(said)
+            about |= {"said": said["text"], "severity": said["severity"]}
+        else:
             _log.info("%s", text)
+        self._events.publish("vehicle_event", **about)
 
     def _words(self, event: "FleetEvent") -> str:
         """An event in words; one about two vehicles names them as the operator does."""
@@ -390,14 +404,28 @@ class VehicleLinks:
     # -- what time asks for -----------------------------------------------------------------------------------------
 
     def _watch(self) -> None:
+        number = 0
         while not self._stop.wait(_WATCH_S):
+            number += 1
             try:
-                rows = self.rows()
-                for row in rows:
-                    self._events.publish("vehicle", **{k: v for k, v in row.items() if k != "trail"})
+                self._publish_rows(complete=number % _COMPLETE_EVERY == 0)
+                if self.traffic.changed():
+                    self._events.publish("traffic", rows=self.traffic.rows())
                 self._give_up_silent()
             except Exception as error:  # a vehicle's odd state must not end the watch
                 _log.warning("watching vehicles: %s", error)
+
+    def _publish_rows(self, *, complete: bool) -> None:
+        """Publish what differs in each vehicle's row from what was published last, or all of it.
+
+        At 96 vehicles complete rows would be most of what the stations' links carry.
+        """
+        for row in self.rows():
+            sent = self._kept[row["system"]].sent
+            now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
+            fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
+            sent.update(now)
+            self._events.publish("vehicle", **fresh | {"id": row["id"], "silent_s": row["silent_s"]})
 
     def _give_up_silent(self) -> None:
         """A vehicle that has been silent for long in the middle of its mission is refined as far as it came."""
@@ -421,7 +449,7 @@ class VehicleLinks:
             if not kept.trail or kept.trail[-1] != point:
                 kept.trail.append(point)
                 del kept.trail[:-_TRAIL]
-        row["trail"] = kept.trail[-_TRAIL:]
+        row["trail"], row["texts"] = kept.trail[-_TRAIL:], list(kept.texts)
         return row
 
 

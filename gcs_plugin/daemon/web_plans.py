@@ -52,11 +52,18 @@ class Plans:
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
+        zones = body.get("no_fly")
+        if not isinstance(zones, dict | None):
+            raise InputError("no_fly is no GeoJSON; send the polygons of the no-fly zones, or nothing")
+        has_zones = zones is not None and bool(zones.get("coordinates") or zones.get("features"))
         name = f"plan-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**6:06d}"
         path = self.folder / name
         path.mkdir(parents=True)
         try:
             (path / "area.geojson").write_text(json.dumps(area), encoding="utf-8")
+            if has_zones:
+                (path / "no-fly.geojson").write_text(json.dumps(zones), encoding="utf-8")
+                values["no_fly"] = (path / "no-fly.geojson",)
             with closing(WorkerPool(1)) as pool:
                 figures = pool.run(plan_into, PlanRequest(area=path / "area.geojson", **values))
         except BaseException:

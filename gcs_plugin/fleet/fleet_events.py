@@ -13,6 +13,9 @@ _WORDS: Final = {
     MissionEvent.ABORTED: "has ended its mission without completing it",
 }
 
+Pair = tuple[int, int]
+"""System ids of two vehicles, in order."""
+
 
 @dataclass(frozen=True, slots=True)
 class FleetEvent:
@@ -25,14 +28,16 @@ class FleetEvent:
         system: system id.
         time_s: UTC epoch seconds.
         text: one sentence.
-        pair: system ids in order of the two that `near` and `apart` are about.
+        pair: the two that `near` and `apart` are about.
+        severity: of a `text`, MAVLink's MAV_SEVERITY (0 emergency ... 6 information).
     """
 
     kind: str
     system: int
     time_s: float
     text: str
-    pair: tuple[int, int] | None = None
+    pair: Pair | None = None
+    severity: int = 6
 
 
 def mission_event(event: MissionEvent) -> tuple[str, str]:

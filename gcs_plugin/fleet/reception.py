@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from gcs_plugin.fleet.dialogues import Dialogues
-from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
+from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.routes import Route
@@ -151,13 +151,14 @@ class Reception:
         if kind == _ACK:
             self._dialogues.send(vehicle.system, vehicle.streams.acknowledged(message, now))
         elif kind == _TEXT:
-            self._text(vehicle, route, str(message.text).strip("\x00\t "), now)
+            self._text(vehicle, route, message, now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self._own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
         self._dialogues.feed(vehicle, message, now)
 
-    def _text(self, vehicle: Vehicle, route: Route, text: str, now: float) -> None:
+    def _text(self, vehicle: Vehicle, route: Route, message: Message, now: float) -> None:
         """Pass a text on once, though it comes on two links."""
+        text = str(message.text).strip("\x00\t ")
         last = self._said.get((vehicle.system, text))
         self._said[vehicle.system, text] = now, route
         if last is not None and last[1] is not route and now - last[0] < _SAME_TEXT_S:
@@ -165,7 +166,7 @@ class Reception:
         if len(self._said) > 1000:
             self._said.clear()
         vehicle.says(text, now)
-        self._event("text", vehicle, f"says: {text}")
+        self._event("text", vehicle, f"says: {text}", severity=int(message.severity))
 
     def _found(self, packet: Packet, now: float) -> Vehicle | None:
         if packet.kind != _HEARTBEAT or not is_autopilot(packet.message):
@@ -202,9 +203,9 @@ class Reception:
             kind, text = mission_event(event)
             self._event(kind, vehicle, text)
 
-    def _event(self, kind: str, vehicle: Vehicle, text: str, pair: tuple[int, int] | None = None) -> None:
+    def _event(self, kind: str, vehicle: Vehicle, text: str, pair: Pair | None = None, severity: int = 6) -> None:
         words = text if pair else f"vehicle {vehicle.system} {text}"
-        self._publish(FleetEvent(kind, vehicle.system, self._wall(), words, pair))
+        self._publish(FleetEvent(kind, vehicle.system, self._wall(), words, pair, severity))
 
     def tick(self, now: float) -> None:
         """Look for what has not come, and for who is too near another."""

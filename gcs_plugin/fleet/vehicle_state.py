@@ -199,6 +199,7 @@ class Vehicle:
                 "items": self.mission_total,
             },
             "photos": self.photos,
+            "home": None if self.home is None else [round(self.home[0], 7), round(self.home[1], 7)],
             "received": self.received,
             "missed": self.missed,
         }

@@ -1,75 +1,131 @@
-"""Areas, lines and no-fly zones from files: GeoJSON, KML, KMZ, QGroundControl `.plan`, `.waypoints`."""
+"""Areas, lines and no-fly zones from files.
+
+GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl `.plan` and `.waypoints`.
+"""
 
 import json
 import zipfile
 from pathlib import Path
+from typing import Final
 
 from gcs_plugin.mission.mission_files import parse_mission
+from gcs_plugin.plans.vector_files import read_geopackage, read_zipped_shapefile
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, parse_geojson, parse_kml, ring
 
-_KINDS = {
+_KINDS: Final = {
     ".geojson": "GeoJSON",
     ".json": "GeoJSON",
     ".kml": "KML",
     ".kmz": "KMZ",
+    ".zip": "a zipped shapefile",
+    ".gpkg": "a GeoPackage",
     ".plan": "a mission",
     ".waypoints": "a mission",
 }
-_LARGEST_BYTES = 50_000_000
+_LARGEST_BYTES: Final = 50_000_000
+_SHAPEFILE: Final = b"\x00\x00\x27\x0a"
+_SQLITE: Final = b"SQLite format 3\0"
 
 
-def read_shapes(path: Path) -> tuple[Shapes, list[Ring]]:
+def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]]:
     """Polygons and lines of a file, and rings of its exclusion fences; what the file is decides its content.
+
+    Args:
+        path: the file. name: how to call it in an error; its path unless said.
 
     Raises:
         InputError: it cannot be read, or its name promises something else.
     """
-    text, kind = _read(path)
+    name = name or str(path)
+    kind = _kind(path, name)
     promised = _KINDS.get(path.suffix.lower(), kind)
     if promised != kind:
-        raise InputError(f"{path} is {promised} by its name but holds {kind}; rename it or give the right file")
+        raise InputError(f"{name} is {promised} by its name but holds {kind}; rename it or give the right file")
+    if kind == "a GeoPackage":
+        return read_geopackage(path, name), []
+    if kind == "a zipped shapefile":
+        return read_zipped_shapefile(path, name), []
+    text = _text(path, name)
     if kind == "GeoJSON":
-        return parse_geojson(text, str(path)), []
+        return parse_geojson(text, name), []
     if kind in ("KML", "KMZ"):
-        return parse_kml(text, str(path)), []
-    mission = parse_mission(text, str(path))
-    polygons = tuple(Polygon(ring(survey, str(path))) for survey in mission.surveys)
-    lines = tuple(ring(line, str(path), 2) for line in (mission.polylines or mission.lines()))
-    return Shapes(polygons, lines), [ring(zone, str(path)) for zone in mission.no_fly]
+        return parse_kml(text, name), []
+    mission = parse_mission(text, name)
+    polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
+    lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
+    return Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly]
 
 
-def _read(path: Path) -> tuple[str, str]:
-    """A file's text and what it seems to be."""
+def _kind(path: Path, name: str) -> str:
+    """What a file is by its content.
+
+    Raises:
+        InputError: it cannot be read, is too large, or is nothing known.
+    """
     try:
         if path.stat().st_size > _LARGEST_BYTES:
-            raise InputError(f"{path} is larger than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
-        data = path.read_bytes()
-        kmz = data.startswith(b"PK\x03\x04")
-        if kmz:
-            with zipfile.ZipFile(path) as archive:
-                inside = [i for i in archive.infolist() if i.filename.lower().endswith(".kml")]
-                if not inside or inside[0].file_size > _LARGEST_BYTES:
-                    raise InputError(f"{path} is a ZIP without a usable KML in it; export it again")
-                data = archive.read(inside[0])
-        text = data.decode("utf-8-sig")
+            raise InputError(f"{name} is larger than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
+        with path.open("rb") as file:
+            head = file.read(len(_SQLITE))
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
+        raise InputError(f"{name} cannot be read ({error.strerror}); check the name") from None
+    if head.startswith(b"PK\x03\x04"):
+        if _inside(path, name, ".shp"):
+            return "a zipped shapefile"
+        if not _inside(path, name, ".kml"):
+            raise InputError(f"{name} is a ZIP without a KML or a shapefile in it; export it again")
+        return "KMZ"
+    if head == _SQLITE:
+        return "a GeoPackage"
+    if head.startswith(_SHAPEFILE):
+        raise InputError(f"{name} is one file of a shapefile; put its .shp, .shx, .dbf and .prj into one ZIP")
+    text = _text(path, name).lstrip()
+    if text.startswith("QGC WPL"):
+        return "a mission"
+    if text.startswith("<"):
+        return "KML"
+    if text.startswith("{"):
+        return "a mission" if _is_mission(text, name) else "GeoJSON"
+    kinds = "GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, a .plan nor a .waypoints mission"
+    raise InputError(f"{name} holds neither {kinds}; export the polygon again")
+
+
+def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
+    """The files in a ZIP with a suffix.
+
+    Raises:
+        InputError: it is broken, or unpacks to too much.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            found = archive.infolist()
+    except (zipfile.BadZipFile, NotImplementedError, OSError):
+        raise InputError(f"{name} is a damaged ZIP; export it again") from None
+    if sum(info.file_size for info in found) > _LARGEST_BYTES:
+        raise InputError(f"{name} unpacks to more than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
+    return [info for info in found if info.filename.lower().endswith(suffix)]
+
+
+def _text(path: Path, name: str) -> str:
+    """The text of a file, of a KMZ's first KML.
+
+    Raises:
+        InputError: it is no text.
+    """
+    try:
+        data = path.read_bytes()
+        if data.startswith(b"PK\x03\x04"):
+            with zipfile.ZipFile(path) as archive:
+                data = archive.read(_inside(path, name, ".kml")[0])
+        return data.decode("utf-8-sig")
     except (UnicodeDecodeError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
-        raise InputError(f"{path} is no text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan") from None
-    head = text.lstrip()
-    if head.startswith("QGC WPL"):
-        return text, "a mission"
-    if head.startswith("<"):
-        return text, "KMZ" if kmz else "KML"
-    if head.startswith("{"):
-        return text, "a mission" if _is_mission(text, path) else "GeoJSON"
-    raise InputError(f"{path} holds neither GeoJSON, KML, a .plan nor a .waypoints mission; export the polygon again")
+        raise InputError(f"{name} is no text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan") from None
 
 
-def _is_mission(text: str, path: Path) -> bool:
+def _is_mission(text: str, name: str) -> bool:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON ({error}); export it again") from None
+        raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
     return isinstance(document, dict) and document.get("fileType") == "Plan"

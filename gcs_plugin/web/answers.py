@@ -69,22 +69,32 @@ async def in_thread(pool: ThreadPoolExecutor, function: Callable[..., Result], *
 
 async def json_body(request: Request) -> dict[str, Any]:
     """The JSON object of a request; an empty one for an empty body."""
-    request._receive = bounded(request.receive, _MOST_JSON_BYTES)
+    data = await body_of(request, _MOST_JSON_BYTES)
+    try:
+        document = parse_json(data) if data.strip() else {}
+    except ValueError:
+        raise HTTPException(422, "the request is no JSON; send a JSON object") from None
+    if not isinstance(document, dict):
+        raise HTTPException(422, "the request is no JSON object; send one")
+    return document
+
+
+async def body_of(request: Request, most_bytes: int) -> bytes:
+    """The body of a request.
+
+    Raises:
+        HTTPException: it is larger than that, came too slowly, or was broken off.
+    """
+    request._receive = bounded(request.receive, most_bytes)
     try:
         async with asyncio.timeout(_BODY_S):
-            data = await request.body()
-        document = parse_json(data) if data.strip() else {}
+            return await request.body()
     except TooLarge as error:
         raise HTTPException(413, str(error)) from None
     except TimeoutError:
         raise HTTPException(408, "the request did not arrive in time; send it again") from None
     except ClientDisconnect:
         raise HTTPException(400, "the request was not sent to its end; send it again") from None
-    except ValueError:
-        raise HTTPException(422, "the request is no JSON; send a JSON object") from None
-    if not isinstance(document, dict):
-        raise HTTPException(422, "the request is no JSON object; send one")
-    return document
 
 
 def parse_json(data: bytes | str) -> Any:

@@ -16,6 +16,7 @@ from gcs_plugin.daemon.intake.posted_pose import parse_time
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
+from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.commands import CommandRoutes
 from gcs_plugin.web.event_stream import stream_events
 from gcs_plugin.web.guard import Guard
@@ -73,6 +74,11 @@ class Routes:
     async def vehicles(self) -> Response:
         """Every vehicle that was heard on a link or sent pictures."""
         return JsonAnswer(await self.work(self.daemon.vehicles))
+
+    async def traffic(self) -> Response:
+        """Other aircraft that the vehicles' ADS-B receivers hear."""
+        links = self.daemon.links
+        return JsonAnswer([] if links is None else await self.work(links.traffic.rows))
 
     async def frames(
         self,
@@ -262,6 +268,8 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/plans/{number}/preflight", routes.commands.preflight, methods=["POST"])
     add("/api/plans/{number}/start", routes.commands.start_plan, methods=["POST"], status_code=202)
     add("/api/missions/{vehicle}/{verb}", routes.commands.mission, methods=["POST"])
+    add("/api/areas", read_area, methods=["POST"])
+    add("/api/traffic", routes.traffic)
     add("/api/plan", routes.console_plan)
     add("/api/plan", routes.put_console_plan, methods=["PUT"])
     add("/api/finds", routes.finds)

@@ -2,6 +2,8 @@
 
 import json
 
+from gcs_plugin.web.areas import area_of
+from orthoswarm.model.errors import InputError
 from tests.kit.page_kit import opened, standing, vehicle
 
 HERE = "orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 16 })"
@@ -72,9 +74,20 @@ def test_files_bring_an_area_or_say_what_is_wrong(browser):
     square = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
     good = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [square]}}
     wrong = {"type": "Polygon", "coordinates": [[[x * 1e5, y] for x, y in square]]}
-    files = [("a.geojson", json.dumps(good), 3, "ha"), ("b.kml", KML, 7, "ha"), ("c.json", "{", 7, "valid JSON"),
-             ("d.geojson", json.dumps(wrong), 7, "out of range"), ("e.geojson", "{}", 7, "no polygon")]  # fmt: skip
+    files = [("a.geojson", json.dumps(good), 3, "ha"), ("b.kml", KML, 7, "ha"), ("c.json", "{", 7, "no valid JSON"),
+             ("d.geojson", json.dumps(wrong), 7, "longitude and latitude in degrees"),
+             ("e.geojson", "{}", 7, "no GeoJSON")]  # fmt: skip
+
+    def answer(method, path, body):
+        """The daemon's own reader."""
+        name = path.partition("name=")[2]
+        try:
+            return 200, area_of(body if isinstance(body, bytes) else json.dumps(body).encode(), name)
+        except InputError as error:
+            return 422, {"detail": str(error)}
+
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        station.answer = answer
         planning(page)
         for name, text, count, words in files:
             file = {"name": name, "mimeType": "text/plain", "buffer": text.encode()}

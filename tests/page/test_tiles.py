@@ -1,8 +1,10 @@
 """Vehicle tiles: they survive any value, stay where they are, lose no press, and show how old they are."""
 
+import time
+
 import pytest
 
-from tests.kit.page_kit import opened, send, standing, vehicle
+from tests.kit.page_kit import SOCKET, opened, send, standing, vehicle
 
 UPDATES = """() => {
   let k = 0;
@@ -164,3 +166,46 @@ def test_the_alarm_of_a_pair_ends_with_that_pair(browser):
         assert "v3" in page.inner_text(".alarms li")
         send(page, event("apart", "v3", "v1", "v3"))
         page.wait_for_selector(".alarms", state="hidden")
+
+
+def test_the_page_has_no_fault_of_its_own_when_parts_of_it_come_late(browser):
+    """On a slow machine vehicles are known before the strip is there."""
+    with standing(vehicle(1)) as station:
+        context = browser.new_context()
+        page = context.new_page()
+        page.route("**/fly/alarms.js", lambda route: (time.sleep(1.5), route.continue_()))
+        page.add_init_script(SOCKET)
+        page.goto(station.url)
+        page.wait_for_function("() => window.orthoswarm")
+        page.wait_for_selector(".tile")
+        page.wait_for_timeout(500)
+        assert page.locator(".problems li").all_text_contents() == []
+        context.close()
+
+
+def test_the_details_show_home_and_what_the_autopilot_said_newest_first(browser):
+    said = [{"text": "PreArm: GPS not healthy", "severity": 2, "time": 1_780_000_000.0}]
+    with standing(vehicle(1, home=[47.398, 8.5456], texts=said)) as station, opened(browser, station.url) as page:
+        page.click(".tile")
+        page.wait_for_selector(".messages li[data-severity='2']")
+        event = {"type": "vehicle_event", "vehicle": "v1", "kind": "text", "text": "vehicle 1 says: Mission: 3 WP",
+                 "said": "Mission: 3 WP", "severity": 6, "time": 1_780_000_001.0}  # fmt: skip
+        send(page, event)
+        page.wait_for_function("() => document.querySelectorAll('.messages li').length == 2")
+        send(page, {"type": "vehicle", "id": "v1", "silent_s": 0.1})  # what changed: nothing; what was said stays
+        page.wait_for_timeout(500)
+        texts = page.locator(".messages li").all_inner_texts()
+        assert texts[0].endswith("Mission: 3 WP") and texts[1].endswith("PreArm: GPS not healthy")
+        assert "47.398000, 8.545600" in page.inner_text(".details dl") and "m away" in page.inner_text(".details dl")
+
+
+def test_other_aircraft_are_on_the_map_while_they_are_heard(browser):
+    row = {"id": "4b1803", "name": "SWR12", "lat_deg": 47.398, "lon_deg": 8.546, "alt_m": 900.0, "heading_deg": 90.0}
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        for rows in ([row, {"id": "x", "lat_deg": 900, "lon_deg": None}], [row | {"alt_m": None}]):
+            send(page, {"type": "traffic", "rows": rows})
+            page.wait_for_selector(".traffic")
+            assert "SWR12" in page.inner_text(".traffic")
+        assert page.locator(".traffic").count() == 1
+        send(page, {"type": "traffic", "rows": []})
+        page.wait_for_selector(".traffic", state="detached")

@@ -9,9 +9,10 @@ from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.daemon.traffic import Traffic
 from gcs_plugin.daemon.vehicles import VehicleLinks
-from gcs_plugin.fleet.separation_watch import Near
-from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.fleet.separation_watch import Near, SeparationWatch
+from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -171,7 +172,46 @@ def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_link
     """The one with system id 1 is called v2: the one with system id 2 needs another name."""
     links = open_links(make_swarm(2, home=HOME), named=(VehicleSettings("v2", 1),))
     assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
-    watch = links.fleet.separation
-    watch.alarms = {(1, 2): Near(2, 1, 4.0, 1.0)}
+    watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)})
     for system in (1, 2):
         assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4 m apart and 1 m in height")
+
+
+def adsb(number, lat_deg, *, flags=0xFF, tslc=0, callsign=b"SWR12"):
+    lat, lon, climb, squawk = int(lat_deg * 1e7), 85_000_000, 0, 7000
+    return dialect.MAVLink_adsb_vehicle_message(
+        number, lat, lon, 0, 900_000, 9000, 12_000, climb, callsign, 3, tslc, flags, squawk
+    )
+
+
+def test_aircraft_are_known_until_nobody_hears_them():
+    now = [100.0]
+    traffic = Traffic(lambda: now[0])
+    traffic.heard(None, adsb(1, 47.0), 0.0)
+    traffic.heard(None, adsb(2, 47.1, flags=int(dialect.ADSB_FLAGS_VALID_COORDS)), 0.0)
+    traffic.heard(None, adsb(3, 47.1, flags=0), 0.0)  # does not say where it is
+    traffic.heard(None, adsb(4, 147.0), 0.0)
+    one, two = traffic.rows()
+    assert one == {"id": "000001", "name": "SWR12", "lat_deg": 47.0, "lon_deg": 8.5, "alt_m": 900.0,
+                   "heading_deg": 90.0, "speed_m_s": 120.0}  # fmt: skip
+    assert (two["alt_m"], two["name"], two["heading_deg"]) == (None, "", None)
+    assert traffic.changed() and not traffic.changed()
+    now[0] += 20.0
+    traffic.heard(None, adsb(2, 47.2, tslc=5), 0.0)
+    now[0] += 20.0
+    assert [row["id"] for row in traffic.rows()] == ["000002"]
+    assert traffic.changed()
+
+
+def test_a_row_has_the_autopilots_words_and_home(open_links):
+    vehicles = make_swarm(1, home=HOME)
+    links = open_links(vehicles)
+    end = time.monotonic() + 30.0
+    while not links.rows() and time.monotonic() < end:
+        time.sleep(0.1)
+    vehicles[0].flight.texts.append("EKF3 IMU0 is using GPS")
+    while not (links.rows() and links.rows()[0]["texts"] and links.rows()[0]["home"]) and time.monotonic() < end:
+        time.sleep(0.1)
+    row = links.rows()[0]
+    assert any(said["text"] == "EKF3 IMU0 is using GPS" for said in row["texts"])
+    assert row["home"] == pytest.approx([HOME[0], HOME[1]], abs=1e-5)

@@ -23,7 +23,7 @@ export class ApiError extends Error {
 export async function request(method, path, body, limit_ms = 30_000) {
   const control = new AbortController();
   const timer = setTimeout(() => control.abort(), limit_ms);
-  const plain = body !== undefined && !(body instanceof FormData);
+  const plain = body !== undefined && !(body instanceof Blob);
   const options = {
     method, signal: control.signal, cache: "no-store",
     headers: { ...(plain ? { "Content-Type": "application/json" } : {}), ...headers() },

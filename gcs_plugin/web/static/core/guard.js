@@ -1,4 +1,4 @@
-// An error in one card or layer never takes another: it is reported once, and the rest goes on.
+// An error in one card or layer never takes another: it is reported until that part works again, and the rest goes on.
 
 const reported = new Map();
 let tell = () => {};
@@ -8,7 +8,9 @@ export const onFault = (listener) => { tell = listener; };
 export function guarded(name, work) {
   return (...values) => {
     try {
-      return work(...values);
+      const result = work(...values);
+      if (reported.delete(name)) tell(name, null);
+      return result;
     } catch (error) {
       const text = `${name}: ${error?.message ?? error}`;
       if (reported.get(name) !== text) {

@@ -4,7 +4,7 @@ import { get } from "/static/core/api.js";
 import { guarded } from "/static/core/guard.js";
 import { changed, state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { ring, vehicle } from "/static/core/values.js";
+import { aircraft, messages, MOST_TEXTS, ring, vehicle } from "/static/core/values.js";
 import { announce } from "/static/fly/alarms.js";
 import { heardCommand } from "/static/fly/commands.js";
 
@@ -14,9 +14,11 @@ const list = (value) => (Array.isArray(value) ? value : []);
 const takeVehicle = guarded("a vehicle", (message) => {
   const id = message?.id == null ? "" : String(message.id);
   if (!id) return;
+  if (!state.vehicles.has(id) && message.state === undefined) { soon("/api/vehicles"); return; } // only what has changed of one not known yet
   state.vehicles.set(id, vehicle(message, state.vehicles.get(id), performance.now()));
   changed("vehicles");
 });
+const takeTraffic = (rows) => { state.traffic = list(rows).map(aircraft).filter((row) => row.id && row.position); changed("traffic"); };
 const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); changed("jobs"); } };
 
 const READS = {
@@ -25,6 +27,7 @@ const READS = {
   "/api/jobs": (rows) => list(rows).forEach(takeJob),
   "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },
   "/api/completions": (rows) => { state.completions = list(rows); changed("completions"); },
+  "/api/traffic": (rows) => takeTraffic(rows),
   "/healthz": (body) => { state.problems = list(body?.problems).map(String); changed("problems"); },
 };
 
@@ -51,7 +54,7 @@ const KINDS = {
   vehicle: takeVehicle,
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
-    if (row && event.text) { row.texts.push({ text: String(event.text).slice(0, 300), time: event.time ?? null, severity: event.severity ?? 6 }); row.texts.splice(0, row.texts.length - 50); changed("vehicles"); }
+    if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }
     if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${list(event.pair).join("/") || event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
     soon("/api/vehicles");
   },
@@ -60,6 +63,7 @@ const KINDS = {
     if (outline.length > 2) { state.outlines.set(String(event.vehicle), outline); changed("outlines"); }
     soon("/api/vehicles");
   },
+  traffic: (event) => takeTraffic(event.rows),
   layer: () => soon("/api/layers"),
   job: (event) => { takeJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
   completion: () => soon("/api/completions", "/api/vehicles"),

@@ -6,7 +6,7 @@ import { changed, state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 
 const faults = new Map();
-onFault((name, text) => { faults.set(name, text); changed("problems"); });
+onFault((name, text) => { text == null ? faults.delete(name) : faults.set(name, text); changed("problems"); });
 
 export function problemList() {
   const list = make("ul", {});

@@ -13,6 +13,7 @@ export const state = {
   commands: [], // newest first; fly/commands.js
   alarms: new Map(), // key -> alarm; fly/alarms.js
   finds: [],
+  traffic: [], // other aircraft, as core/values.js cleans them
   link: "connecting", // connecting, live, late, lost
   silent_s: 0,
   selected: null, // id of a vehicle

@@ -25,9 +25,11 @@ function flight(row) {
   return { state: "", text: text(row.landed), item: count(mission.item), items: count(mission.items) };
 }
 
-function messages(list) {
+export const MOST_TEXTS = 50;
+
+export function messages(list) {
   if (!Array.isArray(list)) return [];
-  return list.slice(-50).map((m) => (typeof m === "string" ? { text: text(m, 300), time: null, severity: 6 }
+  return list.slice(-MOST_TEXTS).map((m) => (typeof m === "string" ? { text: text(m, 300), time: null, severity: 6 }
     : { text: text(object(m).text, 300), time: number(object(m).time), severity: number(object(m).severity, 0, 7) ?? 6 })).filter((m) => m.text);
 }
 
@@ -38,6 +40,7 @@ export function vehicle(message, before, now) {
   const trail = Array.isArray(message.trail) ? points(message.trail) : (before?.trail ?? []);
   if (moved && !Array.isArray(message.trail)) extend(trail, moved);
   delete row.trail;
+  delete row.texts;
   const battery = number(row.battery, 0, 1.5);
   const frames = object(row.frames);
   return {
@@ -49,8 +52,14 @@ export function vehicle(message, before, now) {
     link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
     frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
     sortie: count(row.sortie), phase: text(object(row.mission).phase), takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
-    texts: messages(row.texts), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot),
+    texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot),
   };
+}
+
+// An aircraft that carries ADS-B, as the daemon heard of it.
+export function aircraft(row) {
+  return { id: text(row?.id), name: text(row?.name, 12) || text(row?.id), position: position(row?.lon_deg, row?.lat_deg), alt_m: number(row?.alt_m, -5000, 60000),
+    heading_deg: number(row?.heading_deg, 0, 360), speed_m_s: number(row?.speed_m_s, 0, 2000) };
 }
 
 const TRAIL = 600;

@@ -1,6 +1,6 @@
 // The selected vehicle: its figures in full, its commands, and what its autopilot says.
 
-import { button, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
 import { select, state, subscribe } from "/static/core/store.js";
 import { positionText } from "/static/core/coordinates.js";
@@ -9,10 +9,11 @@ import * as units from "/static/core/units.js";
 import { need } from "/static/fly/need.js";
 import { askOne } from "/static/fly/command_bar.js";
 import { wordOf } from "/static/fly/tiles.js";
+import { lengthOf } from "/static/map/geodesy.js";
 import { map } from "/static/map/map.js";
 import { refine } from "/static/work/jobs.js";
 
-const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "mission", "pictures", "refined"];
+const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "home", "mission", "pictures", "refined"];
 
 export function detailsPanel() {
   const name = make("h2", {});
@@ -23,12 +24,13 @@ export function detailsPanel() {
   const verb = (key) => make("button", { type: "button", dataset: { verb: key }, onclick: () => chosen() && askOne(chosen(), key) }, t(`verb.${key}`));
   const linked = make("div", { class: "row wrap", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
   const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
-  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.text); row.dataset.severity = message.severity; });
+  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.time == null ? message.text : `${new Date(message.time * 1000).toTimeString().slice(0, 8)} ${message.text}`); setAttribute(row, "data-severity", message.severity); });
+  const silent = make("p", { class: "quiet" }, t("details.silent"));
   const box = make("aside", { class: "details", "aria-label": t("details.title"), hidden: true },
     make("div", { class: "row" }, name, button("×", () => select(null), { class: "close", "aria-label": t("details.close") })),
     why, linked, make("div", { class: "row wrap" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
       button(t("details.refine"), () => chosen() && refine(chosen().id))),
-    facts, make("h3", {}, t("details.messages")), messages);
+    facts, make("h3", {}, t("details.messages")), silent, messages);
   subscribe("vehicles selected tick completions", "details of a vehicle", () => {
     const row = chosen();
     setHidden(box, !row);
@@ -44,12 +46,15 @@ export function detailsPanel() {
       battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
       gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
       link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("state.pictures"),
+      home: row.home ? `${positionText(row.home[1], row.home[0], settings.coordinates)}${row.position ? `, ${t("details.away", { m: units.distance(lengthOf([row.home, row.position])) })}` : ""}` : "–",
       mission: row.flight.items ? t("details.item", { item: row.flight.item, items: row.flight.items }) : "–",
       pictures: t("details.counts", { taken: Math.max(row.photos, row.frames.frames), ...row.frames }),
       refined: refinedText(row.id),
     };
     for (const key of FACTS) setText(cells[key], values[key]);
-    draw(row.texts.map((message, k) => [`${message.time ?? ""}/${message.text}/${message.time ? "" : k}`, message]));
+    const said = row.texts.toReversed();
+    setHidden(silent, said.length > 0);
+    draw(said.map((message, k) => [k, message]));
   });
   return box;
 }

@@ -1,8 +1,9 @@
-// Trails, footprints of the last pictures and homes: at most once in two seconds, and only if something differs.
+// Trails, footprints of the last pictures, homes and no-fly zones: at most once in two seconds, and only if something differs.
 
-import { state, subscribe } from "/static/core/store.js";
+import { changed, state, subscribe } from "/static/core/store.js";
 import { colourOf } from "/static/map/colours.js";
 import { feature, show } from "/static/map/map.js";
+import { onArea, zones } from "/static/plan/area.js";
 
 const PAUSE_MS = 2000;
 let timer = null;
@@ -12,10 +13,12 @@ function draw() {
   const rows = [...state.vehicles.values()];
   show("trails", rows.filter((row) => row.trail.length > 1).map((row) => feature("LineString", row.trail, { colour: colourOf(row.id) })));
   show("homes", rows.filter((row) => row.home).map((row) => feature("Point", row.home, { colour: colourOf(row.id) })));
+  show("no-fly", [feature("MultiPolygon", zones().coordinates)]);
   show("footprints", [...state.outlines].filter(([, ring]) => ring.length > 2).map(([id, ring]) => feature("Polygon", [[...ring, ring[0]]], { colour: colourOf(id) })));
 }
 
-subscribe("vehicles outlines ready", "trails and footprints", () => {
+onArea(() => changed("zones"));
+subscribe("vehicles outlines zones ready", "trails and footprints", () => {
   if (timer) { due = true; return; }
   draw();
   timer = setTimeout(() => { timer = null; if (due) { due = false; draw(); } }, PAUSE_MS);

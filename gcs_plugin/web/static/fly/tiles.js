@@ -13,15 +13,14 @@ import { inAir, need } from "/static/fly/need.js";
 const FIX = ["", "", "2D", "3D", "DGPS", "RTK~", "RTK"];
 const PARTS = ["height", "speed", "battery", "gps", "age", "pictures"];
 const tiles = new Map();
-let list, search, filter, count, nothing;
+const list = make("ul", { class: "tiles", "aria-label": t("fly.vehicles") });
+const search = make("input", { type: "search", placeholder: t("fly.search"), "aria-label": t("fly.search"), oninput: refilter });
+const filter = choice(["all", "need", "air", "ground"].map((key) => [key, t(`fly.filter.${key}`)]), "all", refilter, t("fly.filter"));
+const count = make("p", { class: "quiet", role: "status" });
+const nothing = make("p", { class: "quiet" }, t("fly.none"));
 
 export function stripOf() {
-  list = make("ul", { class: "tiles", "aria-label": t("fly.vehicles") });
-  search = make("input", { type: "search", placeholder: t("fly.search"), "aria-label": t("fly.search"), oninput: refilter });
-  filter = choice(["all", "need", "air", "ground"].map((key) => [key, t(`fly.filter.${key}`)]), "all", refilter, t("fly.filter"));
   const sort = choice(["name", "need"].map((key) => [key, t(`fly.sort.${key}`)]), settings.sort, (value) => { setSetting("sort", value); order(); }, t("fly.sort"));
-  count = make("p", { class: "quiet", role: "status" });
-  nothing = make("p", { class: "quiet" }, t("fly.none"));
   const again = button(t("fly.again"), () => order(), { class: "small", title: t("fly.again.hint") });
   return make("div", { class: "strip" }, make("div", { class: "row tools" }, search, filter, sort, again), count, nothing, list);
 }

@@ -21,6 +21,8 @@ const OVERLAYS = [
   ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15 }],
   ["area-line", "line", { "line-color": "#fff", "line-width": 4 }, null, "area"],
   ["area-edge", "line", { "line-color": "#1c64b0", "line-width": 2.5 }, null, "area"],
+  ["no-fly", "fill", { "fill-color": "#c92a2a", "fill-opacity": 0.28 }],
+  ["no-fly-edge", "line", { "line-color": "#c92a2a", "line-width": 2.5, "line-dasharray": [3, 1.5] }, null, "no-fly"],
   ["plan-edge", "line", { "line-color": "#fff", "line-width": 5, "line-opacity": 0.7 }, null, "plan"],
   ["plan", "line", { "line-color": COLOUR, "line-width": ["match", ["get", "kind"], "leg", 3, 1.5] }],
   ["homes", "circle", { "circle-radius": 6, "circle-color": "#fff", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],

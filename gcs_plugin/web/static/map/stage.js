@@ -12,6 +12,7 @@ import { legPanel } from "/static/map/legs.js";
 import { boundsOf, fit, isReady, map, ready } from "/static/map/map.js";
 import { measurePanel } from "/static/map/measure.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
+import "/static/map/traffic_markers.js";
 import "/static/map/vehicle_markers.js";
 import { setEditing } from "/static/plan/editor.js";
 import { loadPlan, planPanel } from "/static/plan/panel.js";

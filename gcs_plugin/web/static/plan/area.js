@@ -1,4 +1,4 @@
-// The area to be mapped: an outline and holes, each a ring of [lon, lat] without the closing point; with undo and redo.
+// The area to be mapped: an outline, and no-fly zones inside it or beside it, each a ring of [lon, lat] without the closing point; with undo and redo.
 
 import { areaOf, crossesItself } from "/static/map/geodesy.js";
 import { t } from "/static/core/strings.js";
@@ -53,7 +53,10 @@ export function replace(rings) {
   tell("loaded");
 }
 
-export const polygon = () => ({ type: "Polygon", coordinates: area.rings.filter((ring) => ring.length > 2).map((ring) => [...ring, ring[0]]) });
+const closed = () => area.rings.filter((ring) => ring.length > 2).map((ring) => [...ring, ring[0]]);
+export const polygon = () => ({ type: "Polygon", coordinates: closed() });
+export const outline = () => ({ type: "Polygon", coordinates: closed().slice(0, 1) });
+export const zones = () => ({ type: "MultiPolygon", coordinates: closed().slice(1).map((ring) => [ring]) });
 export const size_m2 = () => Math.max(0, areaOf(area.rings[0] ?? []) - area.rings.slice(1).reduce((sum, ring) => sum + areaOf(ring), 0));
 
 // What is wrong with the area, as what to change; empty if it can be planned.

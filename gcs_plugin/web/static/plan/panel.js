@@ -10,7 +10,7 @@ import * as units from "/static/core/units.js";
 import { ring } from "/static/core/values.js";
 import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
-import { acceptDrops, readArea } from "/static/plan/import.js";
+import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { planResult, showPlan } from "/static/plan/result.js";
 import { isSaving, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
@@ -81,7 +81,7 @@ export function planPanel() {
   const undo = button(t("area.undo"), area.undo);
   const redo = button(t("area.redo"), area.redo);
   const clear = button(t("area.clear"), () => { editor.stopDrawing(); area.change((rings) => rings.splice(0)); });
-  const file = make("input", { type: "file", accept: ".geojson,.json,.kml,.kmz,.zip,.gpkg,.plan", class: "hidden-file", "aria-label": t("import.label"), onchange: () => { if (file.files[0]) read(file.files[0]); file.value = ""; } });
+  const file = make("input", { type: "file", accept: KINDS, class: "hidden-file", "aria-label": t("import.label"), onchange: () => { if (file.files[0]) read(file.files[0]); file.value = ""; } });
   const open = button(t("import.open"), () => file.click());
   const go = make("button", { type: "submit", class: "primary" }, t("plan.make"));
   end = choice(["rtl", "land", "hover"].map((key) => [key, t(`plan.end.${key}`)]), "rtl", save);
@@ -106,7 +106,7 @@ export function planPanel() {
     go.disabled = true;
     setText(go, t("plan.making"));
     try {
-      const body = { ...values(), area: area.polygon() };
+      const body = { ...values(), area: area.outline(), no_fly: area.zones() };
       const heard = [...state.vehicles.values()].filter((row) => row.linked && row.position);
       if (heard.length >= body.vehicles) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
       made = await post("/api/plans", body);

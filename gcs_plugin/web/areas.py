@@ -1,0 +1,50 @@
+"""Reading an area from a file that a page was given: the reader of the command line, behind an upload."""
+
+import asyncio
+import tempfile
+from pathlib import Path, PurePath
+from typing import Any, Final
+
+from fastapi import Query, Request, Response
+
+from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.web.answers import JsonAnswer, body_of
+from orthoswarm.planning.area.shape_files import Ring
+
+MOST_BYTES: Final = 20_000_000
+_MOST_NAME: Final = 200
+
+
+async def read_area(
+    request: Request, name: str = Query(..., description="the file's name; its ending says what it is")
+) -> Response:
+    """Read an area file, sent as the body.
+
+    GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl .plan. Answers `polygons` (each a list of closed
+    rings of [longitude, latitude], the outline first), `lines`, and `no_fly` (closed rings: exclusion fences).
+    """
+    data = await body_of(request, MOST_BYTES)
+    return JsonAnswer(await asyncio.to_thread(area_of, data, name[:_MOST_NAME]))
+
+
+def area_of(data: bytes, name: str) -> dict[str, Any]:
+    """What a file holds, as JSON values; see `read_area`.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    with tempfile.TemporaryDirectory(prefix="orthoswarm-") as folder:
+        suffix = PurePath(name).suffix.lower()
+        path = Path(folder) / f"area{suffix if suffix.isascii() and suffix[1:].isalnum() else ''}"
+        path.write_bytes(data)
+        shapes, zones = read_shapes(path, name)
+    return {
+        "polygons": [[_closed(ring) for ring in (polygon.shell, *polygon.holes)] for polygon in shapes.polygons],
+        "lines": [[[lon, lat] for lat, lon in line.tolist()] for line in shapes.lines],
+        "no_fly": [_closed(zone) for zone in zones],
+    }
+
+
+def _closed(ring: Ring) -> list[list[float]]:
+    points = [[lon, lat] for lat, lon in ring.tolist()]
+    return [*points, points[0]]
