@@ -26,8 +26,9 @@ from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
 from gcs_plugin.daemon.layers.anchor import Anchor
+from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
-from gcs_plugin.daemon.layers.realtime_layer import Drawer, frame_of_row
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.mission_journal import completion_rows, note_completion
 from gcs_plugin.daemon.settings import Settings

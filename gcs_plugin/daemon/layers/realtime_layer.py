@@ -5,7 +5,6 @@ keeps up, frames are drawn as they come. Under overload those that would win the
 they are on the disk, count for the refinement, and are drawn when there is time; how many they are is told.
 """
 
-import json
 import logging
 import shutil
 import sqlite3
@@ -13,27 +12,25 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.intake.posted_pose import frame_of, is_position
-from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
+from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, Pending
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
+from gcs_plugin.daemon.layers.journal_frames import frame_of_row
+from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
+from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Drawn, Journal, fact_change, frames_drawn, packed, unpacked
+from gcs_plugin.daemon.store.journal import Drawn, Journal, frames_drawn, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import GroundGrid, LocalGrid, utm_epsg
-from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.model.geo import GroundGrid
 from orthoswarm.mosaic.realtime import RealtimeMosaic
-from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.raster.picture_file import read_rgba
 
@@ -41,10 +38,6 @@ _IN_MEMORY: Final = 2000
 _AT_ONCE: Final = 16
 _LATE_S: Final = 1.0
 _LOOK_S: Final = 0.5
-_FEW: Final = 200
-_OTHER_GSD: Final = 3.0
-_FAR_M: Final = 100_000.0
-_SEEN_HEIGHTS: Final = 4.0  # nothing is drawn beyond 3.8 heights (`reach`)
 _COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"
 _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
@@ -54,7 +47,6 @@ class Drawer:
     """Draws the frames of a journal on the real-time layer.
 
     Attributes:
-        area: where the map lies, None before the first frame.
         drawn: frames drawn since the start. late: drawn later than a second after they came.
         put_off: frames that wait longer than a second, because they would show least of all that wait.
         latencies: seconds from arrival to the map, of the last thousand.
@@ -89,9 +81,7 @@ class Drawer:
             on_rejected: called with each frame that cannot be on the map, why, and whether that is for its place.
         """
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
-        self._gsd_m, self._fov_rad, self._on_area = gsd_m, fov_rad, on_area
-        self._anchor, self._on_rejected = anchor, on_rejected
-        self._far: list[tuple[float, float]] | None = None
+        self._on_rejected = on_rejected
         self._begun = 0
         self._queue = DrawQueue(_IN_MEMORY)
         self._waiting: set[int] = set()
@@ -100,16 +90,13 @@ class Drawer:
         self._condition = threading.Condition()
         self._stop = False
         self._thread: threading.Thread | None = None
-        self._mosaic: RealtimeMosaic | None = None
-        self._grid: LocalGrid | None = None
-        self.area: Area | None = None
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        document = journal.fact("area")
-        if document is not None:
-            self.area = Area.from_document(document)
-            self._open(journal.fact("realtime"))
+        self._site = MapSite(
+            journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, on_area=on_area, anchor=anchor,
+            draw_again=self._draw_anew,
+        )  # fmt: skip
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
@@ -132,6 +119,11 @@ class Drawer:
             if seq not in self._waiting:
                 self._put(Pending(seq, arrived, sortie, frame))
             self._condition.notify_all()
+
+    @property
+    def area(self) -> Area | None:
+        """Where the map lies, None before the first frame."""
+        return self._site.area
 
     @property
     def backlog(self) -> int:
@@ -266,18 +258,25 @@ class Drawer:
         self.latencies.append(took)
         del self.latencies[:-1000]
 
+    def _draw_anew(self) -> None:
+        """All frames are drawn again, by what the journal says."""
+        self._begun += 1
+        with self._condition:
+            self._queue.forget_drawn()
+            self._more = True
+
     # -- one frame ------------------------------------------------------------------------------------------------
 
     def _draw(self, pending: Pending) -> Drawn:
         frame = pending.frame
         try:
-            place = self._place(frame)
+            place = self._site.place(frame, self.drawn)
             if isinstance(place, str):
                 self._on_rejected(frame, place, True)
                 return self._report(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
             picture = read_rgba(frame.path)
-            mosaic = self._mosaic
+            mosaic = self._site.mosaic
             assert mosaic is not None
             added = mosaic.add(picture, camera)
         except StorageError:  # the disk is full, or gone: later
@@ -292,182 +291,17 @@ class Drawer:
 
     def _report(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
-        outline = None
-        if camera is not None and self._grid is not None and drawn.reason is None:
+        outline, grid = None, self._site.grid
+        if camera is not None and grid is not None and drawn.reason is None:
             corners = camera.corners()
             if np.isfinite(corners).all():
-                outline = [[float(lon), float(lat)] for lat, lon in self._grid.to_geographic(corners)]
+                outline = [[float(lon), float(lat)] for lat, lon in grid.to_geographic(corners)]
         self._events.publish(
             "frame", seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
             stage="rejected" if drawn.reason else "realtime", reason=drawn.reason, sigma_m=drawn.sigma_m,
             lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, outline=outline,
         )  # fmt: skip
         return drawn
-
-    def _place(self, frame: Frame) -> tuple[Camera, float] | str:
-        """The frame's camera and sigma, the layer ready to take it; or why it cannot be drawn."""
-        if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
-            return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
-        far = self._is_far(frame)
-        if far is not None:
-            return far
-        if self._grid is None:
-            if not -80.0 <= frame.fix.lat_deg <= 84.0:
-                return "it lies beyond the UTM grid, near a pole"
-            epsg = self.area.epsg if self.area else utm_epsg(frame.fix.lat_deg, frame.fix.lon_deg)
-            self._grid = LocalGrid(epsg)
-        place = self._grid.to_grid(frame.fix.lat_deg, frame.fix.lon_deg)
-        if not np.isfinite(place).all():
-            return "its position is beyond the map's grid; use a workspace of its own for it"
-        placed = recorded_cameras([frame], self._grid, self._fov_rad).placed
-        if not placed:
-            return "its position is not a number"
-        camera = placed[0].camera
-        if self.area is None:
-            gsd = self._gsd_m or default_gsd([camera])
-            reason = rejection(camera, 0.0, gsd)
-            if reason is not None:
-                self._grid = None
-                return reason
-            self._begin(Area.around(self._grid.epsg, float(place[0]), float(place[1]), gsd))
-        elif self._gsd_m is None and self.drawn < _FEW and self._is_other_scale(camera):
-            self._begin_again(camera, place)
-        return self._with_room(camera) or (camera, placed[0].sigma_m)
-
-    def _is_far(self, frame: Frame) -> str | None:
-        """Why a frame lies too far away for the map, None if it does not; the map may move to it.
-
-        The basemap says where the map lies, without one the newest plan, without that most of the pictures. A map that
-        was begun elsewhere (by pictures with a wrong position) is begun again, as long as nothing was solved on it,
-        and all frames are drawn again.
-        """
-        fix, anchor = frame.fix, self._anchor()
-        if anchor is not None and anchor.distance_m(fix.lat_deg, fix.lon_deg) > _FAR_M:
-            km = anchor.distance_m(fix.lat_deg, fix.lon_deg) / 1e3
-            return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
-        if self.area is None:
-            return None
-        lat, lon = (float(v) for v in LocalGrid(self.area.epsg).to_geographic(self.area.origin))
-        away_m = distance_m(fix.lat_deg, fix.lon_deg, lat, lon)
-        if away_m <= _FAR_M:
-            return None
-        wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
-        if (wrong or (anchor is None and self._is_majority(frame))) and not self._solved():
-            self._move_away()
-            return None
-        return (
-            f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
-        )
-
-    def _is_majority(self, frame: Frame) -> bool:
-        """Whether more of the frames lie around this one, too far from the map, than on the map."""
-        if self._far is None:
-            rows = self._journal.rows("SELECT pose FROM frames WHERE stage = 'rejected'")
-            poses = [pose for row in rows if is_position(pose := json.loads(row["pose"]))]
-            self._far = [(pose["lat_deg"], pose["lon_deg"]) for pose in poses]
-        here = (frame.fix.lat_deg, frame.fix.lon_deg)
-        self._far.append(here)
-        around = sum(distance_m(*here, *other) <= _FAR_M for other in self._far)
-        row = self._journal.one("SELECT COUNT(*) AS n FROM frames WHERE drawn = 1 AND reason IS NULL")
-        return row is not None and around > int(row["n"])
-
-    def _solved(self) -> bool:
-        query = "SELECT 1 FROM solutions UNION SELECT 1 FROM coarse LIMIT 1"
-        return self._journal.one(query) is not None
-
-    def _draw_anew(self) -> None:
-        """All frames are drawn again, by what the journal says."""
-        self._begun += 1
-        with self._condition:
-            self._queue.forget_drawn()
-            self._more = True
-
-    def _move_away(self) -> None:
-        """Leave the place where the map lies: the next frame begins it, and all are drawn again."""
-        _log.warning("the map was begun at a wrong position; it is begun again where most pictures lie")
-
-        def change(db: sqlite3.Connection) -> None:
-            db.execute("UPDATE frames SET drawn = 0")
-            db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
-
-        self._journal.write(change)
-        self._draw_anew()
-        self.area, self._grid, self._mosaic, self._far = None, None, None, None
-        self._layer.replace(None)
-
-    def _is_other_scale(self, camera: Camera) -> bool:
-        """Whether the map's scale was taken from pictures during the climb."""
-        assert self.area is not None
-        height = float(camera.position[2])
-        solved = self._journal.one("SELECT 1 FROM solutions LIMIT 1") is not None
-        return 10.0 < height < 500.0 and not solved and height / camera.lens.focal_px > _OTHER_GSD * self.area.gsd_m
-
-    def _begin_again(self, camera: Camera, place: Any) -> None:
-        assert self._grid is not None
-        gsd = default_gsd([camera])
-        _log.info("the map's pixel becomes %.3f m; what was drawn is drawn again", gsd)
-        self._begin(Area.around(self._grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
-
-    def _with_room(self, camera: Camera) -> str | None:
-        """Make sure that the layer holds what a camera sees; why not, if that cannot be."""
-        assert self.area is not None
-        east, north, height = (float(v) for v in camera.position)
-        far = _SEEN_HEIGHTS * abs(height)
-        if self.area.bounds.contains(BoundingBox(east, north, east, north).grown(far)):
-            return None  # the usual case, without a look at the footprint
-        if rejection(camera, 0.0, self.area.gsd_m) is not None:
-            return None  # the mosaic will say so
-        box = footprint_boxes([camera], 0.0, 0.0)[0]
-        bounds = BoundingBox(*(float(v) for v in box))
-        if not np.isfinite(box).all() or self.area.bounds.contains(bounds):
-            return None
-        try:
-            area = self.area.grown(bounds)
-        except OrthoSwarmError as error:
-            return str(error)
-        old = self._layer.canvas
-        name = new_name("realtime")
-        self._adopt(area, successor(old, self._folder / name, area.grid, "orthogonality", share=True))
-        return None
-
-    # -- the layer ------------------------------------------------------------------------------------------------
-
-    def _begin(self, area: Area, *, again: bool = False) -> None:
-        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid)
-        self._adopt(area, canvas, again=again)
-
-    def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
-        """Make a canvas the layer, in the journal first."""
-        facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
-
-        def change(db: sqlite3.Connection) -> None:
-            for fact in facts:
-                fact(db)
-            if again:
-                db.execute("UPDATE frames SET drawn = 0")
-
-        self._journal.write(change)
-        if again:
-            self._draw_anew()
-        self.area = area
-        self._layer.replace(canvas)
-        self._mosaic = RealtimeMosaic(canvas)
-        self._grid = LocalGrid(area.epsg)
-        self._on_area(area)
-
-    def _open(self, name: str | None) -> None:
-        """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
-        assert self.area is not None
-        try:
-            canvas = Canvas.open(self._folder / str(name))
-        except (OrthoSwarmError, OSError):
-            _log.warning("the real-time layer is damaged and is drawn again")
-            self._begin(self.area, again=True)
-            return
-        self._layer.replace(canvas)
-        self._mosaic = RealtimeMosaic(canvas)
-        self._grid = LocalGrid(self.area.epsg)
-        self._on_area(self.area)
 
 
 def _warm_up(folder: Path) -> None:
@@ -490,11 +324,3 @@ def _thumbnail(picture: Bytes) -> bytes:
 
     some = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
     return thumbnail(np.ascontiguousarray(some[..., :3])).tobytes()
-
-
-def frame_of_row(row: sqlite3.Row, store: PictureStore) -> Frame:
-    """The frame of a journal's row."""
-    return frame_of(
-        json.loads(row["pose"]), image=unpacked(row["image"]), path=store.path(row["path"]),
-        vehicle=unpacked(row["vehicle"]), time_s=row["time"], size=(row["width"], row["height"]),
-    )  # fmt: skip

@@ -1,0 +1,234 @@
+"""Where the map lies: begun by the first picture, grown as pictures come, moved if it was begun at a wrong place.
+
+The basemap says where the map lies, without one the newest plan, without that most of the pictures.
+"""
+
+import json
+import logging
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gcs_plugin.daemon.intake.posted_pose import is_position
+from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
+from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
+from gcs_plugin.daemon.store.journal import Journal, fact_change
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid, utm_epsg
+from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
+from orthoswarm.mosaic.realtime import RealtimeMosaic
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
+
+_FEW: Final = 200
+_OTHER_GSD: Final = 3.0
+_FAR_M: Final = 100_000.0
+_SEEN_HEIGHTS: Final = 4.0  # nothing is drawn beyond 3.8 heights (`reach`)
+_log = logging.getLogger(__name__)
+
+
+class MapSite:
+    """The map's area and the canvas of the real-time layer, used by the drawing thread.
+
+    Attributes:
+        area: where the map lies, None before the first frame. grid: its grid. mosaic: draws on its canvas.
+    """
+
+    def __init__(
+        self,
+        journal: Journal,
+        layer: Layer,
+        folder: Path,
+        *,
+        gsd_m: float | None,
+        fov_rad: float | None,
+        on_area: Callable[[Area], None],
+        anchor: Callable[[], Anchor | None],
+        draw_again: Callable[[], None],
+    ) -> None:
+        """Take up where the last daemon stopped.
+
+        Args:
+            journal: of the workspace. layer: the real-time layer. folder: of all layers' canvases.
+            gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
+            on_area: called when the area changes. anchor: gives where the map is to lie, None to go by the pictures.
+            draw_again: has all frames drawn that the journal says are not.
+        """
+        self._journal, self._layer, self._folder = journal, layer, folder
+        self._gsd_m, self._fov_rad, self._on_area, self._anchor = gsd_m, fov_rad, on_area, anchor
+        self._draw_again = draw_again
+        self._far: list[tuple[float, float]] | None = None
+        self.area: Area | None = None
+        self.grid: LocalGrid | None = None
+        self.mosaic: RealtimeMosaic | None = None
+        document = journal.fact("area")
+        if document is not None:
+            self.area = Area.from_document(document)
+            self._open(journal.fact("realtime"))
+
+    def place(self, frame: Frame, drawn: int) -> tuple[Camera, float] | str:
+        """The frame's camera and sigma, metres, with room for it on the layer; or why it cannot be drawn.
+
+        Args:
+            frame: with a recorded pose. drawn: how many frames were drawn since the start.
+        """
+        if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
+            return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
+        far = self._is_far(frame)
+        if far is not None:
+            return far
+        if self.grid is None:
+            if not -80.0 <= frame.fix.lat_deg <= 84.0:
+                return "it lies beyond the UTM grid, near a pole"
+            epsg = self.area.epsg if self.area else utm_epsg(frame.fix.lat_deg, frame.fix.lon_deg)
+            self.grid = LocalGrid(epsg)
+        place = self.grid.to_grid(frame.fix.lat_deg, frame.fix.lon_deg)
+        if not np.isfinite(place).all():
+            return "its position is beyond the map's grid; use a workspace of its own for it"
+        placed = recorded_cameras([frame], self.grid, self._fov_rad).placed
+        if not placed:
+            return "its position is not a number"
+        camera = placed[0].camera
+        if self.area is None:
+            gsd = self._gsd_m or default_gsd([camera])
+            reason = rejection(camera, 0.0, gsd)
+            if reason is not None:
+                self.grid = None
+                return reason
+            self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd))
+        elif self._gsd_m is None and drawn < _FEW and self._is_other_scale(camera):
+            self._begin_again(camera, place)
+        return self._with_room(camera) or (camera, placed[0].sigma_m)
+
+    def _is_far(self, frame: Frame) -> str | None:
+        """Why a frame lies too far away for the map, None if it does not; the map may move to it.
+
+        A map that was begun elsewhere (by pictures with a wrong position) is begun again, as long as nothing was
+        solved on it, and all frames are drawn again.
+        """
+        fix, anchor = frame.fix, self._anchor()
+        if anchor is not None and anchor.distance_m(fix.lat_deg, fix.lon_deg) > _FAR_M:
+            km = anchor.distance_m(fix.lat_deg, fix.lon_deg) / 1e3
+            return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
+        if self.area is None:
+            return None
+        lat, lon = (float(v) for v in LocalGrid(self.area.epsg).to_geographic(self.area.origin))
+        away_m = distance_m(fix.lat_deg, fix.lon_deg, lat, lon)
+        if away_m <= _FAR_M:
+            return None
+        wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
+        if (wrong or (anchor is None and self._is_majority(frame))) and not self._solved():
+            self._move_away()
+            return None
+        return (
+            f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
+        )
+
+    def _is_majority(self, frame: Frame) -> bool:
+        """Whether more of the frames lie around this one, too far from the map, than on the map."""
+        if self._far is None:
+            rows = self._journal.rows("SELECT pose FROM frames WHERE stage = 'rejected'")
+            poses = [pose for row in rows if is_position(pose := json.loads(row["pose"]))]
+            self._far = [(pose["lat_deg"], pose["lon_deg"]) for pose in poses]
+        here = (frame.fix.lat_deg, frame.fix.lon_deg)
+        self._far.append(here)
+        around = sum(distance_m(*here, *other) <= _FAR_M for other in self._far)
+        row = self._journal.one("SELECT COUNT(*) AS n FROM frames WHERE drawn = 1 AND reason IS NULL")
+        return row is not None and around > int(row["n"])
+
+    def _solved(self) -> bool:
+        query = "SELECT 1 FROM solutions UNION SELECT 1 FROM coarse LIMIT 1"
+        return self._journal.one(query) is not None
+
+    def _move_away(self) -> None:
+        """Leave the place where the map lies: the next frame begins it, and all are drawn again."""
+        _log.warning("the map was begun at a wrong position; it is begun again where most pictures lie")
+
+        def change(db: sqlite3.Connection) -> None:
+            db.execute("UPDATE frames SET drawn = 0")
+            db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
+
+        self._journal.write(change)
+        self._draw_again()
+        self.area, self.grid, self.mosaic, self._far = None, None, None, None
+        self._layer.replace(None)
+
+    def _is_other_scale(self, camera: Camera) -> bool:
+        """Whether the map's scale was taken from pictures during the climb."""
+        assert self.area is not None
+        height = float(camera.position[2])
+        solved = self._journal.one("SELECT 1 FROM solutions LIMIT 1") is not None
+        return 10.0 < height < 500.0 and not solved and height / camera.lens.focal_px > _OTHER_GSD * self.area.gsd_m
+
+    def _begin_again(self, camera: Camera, place: Any) -> None:
+        assert self.grid is not None
+        gsd = default_gsd([camera])
+        _log.info("the map's pixel becomes %.3f m; what was drawn is drawn again", gsd)
+        self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
+
+    def _with_room(self, camera: Camera) -> str | None:
+        """Make sure that the layer holds what a camera sees; why not, if that cannot be."""
+        assert self.area is not None
+        east, north, height = (float(v) for v in camera.position)
+        far = _SEEN_HEIGHTS * abs(height)
+        if self.area.bounds.contains(BoundingBox(east, north, east, north).grown(far)):
+            return None  # the usual case, without a look at the footprint
+        if rejection(camera, 0.0, self.area.gsd_m) is not None:
+            return None  # the mosaic will say so
+        box = footprint_boxes([camera], 0.0, 0.0)[0]
+        bounds = BoundingBox(*(float(v) for v in box))
+        if not np.isfinite(box).all() or self.area.bounds.contains(bounds):
+            return None
+        try:
+            area = self.area.grown(bounds)
+        except OrthoSwarmError as error:
+            return str(error)
+        old = self._layer.canvas
+        name = new_name("realtime")
+        self._adopt(area, successor(old, self._folder / name, area.grid, "orthogonality", share=True))
+        return None
+
+    # -- the layer ------------------------------------------------------------------------------------------------
+
+    def _begin(self, area: Area, *, again: bool = False) -> None:
+        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid)
+        self._adopt(area, canvas, again=again)
+
+    def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
+        """Make a canvas the layer, in the journal first."""
+        facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
+
+        def change(db: sqlite3.Connection) -> None:
+            for fact in facts:
+                fact(db)
+            if again:
+                db.execute("UPDATE frames SET drawn = 0")
+
+        self._journal.write(change)
+        if again:
+            self._draw_again()
+        self.area = area
+        self._layer.replace(canvas)
+        self.mosaic = RealtimeMosaic(canvas)
+        self.grid = LocalGrid(area.epsg)
+        self._on_area(area)
+
+    def _open(self, name: str | None) -> None:
+        """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
+        assert self.area is not None
+        try:
+            canvas = Canvas.open(self._folder / str(name))
+        except (OrthoSwarmError, OSError):
+            _log.warning("the real-time layer is damaged and is drawn again")
+            self._begin(self.area, again=True)
+            return
+        self._layer.replace(canvas)
+        self.mosaic = RealtimeMosaic(canvas)
+        self.grid = LocalGrid(self.area.epsg)
+        self._on_area(self.area)
