@@ -3,7 +3,7 @@
     cover = CoverageGrid(Cells.of_area(epsg, ground, no_fly), Terrain.flat(), Demands())
     cover.put(views_of_a_leg)                 # recorded poses, in flight
     cover.put(the_same_views_placed)          # replaces those of the same vehicle and image
-    cover.states(complete=False)
+    cover.states(due=False)
 
 One thread adds. A picture that shows 190 x 150 m costs 0.6 ms in cells of 1 m.
 """
@@ -29,9 +29,11 @@ from orthoswarm.model.placement import Terrain
 Array = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 Geometry = Any
+Due = bool | NDArray[np.bool_]
 
 CELL_M = 1.0
 _MOST_CELLS = 60_000_000
+_ROWS_AT_ONCE = 64
 _FLATTEST = math.tan(math.radians(75.0))
 
 
@@ -133,7 +135,7 @@ class CoverageGrid:
         self.good: NDArray[np.uint16] = np.zeros((grid.height, grid.width), np.uint16)
         self._views: dict[tuple[str, str], View] = {}
         self._boxes: dict[tuple[str, str], Box] = {}
-        self._heights = _heights(self.terrain, grid)
+        self._heights = _heights(self.terrain, grid, (0, grid.height, 0, grid.width))
         self._edges = np.array([grid.west, grid.north, grid.gsd_m])
 
     @property
@@ -141,14 +143,18 @@ class CoverageGrid:
         """All pictures, in the order in which they were first put."""
         return list(self._views.values())
 
-    def put(self, views: Iterable[View]) -> Box | None:
+    def put(self, views: Iterable[View], gone: Iterable[tuple[str, str]] = ()) -> Box | None:
         """Add pictures; one of the same vehicle and name is replaced. Returns the box of changed cells, None if none.
 
         Args:
             views: in any order. A view whose sigma is not a number is counted as 1000 m: seen, but nowhere well.
+            gone: vehicle and name of pictures to be removed.
         """
         fresh = [((v.vehicle, v.image), v) for v in views]
-        replaced = [self._boxes[key] for key, _ in fresh if self._boxes.get(key)]
+        left = [key for key in gone if key in self._boxes]
+        replaced = [self._boxes[key] for key in (*(key for key, _ in fresh), *left) if self._boxes.get(key)]
+        for key in left:
+            del self._views[key], self._boxes[key]
         for key, view in fresh:
             self._views[key] = view
             self._boxes[key] = self._box(view)
@@ -165,23 +171,25 @@ class CoverageGrid:
         changed = [b for b in (*replaced, *(self._boxes[key] for key, _ in fresh)) if b[0] < b[1] and b[2] < b[3]]
         return _union(changed) if changed else None
 
-    def states(self, complete: bool = True) -> NDArray[np.uint8]:
+    def states(self, due: Due = True) -> NDArray[np.uint8]:
         """State of each cell, uint8 (rows, columns).
 
         Args:
-            complete: the flight is over: what no picture saw is missed, and not merely planned.
+            due: cells whose flight is over, bool (rows, columns) or one value for all: what no picture saw of them is
+                missed, and not merely planned.
         """
         state = np.full(self.best.shape, State.OUTSIDE, np.uint8)
         wanted = self.cells.wanted
-        state[wanted] = State.MISSED if complete else State.PLANNED
+        state[wanted] = State.PLANNED
+        state[wanted & due] = State.MISSED
         state[wanted & (self.best != UNSEEN)] = State.POOR
         state[wanted & (self.best == 0)] = State.SEEN
         state[self.cells.excluded] = State.EXCLUDED
         return state
 
-    def shares(self, complete: bool = True) -> Shares:
-        """Parts of the area by state."""
-        counts = np.bincount(self.states(complete)[self.cells.wanted], minlength=len(State)) / self.cells.wanted.sum()
+    def shares(self, due: Due = True) -> Shares:
+        """Parts of the area by state; `due` as for `states`."""
+        counts = np.bincount(self.states(due)[self.cells.wanted], minlength=len(State)) / self.cells.wanted.sum()
         return Shares(
             float(counts[State.SEEN]), float(counts[State.POOR]), float(counts[State.MISSED]),
             float(counts[State.PLANNED]),
@@ -196,18 +204,19 @@ class CoverageGrid:
             flaws |= Flaw.POSITION
         coarsest = 0.0 if self.demands.gsd_m is None else self.demands.gsd_m
         quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest])
-        lens, level = _lens_row(view.lens), float(self.terrain.z[0, 0])
-        camera = np.ascontiguousarray(view.to_camera)
-        paint(
-            self.best, self.good, self._heights, level, np.array(box), self._edges, camera, view.position, lens, quality
-        )
+        ground, heights, corner = self.terrain, self._heights, (0, 0)
+        if view.ground is not None:
+            ground, heights, corner = view.ground, _heights(view.ground, self.cells.grid, box), (box[0], box[2])
+        lens, level = _lens_row(view.lens), float(ground.z[0, 0])
+        camera, place = np.ascontiguousarray(view.to_camera), np.array([*box, *corner])
+        paint(self.best, self.good, heights, level, place, self._edges, camera, view.position, lens, quality)
 
     def _box(self, view: View) -> Box:
         """Rows and columns that hold the view's footprint on the lowest and the highest ground."""
-        corners, grid = _border(view.lens), self.cells.grid
+        corners, grid, ground = _border(view.lens), self.cells.grid, view.ground or self.terrain
         rays = corners @ np.linalg.inv(view.to_camera).T
         points = []
-        for z in (float(self.terrain.z.min()), float(self.terrain.z.max())):
+        for z in (float(ground.z.min()), float(ground.z.max())):
             above = float(view.position[2]) - z
             if above <= 0.0:
                 continue
@@ -235,15 +244,16 @@ def _common(a: Box, b: Box) -> Box:
     return max(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), min(a[3], b[3])
 
 
-def _heights(terrain: Terrain, grid: GroundGrid) -> NDArray[np.float32]:
-    """Ground at the cells' centres; (1, 1) where it is level."""
+def _heights(terrain: Terrain, grid: GroundGrid, box: Box) -> NDArray[np.float32]:
+    """Ground at the centres of a box of cells; (1, 1) where it is level."""
     if float(np.ptp(terrain.z)) == 0.0:
         return np.array([[terrain.z[0, 0]]], np.float32)
-    east = grid.west + (np.arange(grid.width) + 0.5) * grid.gsd_m
-    out = np.empty((grid.height, grid.width), np.float32)
-    for r in range(grid.height):  # row by row: a whole area's points in float64 would be large
-        north = np.full(grid.width, grid.north - (r + 0.5) * grid.gsd_m)
-        out[r] = terrain.height(np.stack([east, north], -1))
+    east = grid.west + (np.arange(box[2], box[3]) + 0.5) * grid.gsd_m
+    out = np.empty((box[1] - box[0], box[3] - box[2]), np.float32)
+    for first in range(0, len(out), _ROWS_AT_ONCE):  # the points of a large area in float64 would be large
+        rows = np.arange(first, min(len(out), first + _ROWS_AT_ONCE))
+        points = np.stack(np.meshgrid(east, grid.north - (box[0] + rows + 0.5) * grid.gsd_m), -1)
+        out[rows] = terrain.height(points)
     return out
 
 

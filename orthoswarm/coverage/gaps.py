@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.coverage.coverage_grid import CoverageGrid, State
+from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Due, State
 from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
 from orthoswarm.coverage.painting import UNSEEN
 from orthoswarm.coverage.view import FLAW_NAMES, Flaw
@@ -86,8 +86,9 @@ def find_gaps(
     missing: Sequence[MissingPicture] = (),
     plan: PlannedFlight | None = None,
     smallest_m2: float = SMALLEST_M2,
+    due: Due = True,
 ) -> Gaps:
-    """Gaps of a finished flight and their causes.
+    """Gaps and their causes.
 
     A cause is found by asking what would have seen a cell: a picture that is missing; else the same pictures through
     the lens that the plan relies on; else a leg of the plan, which then was not flown (or none, so that the plan itself
@@ -97,12 +98,13 @@ def find_gaps(
     Args:
         cover: with all pictures. missing: of `missing_pictures`. plan: what was to be flown, None if not known.
         smallest_m2: smaller gaps are only counted.
+        due: cells whose flight is over, as for `CoverageGrid.states`; no other is a gap.
     """
-    state = cover.states()
+    state = cover.states(due)
     vehicles = sorted({v.vehicle for v in cover.views})
     size = state.shape
     explained = _Explained(np.full(size, _NONE, np.uint8), np.zeros(size, np.float32), np.full(size, -1, np.int16))
-    explained.enter(state == State.POOR, Cause.POOR, 1.0)
+    explained.enter((state == State.POOR) & due, Cause.POOR, 1.0)
     missed = state == State.MISSED
     for vehicle in vehicles:
         for cause in (Cause.REJECTED, Cause.NOT_ARRIVED, Cause.NOT_TRIGGERED):
@@ -120,7 +122,7 @@ def find_gaps(
             if narrow:
                 wide = _would_see(cover, [v.with_fov(plan.fov_rad) for v in narrow])
                 explained.enter(missed & wide, Cause.NARROW_LENS, 0.9, vehicles.index(vehicle))
-        explained.enter(missed & _planned(cover, plan), Cause.NOT_FLOWN, 0.9)
+        explained.enter(missed & below_legs(cover.cells, plan, plan.legs), Cause.NOT_FLOWN, 0.9)
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
     return _polygons(cover, explained, vehicles, smallest_m2)
@@ -138,19 +140,23 @@ def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> NDArray[np.bool_]:
     return np.asarray(other.best != UNSEEN)
 
 
-def _planned(cover: CoverageGrid, plan: PlannedFlight) -> NDArray[np.bool_]:
-    """Cells below the legs' pictures."""
+def below_legs(cells: Cells, plan: PlannedFlight, legs: Array) -> NDArray[np.bool_]:
+    """Cells that a plan's pictures of some of its legs would show, bool (rows, columns).
+
+    Args:
+        cells: of the area. plan: with the size of its pictures. legs: float64 (n, 2, 2), ends of legs, grid metres.
+    """
     import shapely
     from rasterio.features import rasterize
 
-    if not len(plan.legs):
-        return np.zeros(cover.best.shape, bool)
-    step = plan.legs[:, 1] - plan.legs[:, 0]
+    if not len(legs):
+        return np.zeros(cells.wanted.shape, bool)
+    step = legs[:, 1] - legs[:, 0]
     along = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
     across = along[:, ::-1] * [-0.5 * plan.width_m, 0.5 * plan.width_m]
-    a, b = plan.legs[:, 0] - 0.5 * plan.height_m * along, plan.legs[:, 1] + 0.5 * plan.height_m * along
+    a, b = legs[:, 0] - 0.5 * plan.height_m * along, legs[:, 1] + 0.5 * plan.height_m * along
     bands = shapely.polygons(np.stack([a + across, b + across, b - across, a - across], axis=1))
-    grid = cover.cells.grid
+    grid = cells.grid
     return np.asarray(rasterize(list(bands), (grid.height, grid.width), transform=grid.affine()) > 0)
 
 

@@ -28,9 +28,10 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
     Args:
         best: uint8 (rows, columns), flaws of the best view so far, UNSEEN where there is none; changed.
         good: uint16 (rows, columns), number of views without a flaw; changed.
-        height: float32 (rows, columns), ground; (1, 1) for level ground.
+        height: float32, ground at the cells from `box[4]`, `box[5]` on; (1, 1) for level ground.
         level: the ground's height if it is level.
-        box: first row, row behind the last, first column, column behind the last.
+        box: first row, row behind the last, first column, column behind the last, of the cells; row and column of the
+            cell to which the first element of `height` belongs.
         edges: west, north of the grid, side of a cell, metres.
         camera: float64 (3, 3), View.to_camera. position: float64 (3,).
         lens: focal length in pixels, k1, k2, k3, principal point (2), columns, rows, largest undistorted radius.
@@ -45,7 +46,7 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
         north = edges[1] - (r + 0.5) * edges[2] - position[1]
         for c in range(box[2], box[3]):
             east = edges[0] + (c + 0.5) * edges[2] - position[0]
-            up = (level if flat else height[r, c]) - position[2]
+            up = (level if flat else height[r - box[4], c - box[5]]) - position[2]
             depth = camera[2, 0] * east + camera[2, 1] * north + camera[2, 2] * up
             if depth <= 0.0 or up >= 0.0:
                 continue

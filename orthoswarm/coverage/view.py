@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.camera import Camera, Lens, focal_px
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.model.placement import PlacedFrame, Terrain
 
 Array = NDArray[np.float64]
 
@@ -59,6 +59,7 @@ class View:
         focal_sigma: relative error of the focal length, one sigma.
         flaws: what is wrong with the whole picture.
         placed: True where the map or neighbours hold it, False for a recorded pose.
+        ground: the terrain with which the camera was solved, in the datum of its position; None for that of the grid.
     """
 
     image: str
@@ -71,6 +72,7 @@ class View:
     focal_sigma: float = 0.0
     flaws: Flaw = NO_FLAW
     placed: bool = True
+    ground: Terrain | None = None
 
     @classmethod
     def of_camera(
@@ -80,12 +82,14 @@ class View:
         return cls(image, vehicle, time_s, camera.position, camera.rotation.T.copy(), camera.lens, sigma_m, **more)
 
     @classmethod
-    def of_frame(cls, placed: PlacedFrame, flaws: Flaw = NO_FLAW, focal_sigma: float = 0.0) -> "View":
+    def of_frame(
+        cls, placed: PlacedFrame, flaws: Flaw = NO_FLAW, focal_sigma: float = 0.0, ground: Terrain | None = None
+    ) -> "View":
         """The view of a placed frame."""
         frame = placed.frame
         return cls.of_camera(
             placed.camera, frame.image, frame.vehicle, placed.sigma_m, frame.time_s, flaws=flaws,
-            focal_sigma=focal_sigma, placed=placed.stage != "realtime",
+            focal_sigma=focal_sigma, placed=placed.stage != "realtime", ground=ground,
         )  # fmt: skip
 
     @classmethod

@@ -33,7 +33,7 @@ def test_putting_in_parts_and_replacing_equals_putting_at_once() -> None:
 def test_cells_are_planned_until_the_flight_is_complete() -> None:
     cover = CoverageGrid(_cells())
     assert cover.put([]) is None
-    assert set(np.unique(cover.states(complete=False))) == {State.PLANNED}
+    assert set(np.unique(cover.states(due=False))) == {State.PLANNED}
     assert set(np.unique(cover.states())) == {State.MISSED}
 
 
@@ -76,3 +76,22 @@ def test_a_view_of_unknown_error_counts_nowhere_as_well_seen() -> None:
     cover = CoverageGrid(_cells())
     cover.put([View.of_frame(p) for p in FlownArea(sigma_m=float("nan")).placed()])
     assert cover.shares().seen == 0.0 and cover.shares().poor == 1.0
+
+
+def test_a_view_with_ground_of_its_own_sees_what_it_sees_on_a_grid_with_that_ground() -> None:
+    hills = np.random.default_rng(2).uniform(-20, 20, (20, 25)).astype(np.float32)
+    terrain = Terrain(CORNER[0], CORNER[1], 20.0, hills)
+    views = [View.of_frame(p) for p in FlownArea(vehicles=1).placed()]
+    common, own = CoverageGrid(_cells(), terrain), CoverageGrid(_cells())
+    common.put(views)
+    own.put(replace(v, ground=terrain) for v in views)
+    assert np.array_equal(common.best, own.best) and np.array_equal(common.good, own.good)
+
+
+def test_removed_pictures_are_seen_no_longer() -> None:
+    views = [View.of_frame(p) for p in FlownArea().placed()]
+    without, removed = CoverageGrid(_cells()), CoverageGrid(_cells())
+    without.put(views[:-9])
+    removed.put(views)
+    removed.put([], [(v.vehicle, v.image) for v in views[-9:]])
+    assert np.array_equal(without.good, removed.good) and len(removed.views) == len(views) - 9
