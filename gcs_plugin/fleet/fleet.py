@@ -24,6 +24,7 @@ from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, Address, Exchange, Verdict
+from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.upload import MissionUpload
 from orthoswarm.model.errors import OrthoSwarmError
@@ -167,9 +168,10 @@ class Fleet:
         """Put a mission into a vehicle and read it back.
 
         Raises:
-            OrthoSwarmError: the vehicle is not there, is flying its mission, or is busy with another upload or start.
+            OrthoSwarmError: the vehicle is not there, is no multirotor, is flying its mission, or is busy with another
+                upload or start.
         """
-        vehicle = self._free(system)
+        vehicle = self._flies_missions(system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {system} is flying its mission; pause it or let it return first")
         if mission.autopilot is not vehicle.autopilot:
@@ -219,6 +221,12 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} is busy with another request; wait until that has ended")
         return vehicle
 
+    def _flies_missions(self, system: int) -> Vehicle:
+        vehicle = self._free(system)
+        if why := why_no_missions(vehicle.kind):
+            raise OrthoSwarmError(f"vehicle {system} {why}")
+        return vehicle
+
     def _now(self, verb: Verb, system: int) -> Exchange:
         """A command that is given at this moment.
 
@@ -236,7 +244,7 @@ class Fleet:
             OrthoSwarmError: it cannot be given.
         """
         if verb == "start":
-            vehicle = self._free(system)
+            vehicle = self._flies_missions(system)
             if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
                 raise OrthoSwarmError(f"vehicle {system} is flying its mission already")
             check = vehicle.mission is None or not vehicle.detector.knows

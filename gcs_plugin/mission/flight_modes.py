@@ -56,6 +56,25 @@ _PLANES: Final = frozenset({1, *range(19, 26)})
 _ROVERS: Final = frozenset({int(dialect.MAV_TYPE_GROUND_ROVER), int(dialect.MAV_TYPE_SURFACE_BOAT)})
 
 
+_HOVERS: Final = frozenset({
+    int(dialect.MAV_TYPE_GENERIC), int(dialect.MAV_TYPE_QUADROTOR), int(dialect.MAV_TYPE_COAXIAL),
+    int(dialect.MAV_TYPE_HELICOPTER), int(dialect.MAV_TYPE_HEXAROTOR), int(dialect.MAV_TYPE_OCTOROTOR),
+    int(dialect.MAV_TYPE_TRICOPTER), int(dialect.MAV_TYPE_DODECAROTOR), int(dialect.MAV_TYPE_DECAROTOR),
+})  # fmt: skip
+
+
+def why_no_missions(vehicle_type: int) -> str:
+    """Why a vehicle of this type (MAV_TYPE) is given no missions, in words; empty for those that hover."""
+    if vehicle_type in _HOVERS:
+        return ""
+    entry = dialect.enums["MAV_TYPE"].get(vehicle_type)
+    name = str(entry.name).removeprefix("MAV_TYPE_").lower().replace("_", " ") if entry else f"type {vehicle_type}"
+    return (
+        f"is no multirotor ({name}); missions here turn on the spot and hover, so none is uploaded or started; "
+        "pause, rtl and land are sent to it"
+    )
+
+
 def modes_of(autopilot: Autopilot, vehicle_type: int) -> Modes:
     """The modes of a vehicle from its HEARTBEAT's type."""
     if autopilot is Autopilot.PX4:

@@ -2,12 +2,15 @@
 
 import heapq
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 from typing import Final, Generic, TypeVar
 
 Cargo = TypeVar("Cargo")
+
+_QUEUE_S: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +23,7 @@ class Faults:
         delay_s: least and greatest delay; packets overtake each other within it.
         silent: intervals (from, to) in seconds in which nothing gets through.
         seed: equal seeds give equal faults.
+        bytes_s: what it carries; packets wait for those before them, and those that would wait a second are lost.
     """
 
     loss: float = 0.0
@@ -27,11 +31,13 @@ class Faults:
     delay_s: tuple[float, float] = (0.0, 0.0)
     silent: tuple[tuple[float, float], ...] = ()
     seed: int = 0
+    bytes_s: float = math.inf
 
     @property
     def any(self) -> bool:
         """True if the link does anything at all."""
-        return bool(self.loss or self.duplicate or self.delay_s[1] or self.silent)
+        slow = self.bytes_s < math.inf
+        return bool(self.loss or self.duplicate or self.delay_s[1] or self.silent or slow)
 
 
 NO_FAULTS: Final = Faults()
@@ -50,6 +56,7 @@ class Channel(Generic[Cargo]):
     lost: int = 0
     sent: int = 0
     _random: Random = field(init=False)
+    _free_at: float = 0.0
     _queue: list[tuple[float, int, Cargo]] = field(default_factory=list)
     _order: "itertools.count[int]" = field(default_factory=itertools.count)
 
@@ -57,15 +64,20 @@ class Channel(Generic[Cargo]):
         """Seed the faults."""
         self._random = Random(self.faults.seed)
 
-    def put(self, cargo: Cargo, now: float) -> None:
-        """Send a packet."""
+    def put(self, cargo: Cargo, now: float, size: int = 0) -> None:
+        """Send a packet of so many bytes."""
         self.sent += 1
         faults, random = self.faults, self._random
         if random.random() < faults.loss or any(start <= now < end for start, end in faults.silent):
             self.lost += 1
             return
+        begins = max(now, self._free_at)
+        if begins - now > _QUEUE_S:
+            self.lost += 1
+            return
+        self._free_at = begins + size / faults.bytes_s
         for _ in range(2 if random.random() < faults.duplicate else 1):
-            arrival = now + random.uniform(*faults.delay_s)
+            arrival = self._free_at + random.uniform(*faults.delay_s)
             heapq.heappush(self._queue, (arrival, next(self._order), cargo))
 
     def take(self, now: float) -> list[Cargo]:

@@ -72,7 +72,7 @@ class SimLink(Link):
 
     def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Hand bytes to the radio."""
-        self.up.put((peer, data), self._clock.now)
+        self.up.put((peer, data), self._clock.now, len(data))
         return True
 
     def receive(self, source: Any, events: int, now: float) -> Iterator[tuple[Peer, bytes]]:
@@ -88,7 +88,8 @@ class SimLink(Link):
     def _say(self, peer: int, messages: Sequence[Message], now: float) -> None:
         packer = self._packers[peer]
         for message in messages:
-            self.down.put((peer, message.pack(packer)), now)
+            raw = message.pack(packer)
+            self.down.put((peer, raw), now, len(raw))
             packer.seq = (packer.seq + 1) & 0xFF
 
 

@@ -145,7 +145,7 @@ class SimSwarm:
         for key, events in self._selector.select(0.0):
             end = self._by_link[key.data]
             for peer, data in end.link.receive(key.fileobj, events, self._clock()):
-                end.up.put(data, now) if end.up.faults.any else self._take(end, peer, data, now)
+                end.up.put(data, now, len(data)) if end.up.faults.any else self._take(end, peer, data, now)
         for end in self._ends:
             for data in end.up.take(now):
                 self._take(end, None, data, now)
@@ -178,7 +178,7 @@ class SimSwarm:
             if muted:
                 continue
             if end.down.faults.any:
-                end.down.put(raw, now)
+                end.down.put(raw, now, len(raw))
             else:
                 self._put(end, raw)
 

@@ -42,7 +42,7 @@ class SimVehicle:
 
     Attributes:
         system: system id.
-        autopilot: dialect.
+        autopilot: dialect. kind: MAV_TYPE that it says it is; it flies as a multirotor all the same.
         home: latitude, longitude (degrees), altitude (metres).
         airframe: what it can do.
         boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
@@ -59,6 +59,7 @@ class SimVehicle:
     autopilot: Autopilot = Autopilot.ARDUPILOT
     home: tuple[float, float, float] = _HOME
     airframe: Airframe = field(default_factory=Airframe)
+    kind: int = int(dialect.MAV_TYPE_QUADROTOR)
     boot_utc_s: float = 1_700_000_000.0
     ready_s: float = 0.0
     seed: int = 0
@@ -88,7 +89,7 @@ class SimVehicle:
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
         self.store = MissionStore(self.autopilot, home, items)
         chart = Chart(*self.home)
-        modes = modes_of(self.autopilot, dialect.MAV_TYPE_QUADROTOR)
+        modes = modes_of(self.autopilot, self.kind)
         self.flight = Flight.make(self.autopilot, modes, self.store, chart, self.airframe, self.seed + self.system)
         self._boot(0.0)
 
@@ -342,7 +343,7 @@ class SimVehicle:
         )
         base = 81 | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0)
         status = dialect.MAV_STATE_STANDBY if flight.landed is Landed.ON_GROUND else dialect.MAV_STATE_ACTIVE
-        return dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_QUADROTOR, kind, base, flight.mode, status, 3)
+        return dialect.MAVLink_heartbeat_message(self.kind, kind, base, flight.mode, status, 3)
 
     def _position(self) -> Message | None:
         motion = self.flight.motion

@@ -55,14 +55,14 @@ class LossyLink(Link):
 
     def send(self, peer, data, expires=math.inf):
         now = time.monotonic()
-        self.up.put((peer, data), now)
+        self.up.put((peer, data), now, len(data))
         self.up.drain(now, lambda cargo: self.link.send(*cargo))
         return True
 
     def receive(self, source, events, now):
         if source is not self:
             for cargo in self.link.receive(source, events, now):
-                self.down.put(cargo, now)
+                self.down.put(cargo, now, len(cargo[1]))
         self.up.drain(now, lambda cargo: self.link.send(*cargo))
         yield from self.down.take(now)
 

@@ -20,7 +20,7 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -365,3 +365,26 @@ def test_streams_that_starve_cost_no_heartbeat_and_no_completion(autopilot):
     assert (len(beats) - had[1]) / seconds > 0.9
     assert not any(event.kind == "lost" for event in world.events)
     assert (len(asked) - answers) / seconds < 0.5  # they are asked for again, ever more seldom
+
+
+@BOTH
+def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(autopilot):
+    faults = [Faults(loss=0.05, delay_s=(0.02, 0.08), bytes_s=5760.0, seed=seed) for seed in (1, 2)]
+    world = make_world([SimVehicle(1, autopilot)], *faults)
+    world.meet()
+    positions = listen(world, "GLOBAL_POSITION_INT")
+    assert world.finish(world.fleet.upload(1, mission(autopilot, MissionItem.do(RTL))))[0].ok
+    assert world.finish(world.fleet.start(1))[0].ok
+    began, had = world.clock.now, len(positions)
+    assert completed(world)
+    assert (len(positions) - had) / (world.clock.now - began) == pytest.approx(9.5, abs=1.0)
+    assert world.kinds(1) == ["started", "complete"]
+    assert not any(event.kind == "lost" for event in world.events)
+
+
+def test_a_radio_carries_no_more_than_its_rate():
+    radio = Channel(Faults(bytes_s=1000.0))
+    for _ in range(30):
+        radio.put("packet", 0.0, 100)  # three seconds' worth at once: what would wait longer than one is lost
+    assert len(radio.take(0.55)) == 5 and radio.lost == 19
+    assert len(radio.take(2.0)) == 6

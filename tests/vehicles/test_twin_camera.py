@@ -185,8 +185,15 @@ def fly(served, name, pace):
     upload = {"plan": plan.json()["id"], "mission": plan.json()["vehicles"][0]["id"]}
     answer = served.command(f"/api/missions/{name}/upload", upload)
     assert answer.status_code == 200, answer.text
-    answer = served.command(f"/api/missions/{name}/start")
-    assert answer.status_code == 200, answer.text
+    answers = []
+
+    def started(_):
+        """Its own checks may take a while to pass, for example after the upload where it stood in AUTO without one."""
+        time.sleep(1.0)
+        answers.append(served.command(f"/api/missions/{name}/start").json())
+        return answers[-1]["outcome"] == "done"
+
+    assert served.until("/healthz", started, limit_s=120.0), answers[-1]
 
     def refined(rows):
         pace(next(r for r in served.get("/api/vehicles").json() if r["id"] == name)["pictures"]["taken"])
