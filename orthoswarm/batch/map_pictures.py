@@ -14,13 +14,14 @@ from orthoswarm.export.cog import write_cog
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
-from orthoswarm.mosaic.extent import drawn_window, ground_level, map_offset, placed_bounds
+from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
 from orthoswarm.raster.height_model import read_dem
+from orthoswarm.refine.registration.map_offset import measure_map_offset
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
@@ -47,7 +48,9 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
         state.leave_out(reasons, state.recorded.placed)
         state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
     on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
-    state.warnings += map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
+    state.map_offset = measure_map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
+    if state.map_offset is not None:
+        state.warnings += state.map_offset.warning()
     with_map = state.basemap is not None and run.options.until == "fine"
     if with_map and not on_map:
         state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")

@@ -67,6 +67,7 @@ def _report(
         "area_ha": state.drawn[0] / 1e4,
         "covered_share": state.drawn[1],
         "basemap": str(run.options.basemap) if state.basemap else None,
+        "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
         "until": run.options.until,
         "config": {stage: dict(values) for stage, values in run.options.config.items()},
         "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],

@@ -19,6 +19,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.recorded_pose import Recorded
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel
+from orthoswarm.refine.registration.map_offset import MapOffset
 
 Bytes = NDArray[np.uint8]
 Progress = Callable[[str, int, int], None]
@@ -83,6 +84,7 @@ class RunState:
         still: frames of vehicles that stood at one spot. odd: frames that look elsewhere than their vehicle's others.
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
         undrawn: image -> why the real-time picture does not show it.
+        map_offset: the map against the receivers, None where nothing lies on a map.
         fault: what went wrong inside the refiner, None if nothing did.
     """
 
@@ -101,6 +103,7 @@ class RunState:
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     undrawn: Mapping[str, str] = field(default_factory=dict)
+    map_offset: MapOffset | None = None
     fault: str | None = None
 
     def leave_out(self, reasons: Mapping[str, str], placed: Iterable[PlacedFrame]) -> None:

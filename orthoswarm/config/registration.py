@@ -20,3 +20,18 @@ class RegistrationConfig:
     one found so many times only (expected number of false matches); measured by benchmarks/wrong_maps.py."""
     leg_by_chance: float = 0.01
     """A leg of such a flight is matched if its ties agree with its place by chance with this probability only."""
+
+    # The map against the receivers
+    receiver_bias_sigma_m: float = 1.5
+    """Bias of a receiver without corrections over a flight, an axis: multipath, satellites of its own (chosen; good
+    receivers under open sky differ by 1 to 2 m)."""
+    receiver_common_sigma_m: float = 1.5
+    """The part of the error that all receivers at a place and time share, an axis: ionosphere and orbits. The GPS
+    standard (SPS PS 2020) commits to 8 m (95 %) horizontally on average; 3 to 4 m are usual, most of it shared
+    (chosen)."""
+    corrected_sigma_m: float = 0.5
+    """A position that states at most this sigma was corrected (RTK, PPK)."""
+    corrected_floor_m: float = 0.05
+    """Corrected positions are not trusted better than this: antenna offset, base station (chosen)."""
+    offset_probability: float = 0.01
+    """The map is doubted if the receivers would be so far from a right map with this probability only."""

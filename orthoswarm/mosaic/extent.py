@@ -11,8 +11,6 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
 
-MISLAID_M = 15.0
-"""Receivers without correction are good to some metres; a map this far off is another matter."""
 RAISED_M = 2.0
 """Corners lie no higher than this over the ground around them (rubble, bushes, cars)."""
 
@@ -73,19 +71,3 @@ def partial_cover(basemap: MapWindow, placed: Sequence[PlacedFrame]) -> list[str
     if inside.mean() > 0.98:
         return []
     return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]
-
-
-def map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> list[str]:
-    """A warning where the map lies farther from the recorded positions than receivers err: one of them is mislaid."""
-    before = {p.frame.image: p.camera.nadir for p in recorded}
-    moved = [p.camera.nadir - before[p.frame.image] for p in refined if p.stage == "fine" and p.frame.image in before]
-    if not moved:
-        return []
-    east, north = (float(v) for v in np.median(np.array(moved), axis=0))
-    away = float(np.hypot(east, north))
-    if away < MISLAID_M:
-        return []
-    return [
-        f"the basemap lies {away:.0f} m ({east:+.0f} east, {north:+.0f} north) from where the receivers say; the "
-        "orthoimage follows the basemap, so check that it is well placed"
-    ]

@@ -1,6 +1,7 @@
 """report.html: the state of the map in words, its pictures, and the numbers behind them."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -261,12 +262,18 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
-    text = f"Lies on the pre-disaster map; expected error {usual:.2f} m (one sigma)"
+    text = f"Lies on the pre-disaster map; expected error against it {usual:.2f} m (one sigma)"
     if shifts is not None and len(shifts.at) >= 10:
         median = float(np.median(shifts.size_m))
         text += f"; compared with it block by block {median:.2f} m (median), roofs that lean apart included"
         if median > 3 * max(usual, 0.3):
             return {"kind": "doubt", "text": text + ". The two disagree: check the pictures below before use."}
+    offset = report.get("map_offset_m")
+    if offset is not None:
+        away, sigma = math.hypot(offset["east"], offset["north"]), offset["sigma"]
+        text += f". The map itself lies {away:.1f} m from where the receivers say, who know it to {sigma:.1f} m"
+        if offset["doubted"]:
+            return {"kind": "doubt", "text": text + ": one of the two is wrong, see below."}
     return {"kind": "good" if fine >= 0.9 * len(placed) else "rough", "text": text + "."}
 
 

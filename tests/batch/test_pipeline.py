@@ -5,7 +5,6 @@ import hashlib
 import json
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.export import cog
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.mosaic.extent import from_takeoff, ground_level, map_offset
+from orthoswarm.mosaic.extent import from_takeoff, ground_level
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.report.page import write_page
@@ -354,19 +353,6 @@ def test_ground_is_stated_at_the_takeoff_level_and_no_picture_moves(flight):
         np.testing.assert_allclose(after.camera.homography(level), before.camera.homography(-0.43), rtol=1e-12)
     assert from_takeoff(placed, -12.0) == (placed, -12.0), "a valley is no lift"
     assert from_takeoff([], 0.0) == ([], 0.0)
-
-
-def test_a_map_far_from_where_the_receivers_say_is_told(flight):
-    scene, _, photos = flight
-    recorded = recorded_cameras(load([photos / "photos"]).frames, scene.grid, None).placed
-
-    def moved(east, north, stage="fine"):
-        by = np.array([east, north, 0.0])
-        return [replace(p, camera=replace(p.camera, position=p.camera.position + by), stage=stage) for p in recorded]
-
-    (told,) = map_offset(recorded, moved(18.0, -14.0))
-    assert "23 m (+18 east, -14 north)" in told
-    assert map_offset(recorded, moved(4.0, 3.0)) == map_offset(recorded, moved(40.0, 0.0, "coarse")) == []
 
 
 def test_the_command_prints_one_json_document(flight, tmp_path, capsys):

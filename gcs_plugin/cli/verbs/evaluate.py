@@ -1,4 +1,4 @@
-"""`orthoswarm evaluate`: an orthoimage against a reference, placed frames against true cameras."""
+"""`orthoswarm evaluate`: an orthoimage against a reference or surveyed points, placed frames against true cameras."""
 
 import argparse
 import json
@@ -15,11 +15,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "completeness is the covered share of the ground within the convex hull of what is covered: holes count, what\n"
         "is missing at the edge does not; with --truth, seen_share is that of all ground that the cameras saw.\n\n"
         "example:\n  orthoswarm evaluate out/orthoimage.tif --reference twin/truth/reference.tif \\\n"
-        "      --poses out/frames.jsonl --truth twin/truth/frames.csv --json"
+        "      --poses out/frames.jsonl --truth twin/truth/frames.csv --json\n"
+        "  orthoswarm evaluate out --checkpoints gcp_list.txt"
     )
     add = parser.add_argument
-    add("ortho", type=Path, metavar="ORTHO.tif", help="the orthoimage (alpha or nodata says where it has ground)")
-    add("--reference", type=Path, required=True, metavar="REF.tif", help="what it is measured against")
+    add(
+        "ortho", type=Path, metavar="ORTHO.tif|OUT",
+        help="the orthoimage (alpha or nodata says where it has ground), or the output folder that holds it",
+    )  # fmt: skip
+    add("--reference", type=Path, metavar="REF.tif", help="a picture of the true ground to measure it against")
+    add(
+        "--checkpoints", type=Path, metavar="FILE",
+        help="surveyed points to measure it at: ODM's gcp_list.txt, or a CSV with name, lat_deg, lon_deg (or east_m, "
+        "north_m, epsg), sigma_m, and image, column, row (or map_lat_deg, map_lon_deg)",
+    )  # fmt: skip
+    add(
+        "--pixel-scale", type=float, default=1.0, metavar="S",
+        help="for checkpoints measured in larger copies of the photos: pixels of the mapped photos to one of those",
+    )  # fmt: skip
     add(
         "--mask",
         metavar="MASK.tif",
@@ -35,27 +48,46 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    from orthoswarm.evaluation.displacement import FieldSettings
-    from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask, seen_share
-    from orthoswarm.evaluation.true_cameras import evaluate_poses, read_truth
     from orthoswarm.model.errors import InputError
 
     if (args.poses is None) != (args.truth is None):
         raise InputError("--poses and --truth belong together; give both or none")
-    mask = find_mask(args.reference, args.mask)
-    result = evaluate_ortho(args.ortho, args.reference, mask, FieldSettings(search_m=args.search), args.gsd)
-    figures: dict[str, Any] = dict(result.figures())
-    figures["mask"] = None if mask is None else mask.name
-    if args.poses is not None:
-        figures["poses"] = evaluate_poses(args.poses, args.truth).figures()
-        figures["seen_share"] = seen_share(args.ortho, [camera for _, _, camera in read_truth(args.truth).values()])
-    if args.field is not None:
-        _write_field(args.field, result)
+    if args.reference is None and args.checkpoints is None:
+        raise InputError("say what to measure against: --reference REF.tif or --checkpoints FILE")
+    if args.reference is None and (args.poses is not None or args.field is not None):
+        raise InputError("--poses and --field need --reference")
+    if not args.pixel_scale > 0.0:
+        raise InputError("--pixel-scale must be greater than 0")
+    figures: dict[str, Any] = {}
+    if args.reference is not None:
+        figures |= _against_reference(args)
+    if args.checkpoints is not None:
+        from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
+
+        figures |= evaluate_checkpoints(args.ortho, args.checkpoints, args.pixel_scale).figures()
     if args.json:
         print(json.dumps(figures))
     else:
         _print(figures)
     return 0
+
+
+def _against_reference(args: argparse.Namespace) -> dict[str, Any]:
+    from orthoswarm.evaluation.displacement import FieldSettings
+    from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask, seen_share
+    from orthoswarm.evaluation.true_cameras import evaluate_poses, read_truth
+
+    ortho = args.ortho / "orthoimage.tif" if args.ortho.is_dir() else args.ortho
+    mask = find_mask(args.reference, args.mask)
+    result = evaluate_ortho(ortho, args.reference, mask, FieldSettings(search_m=args.search), args.gsd)
+    figures: dict[str, Any] = dict(result.figures())
+    figures["mask"] = None if mask is None else mask.name
+    if args.poses is not None:
+        figures["poses"] = evaluate_poses(args.poses, args.truth).figures()
+        figures["seen_share"] = seen_share(ortho, [camera for _, _, camera in read_truth(args.truth).values()])
+    if args.field is not None:
+        _write_field(args.field, result)
+    return figures
 
 
 def _write_field(path: Path, result: "Accuracy") -> None:
@@ -82,5 +114,5 @@ def _text(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{k} {_text(v)}" for k, v in value.items())
     if isinstance(value, list):
-        return ", ".join(_text(v) for v in value)
+        return "; ".join(_text(v) for v in value) or "-"
     return "-" if value is None else str(value)

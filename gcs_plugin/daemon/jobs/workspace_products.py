@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.raster.basemap import Basemap
+
+if TYPE_CHECKING:
+    from orthoswarm.mosaic.recorded_pose import Recorded
 
 FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm")
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
@@ -56,6 +59,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
         OrthoSwarmError: the disk is full.
     """
     from orthoswarm.export.product_files import write_frames, write_json
+    from orthoswarm.refine.registration.map_offset import measure_map_offset
     from orthoswarm.report.page import write_page
 
     out = task.workspace
@@ -64,10 +68,14 @@ def write_products(task: ExportTask) -> dict[str, str]:
         raise InputError("there is no map yet; wait for pictures")
     refined = [read_solution(path).solution for path in task.solutions]
     solutions = [*(read_solution(path).solution for path in task.coarse), *refined]
-    placed, rejected = _placements(task, solutions)
+    recorded = _recorded(task)
+    placed, rejected = _placements(task, recorded, solutions)
+    offset = measure_map_offset(recorded.placed, placed)
     placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
     report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
+    report["map_offset_m"] = None if offset is None else offset.document()
+    report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
     write_page(out, report, placed, rejected, basemap)
     write_json(out / "report.json", report)
@@ -137,14 +145,19 @@ class _WithOverviews:
         return out
 
 
-def _placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], list[Rejection]]:
-    """Each frame as it was placed last."""
+def _recorded(task: ExportTask) -> "Recorded":
+    """All frames as recorded."""
     from orthoswarm.mosaic.recorded_pose import recorded_cameras
 
-    best: dict[tuple[str, str], PlacedFrame] = {}
-    grid = LocalGrid(task.epsg)
     ordered = sorted(task.frames, key=lambda f: (f.vehicle, f.time_s or 0.0))
-    recorded = recorded_cameras(ordered, grid, task.fov_rad)
+    return recorded_cameras(ordered, LocalGrid(task.epsg), task.fov_rad)
+
+
+def _placements(
+    task: ExportTask, recorded: "Recorded", solutions: list[Solution]
+) -> tuple[list[PlacedFrame], list[Rejection]]:
+    """Each frame as it was placed last."""
+    best: dict[tuple[str, str], PlacedFrame] = {}
     for p in [*recorded.placed, *(p for s in solutions for p in s.placed)]:
         best[p.frame.vehicle, p.frame.image] = p
     reasons = {(r.vehicle, r.image): r.reason for r in recorded.rejected} | task.reasons

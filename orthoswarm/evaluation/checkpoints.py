@@ -1,0 +1,366 @@
+"""Accuracy at surveyed points, stated as ASPRS's Positional Accuracy Standards (edition 2, 2023) ask for.
+
+A point is measured in the photos that show it (its rays are intersected) or on the orthoimage; the differences to the
+survey are summed up as root mean squares, to which the survey's own error belongs. Two files are read:
+
+- ODM's gcp_list.txt: a line with the coordinate system, then `east north height column row image [name]`.
+- CSV with a header: `name`; `lat_deg`,`lon_deg`, or `east_m`,`north_m` with `epsg`; `sigma_m` (of the survey, an axis);
+  then either `image`,`column`,`row`, a line a photo, or `map_lat_deg`,`map_lon_deg` or `map_east_m`,`map_north_m`, the
+  place at which the orthoimage shows the point.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.camera import Lens, focal_px
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+
+Array = NDArray[np.float64]
+
+STANDARD_COUNT = 30
+"""Checkpoints that a statement by the standard needs at least."""
+_RELIEF_M = 10.0
+"""How far ground may lie off the mapped area's level, where rays do not say: holds a point that one photo shows."""
+_GRID = "+proj=longlat +datum=WGS84 +no_defs"
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A point seen in a photo: column and row, pixel centres at integers, in pixels of the photo as it was mapped."""
+
+    image: str
+    column: float
+    row: float
+
+
+@dataclass(slots=True)
+class Checkpoint:
+    """A surveyed point.
+
+    Attributes:
+        name: of the point. surveyed: float64 (2,), longitude and latitude (WGS 84).
+        sigma_m: of the survey, an axis; 0 where it is not stated.
+        marks: where photos show it. on_map: longitude and latitude at which the orthoimage shows it.
+    """
+
+    name: str
+    surveyed: Array
+    sigma_m: float = 0.0
+    marks: list[Mark] = field(default_factory=list)
+    on_map: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckpointAccuracy:
+    """What the checkpoints say.
+
+    Attributes:
+        names: of the points that could be measured.
+        error: float64 (n, 2), map minus survey, east and north, metres.
+        survey_m: root mean square of the survey's own horizontal error, metres.
+        unused: names of the points that no mapped photo shows.
+        how: `photos`, `orthoimage` or both.
+    """
+
+    names: list[str]
+    error: Array
+    survey_m: float
+    unused: list[str]
+    how: str
+
+    @property
+    def rmse(self) -> tuple[float, float]:
+        """Root mean square error east and north, metres."""
+        east, north = np.sqrt((self.error**2).mean(axis=0)).tolist()
+        return east, north
+
+    @property
+    def rmse_h_m(self) -> float:
+        """Horizontal root mean square error of the fit to the points, metres."""
+        return math.hypot(*self.rmse)
+
+    def statement(self) -> str:
+        """The standard's sentence, or why it cannot be said."""
+        total = math.hypot(self.rmse_h_m, self.survey_m)
+        tested = f"RMSE_H = {total:.2f} m at {len(self.names)} checkpoints, survey's error included"
+        if len(self.names) < STANDARD_COUNT:
+            return f"{tested}; a statement by the ASPRS standard (edition 2, 2023) needs at least {STANDARD_COUNT}"
+        return f"tested by the ASPRS Positional Accuracy Standards, edition 2 (2023): {tested}"
+
+    def figures(self) -> dict[str, Any]:
+        """As JSON values."""
+        east, north = self.rmse
+        mean = self.error.mean(axis=0)
+        away = np.hypot(*self.error.T)
+        return {
+            "checkpoints": len(self.names),
+            "rmse_e_m": east,
+            "rmse_n_m": north,
+            "rmse_h_m": self.rmse_h_m,
+            "survey_rmse_h_m": self.survey_m,
+            "mean_e_m": float(mean[0]),
+            "mean_n_m": float(mean[1]),
+            "max_h_m": float(away.max()),
+            "measured_in": self.how,
+            "statement": self.statement(),
+            "unused": self.unused,
+            "points": [
+                {"name": n, "east_m": float(e), "north_m": float(v)} for n, (e, v) in zip(self.names, self.error)
+            ],
+        }
+
+
+def evaluate_checkpoints(out: Path, table: Path, pixel_scale: float = 1.0) -> CheckpointAccuracy:
+    """Errors of a product at surveyed points.
+
+    Args:
+        out: output folder of `mosaic` (or the workspace of a daemon), or a file in it.
+        table: the points, see the module.
+        pixel_scale: pixels of the mapped photos to one of the photos in which the points were measured.
+
+    Raises:
+        InputError: if the table cannot be read, or no point of it can be measured.
+    """
+    folder = out if out.is_dir() else out.parent
+    points = read_checkpoints(table, pixel_scale)
+    views = _Views.read(folder) if any(p.marks for p in points) else None
+    grid = LocalGrid(views.epsg if views else _epsg(points))
+    names, errors, sigmas, unused, how = [], [], [], [], set()
+    for point in points:
+        rays = views.rays(point.marks) if views else []
+        if rays:
+            assert views is not None
+            found = _intersection(rays, views.ground_z_m)
+            how.add("photos")
+        elif point.on_map is not None:
+            found = _placed(grid, point.on_map)
+            how.add("orthoimage")
+        else:
+            unused.append(point.name)
+            continue
+        names.append(point.name)
+        errors.append(found - _placed(grid, point.surveyed))
+        sigmas.append(point.sigma_m)
+    if not names:
+        raise InputError(
+            f"none of the {len(points)} points of {table.name} is seen in a mapped photo; check the names of the images"
+        )
+    survey = float(np.sqrt(2.0 * np.mean(np.square(sigmas))))
+    return CheckpointAccuracy(names, np.array(errors), survey, unused, " and ".join(sorted(how)))
+
+
+def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
+    """The points of a table, see the module.
+
+    Raises:
+        InputError: if it cannot be read, with the line.
+    """
+    try:
+        lines = table.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the checkpoints {table} cannot be read ({error})") from None
+    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise InputError(f"{table.name} holds no points")
+    scaled = _Scale(pixel_scale)
+    points = _csv(lines, table.name, scaled) if "," in lines[0] else _gcp_list(lines, table.name, scaled)
+    if not points:
+        raise InputError(f"{table.name} holds no points below its first line")
+    return points
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """From pixels of the photos in which points were measured to those of the mapped photos."""
+
+    factor: float
+
+    def mark(self, image: str, column: float, row: float) -> Mark:
+        return Mark(image, (column + 0.5) * self.factor - 0.5, (row + 0.5) * self.factor - 0.5)
+
+
+def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
+    """ODM's gcp_list.txt; lines with the same coordinates or name are one point."""
+    to_geographic = _transformer(lines[0].strip(), name)
+    points: dict[str, Checkpoint] = {}
+    for number, line in enumerate(lines[1:], 2):
+        words = line.split()
+        try:
+            east, north, _, column, row = (_number(word) for word in words[:5])
+            image = words[5]
+        except (ValueError, IndexError):
+            raise InputError(f"{name}, line {number}: expected 'east north height column row image [name]'") from None
+        key = words[6] if len(words) > 6 else f"{words[0]} {words[1]}"
+        if key not in points:
+            points[key] = Checkpoint(key, np.array(to_geographic.transform(east, north)))
+        points[key].marks.append(scale.mark(image, column, row))
+    return list(points.values())
+
+
+def _csv(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
+    points: dict[str, Checkpoint] = {}
+    for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True), 2):
+        cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
+        try:
+            point = _csv_row(cells, name, scale)
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"{name}, line {number}: {_reason(error)}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
+                "epsg), sigma_m, and image, column, row (or map_lat_deg, map_lon_deg)"
+            ) from None
+        known = points.setdefault(point.name, point)
+        if known is not point:
+            known.marks += point.marks
+            known.on_map = point.on_map if known.on_map is None else known.on_map
+    return list(points.values())
+
+
+def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:
+    surveyed = _position(cells, "", name)
+    if surveyed is None:
+        raise KeyError("it has no coordinates")
+    point = Checkpoint(
+        cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}", surveyed, _number(cells.get("sigma_m") or "0"),
+        on_map=_position(cells, "map_", name),
+    )  # fmt: skip
+    if cells.get("image"):
+        point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
+    return point
+
+
+def _position(cells: Mapping[str, str], prefix: str, name: str) -> Array | None:
+    """Longitude and latitude by a row's columns with a prefix; None where they are not there."""
+    if cells.get(f"{prefix}lat_deg") and cells.get(f"{prefix}lon_deg"):
+        return np.array([_number(cells[f"{prefix}lon_deg"]), _number(cells[f"{prefix}lat_deg"])])
+    if cells.get(f"{prefix}east_m") and cells.get(f"{prefix}north_m"):
+        system = _transformer(f"EPSG:{int(cells['epsg'])}", name)
+        return np.array(system.transform(_number(cells[f"{prefix}east_m"]), _number(cells[f"{prefix}north_m"])))
+    return None
+
+
+def _reason(error: Exception) -> str:
+    return f"column {error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"'{text}' is no number")
+    return value
+
+
+def _transformer(system: str, name: str) -> Any:
+    """To longitude and latitude, from a coordinate system as ODM and users write it."""
+    import pyproj
+
+    words = system.upper().split()
+    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdigit():
+        zone, south = int(words[2][:-1]), words[2][-1] == "S"
+        system = f"EPSG:{(32700 if south else 32600) + zone}"
+    try:
+        return pyproj.Transformer.from_crs(system, _GRID, always_xy=True)
+    except pyproj.exceptions.CRSError:
+        raise InputError(
+            f"{name}: '{system[:60]}' is no coordinate system; write EPSG:32617 or a PROJ string"
+        ) from None
+
+
+def _placed(grid: LocalGrid, lon_lat: Array) -> Array:
+    return grid.to_grid(lon_lat[1], lon_lat[0])
+
+
+def _epsg(points: Iterable[Checkpoint]) -> int:
+    from orthoswarm.model.geo import area_epsg
+
+    at = [p.surveyed for p in points]
+    return area_epsg([float(p[1]) for p in at], [float(p[0]) for p in at])
+
+
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """The mapped photos of a product, by name.
+
+    Attributes:
+        rows: lines of frames.jsonl by image. epsg: their grid. ground_z_m: level of their homographies.
+    """
+
+    rows: dict[str, dict[str, Any]]
+    epsg: int
+    ground_z_m: float
+
+    @classmethod
+    def read(cls, folder: Path) -> "_Views":
+        """Raises InputError if the folder has no placed frames."""
+        try:
+            text = (folder / "frames.jsonl").read_text("utf-8")
+            report = json.loads((folder / "report.json").read_text("utf-8"))
+            rows = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{folder} has no frames.jsonl and report.json that can be read ({error}); give the output folder of "
+                "`orthoswarm mosaic`"
+            ) from None
+        placed = {r["image"].replace("\\", "/"): r for r in rows if r.get("homography") and r.get("camera")}
+        if not placed:
+            raise InputError(f"{folder} has no placed photos")
+        return cls(placed, int(next(iter(placed.values()))["epsg"]), float(report.get("ground_z_m") or 0.0))
+
+    def rays(self, marks: Sequence[Mark]) -> list[tuple[Array, Array]]:
+        """Camera position (3,) and unit direction (3,) of each mark whose photo was mapped."""
+        found = ((self._row(mark.image), mark) for mark in marks)
+        return [self._ray(row, mark) for row, mark in found if row is not None]
+
+    def _row(self, image: str) -> dict[str, Any] | None:
+        """The photo of a name; a name without folders may stand for one photo only."""
+        name = image.replace("\\", "/")
+        if name in self.rows:
+            return self.rows[name]
+        tail = "/" + name.rsplit("/", 1)[-1].lower()
+        hits = [row for known, row in self.rows.items() if ("/" + known).lower().endswith(tail)]
+        if len(hits) > 1:
+            raise InputError(f"{len(hits)} photos are called {image}; write them with their folders")
+        return hits[0] if hits else None
+
+    def _ray(self, row: Mapping[str, Any], mark: Mark) -> tuple[Array, Array]:
+        width, height = int(row["width"]), int(row["height"])
+        if not (-1.0 <= mark.column <= width and -1.0 <= mark.row <= height):
+            raise InputError(
+                f"{mark.image} has {width} x {height} pixels, a point is marked at {mark.column:.0f}, {mark.row:.0f}; "
+                "if the points were measured in larger copies, say how much smaller these are (--pixel-scale 0.2)"
+            )
+        focal = focal_px(math.radians(float(row["fov_deg"])), width)
+        lens = Lens(width, height, focal, float(row.get("k1", 0.0)), float(row.get("k2", 0.0)))
+        centre = np.array(lens.principal_point)
+        pixel = lens.undistort((np.array([mark.column, mark.row]) - centre) / focal) * focal + centre
+        h = np.array(row["homography"]) @ np.array([*pixel, 1.0])
+        ground = np.array([*(h[:2] / h[2]), self.ground_z_m])
+        camera = row["camera"]
+        place = LocalGrid(self.epsg).to_grid(camera["lat_deg"], camera["lon_deg"])
+        position = np.array([*place, float(camera["height_m"])])
+        away = ground - position
+        return position, away / np.linalg.norm(away)
+
+
+def _intersection(rays: Sequence[tuple[Array, Array]], ground_z_m: float) -> Array:
+    """East and north (2,) of the point nearest to all rays; its height is held by the ground where they do not hold it.
+
+    Every ray counts by its distance over the camera's range, so that a metre at 50 m height and two at 100 m are alike.
+    """
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for position, direction in rays:
+        distance = max(position[2] - ground_z_m, 1.0)
+        across = (np.eye(3) - np.outer(direction, direction)) * (1000.0 / distance) ** 2  # a pixel: about 1/1000
+        normal += across
+        right += across @ position
+    normal[2, 2] += 1.0 / _RELIEF_M**2
+    right[2] += ground_z_m / _RELIEF_M**2
+    return np.asarray(np.linalg.solve(normal, right)[:2])

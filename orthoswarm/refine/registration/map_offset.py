@@ -1,0 +1,130 @@
+"""How far the map lies from where the receivers say, and whether their errors explain it.
+
+The orthoimage follows the map, and against the map it is exact to centimetres. Whether the map itself lies where it
+should only the receivers can tell. Each vehicle's mean difference is one observation of the offset: its sigma is the
+receiver's own bias (multipath, the satellites it tracks) and what it wanders by during the flight. What all receivers
+of an hour and a place have in common (ionosphere) no number of vehicles takes away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.placement import PlacedFrame
+
+Array = NDArray[np.float64]
+
+_OUTLIER_SPREADS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class MapOffset:
+    """The map against the receivers.
+
+    Attributes:
+        east, north: metres from where the receivers say to where the map shows the same ground.
+        sigma: one sigma of both, metres.
+        vehicles: how many were compared.
+        corrected: True where the receivers had corrections (RTK, PPK), by the accuracy that they state.
+    """
+
+    east: float
+    north: float
+    sigma: float
+    vehicles: int
+    corrected: bool
+
+    @property
+    def distance(self) -> float:
+        """Metres."""
+        return float(np.hypot(self.east, self.north))
+
+    @property
+    def by_chance(self) -> float:
+        """Probability of at least this distance if the map lies where it should (both axes Gaussian)."""
+        return float(np.exp(-0.5 * (self.distance / self.sigma) ** 2))
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the receivers' errors do not explain it."""
+        return self.by_chance < active().registration.offset_probability
+
+    def document(self) -> dict[str, float | int | bool]:
+        """As JSON values: `east`, `north`, `sigma` in metres, `vehicles`, `doubted`."""
+        return {
+            "east": self.east, "north": self.north, "sigma": self.sigma, "vehicles": self.vehicles,
+            "doubted": self.doubted,
+        }  # fmt: skip
+
+    def warning(self) -> list[str]:
+        """One sentence where the receivers' errors do not explain the offset, else none."""
+        if not self.doubted:
+            return []
+        probably = (
+            "the map is probably misplaced, for the receivers had corrections"
+            if self.corrected
+            else "the map or all receivers are wrong, and that these vehicles agree speaks against the map"
+            if self.vehicles > 2
+            else "the map or the receivers are wrong"
+        )
+        return [
+            f"the basemap lies {self.distance:.1f} m ({self.east:+.1f} east, {self.north:+.1f} north) from where the "
+            f"receivers say, which are good to {self.sigma:.1f} m (one sigma, {_count(self.vehicles)}): {probably}; "
+            "the orthoimage follows the basemap, so compare it with a surveyed point (evaluate --checkpoints)"
+        ]
+
+
+def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
+    """The offset of the map against the receivers, by the frames that were refined on the map; None without any.
+
+    Args:
+        recorded: the cameras as recorded. refined: the same frames after the refinement, in the same grid.
+    """
+    config = active().registration
+    before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded}
+    moved: dict[str, list[Array]] = {}
+    stated: dict[str, list[float]] = {}
+    for p in refined:
+        was = before.get((p.frame.vehicle, p.frame.image))
+        if p.stage == "fine" and not p.weak and was is not None:
+            moved.setdefault(p.frame.vehicle, []).append(p.camera.nadir - was)
+            stated.setdefault(p.frame.vehicle, []).append(p.frame.fix.position_sigma_m or np.inf)
+    if not moved:
+        return None
+    accuracy = {vehicle: float(np.median(values)) for vehicle, values in stated.items()}
+    corrected = {v for v, s in accuracy.items() if s <= config.corrected_sigma_m}
+    used = sorted(corrected or moved)
+    means, sigmas = [], []
+    for vehicle in used:
+        mean, spread = _mean(np.array(moved[vehicle]))
+        means.append(mean)
+        own = max(accuracy[vehicle], config.corrected_floor_m) if corrected else config.receiver_bias_sigma_m
+        sigmas.append(np.hypot(own, spread))
+    offset, sigma = _together(np.array(means), np.array(sigmas))
+    common = 0.0 if corrected else config.receiver_common_sigma_m
+    return MapOffset(float(offset[0]), float(offset[1]), float(np.hypot(sigma, common)), len(used), bool(corrected))
+
+
+def _mean(moved: Array) -> tuple[Array, float]:
+    """Mean of a vehicle's differences (n, 2) without gross errors, and their spread, an axis."""
+    away = np.hypot(*(moved - np.median(moved, axis=0)).T)
+    kept = moved[away <= _OUTLIER_SPREADS * max(float(np.median(away)), 1e-6)]
+    return np.asarray(kept.mean(axis=0)), float(np.sqrt(kept.var(axis=0).mean()))
+
+
+def _together(means: Array, sigmas: Array) -> tuple[Array, float]:
+    """Weighted mean (2,) and its sigma, larger where the vehicles differ by more than their sigmas (Birge ratio)."""
+    weight = 1.0 / sigmas**2
+    offset = (weight[:, None] * means).sum(axis=0) / weight.sum()
+    variance = 1.0 / weight.sum()
+    if len(means) > 1:
+        chi2 = float((weight[:, None] * (means - offset) ** 2).sum()) / (2 * (len(means) - 1))
+        variance *= max(1.0, chi2)
+    return offset, float(np.sqrt(variance))
+
+
+def _count(vehicles: int) -> str:
+    return "1 vehicle" if vehicles == 1 else f"{vehicles} vehicles"

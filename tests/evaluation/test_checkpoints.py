@@ -1,0 +1,142 @@
+"""Surveyed points: the map's error at them is measured, in photos and on the orthoimage, and bad tables are said."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcs_plugin.cli.main import main
+from orthoswarm.evaluation.checkpoints import evaluate_checkpoints, read_checkpoints
+from orthoswarm.export.product_files import write_frames
+from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame
+
+EPSG = 32632
+EAST, NORTH = 690_000.0, 5_330_000.0
+GROUND = 1.5
+LENS = Lens(1600, 1200, 1300.0, -0.12, 0.03, cx=4.0, cy=-3.0)
+
+
+def cameras() -> dict[str, Camera]:
+    rng = np.random.default_rng(8)
+    made = {}
+    for leg in range(2):
+        for k in range(5):
+            turn = rotation_from_angles(np.pi * leg, np.radians(-90 + rng.normal(0, 4)), np.radians(rng.normal(0, 4)))
+            at = np.array([EAST + 40.0 * leg, NORTH + 20.0 * k, 80.0 + rng.normal(0, 1)])
+            made[f"uav{leg + 1}/DJI_{k:04d}.JPG"] = Camera(at, turn, LENS)
+    return made
+
+
+def points() -> np.ndarray:
+    rng = np.random.default_rng(3)
+    flat = np.column_stack([EAST + rng.uniform(0, 40, 6), NORTH + rng.uniform(10, 70, 6)])
+    return np.column_stack([flat, GROUND + np.array([0.0, 3.0, -2.0, 0.0, 6.0, 1.0])])
+
+
+def product(folder: Path, shift: tuple[float, float] = (0.0, 0.0)) -> Path:
+    """An output folder whose cameras stand a shift from the true ones."""
+    folder.mkdir(exist_ok=True)
+    by = np.array([*shift, 0.0])
+    placed = []
+    for image, camera in cameras().items():
+        frame = Frame(image, Path(image), image.split("/")[0], None, Fix(48.0, 11.0), LENS.width, LENS.height)
+        placed.append(PlacedFrame(frame, Camera(camera.position + by, camera.rotation, LENS), "fine", 0.1))
+    write_frames(folder, placed, [], LocalGrid(EPSG), GROUND)
+    (folder / "report.json").write_text(json.dumps({"ground_z_m": GROUND}))
+    return folder
+
+
+def gcp_list(path: Path, scale: float = 1.0) -> Path:
+    lines = ["WGS84 UTM 32N"]
+    for k, point in enumerate(points()):
+        for image, camera in cameras().items():
+            column, row = camera.project(point)
+            if 0 <= column < LENS.width and 0 <= row < LENS.height:
+                u, v = (column + 0.5) / scale - 0.5, (row + 0.5) / scale - 0.5
+                lines.append(f"{point[0]:.4f} {point[1]:.4f} {point[2]:.2f} {u:.4f} {v:.4f} {image} gcp{k}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_points_that_photos_show_are_measured_whatever_their_height(tmp_path):
+    out = product(tmp_path / "out")
+    result = evaluate_checkpoints(out, gcp_list(tmp_path / "gcp_list.txt"))
+    assert len(result.names) == 6 and result.how == "photos"
+    assert np.abs(result.error).max() < 0.01  # the lens of frames.jsonl is a simpler one, right to a hundredth
+
+
+def test_a_shift_of_the_map_is_the_mean_error(tmp_path):
+    figures = evaluate_checkpoints(product(tmp_path / "out", (0.8, -0.3)), gcp_list(tmp_path / "gcp.txt")).figures()
+    assert figures["mean_e_m"] == pytest.approx(0.8, abs=0.01)
+    assert figures["mean_n_m"] == pytest.approx(-0.3, abs=0.01)
+    assert figures["rmse_h_m"] == pytest.approx(np.hypot(0.8, 0.3), abs=0.01)
+    assert "at least 30" in figures["statement"]
+
+
+def test_points_of_larger_copies_need_their_scale(tmp_path):
+    out, table = product(tmp_path / "out"), gcp_list(tmp_path / "gcp.txt", scale=0.2)
+    with pytest.raises(InputError, match="--pixel-scale"):
+        evaluate_checkpoints(out, table)
+    assert np.abs(evaluate_checkpoints(out, table, 0.2).error).max() < 0.01
+
+
+def test_points_measured_on_the_orthoimage_with_the_surveys_own_error(tmp_path):
+    rng = np.random.default_rng(1)
+    rows = ["name,east_m,north_m,epsg,sigma_m,map_east_m,map_north_m"]
+    for k in range(40):
+        east, north = EAST + rng.uniform(0, 500), NORTH + rng.uniform(0, 500)
+        rows.append(f"p{k},{east:.3f},{north:.3f},{EPSG},0.03,{east + 0.2:.3f},{north - 0.1:.3f}")
+    table = tmp_path / "points.csv"
+    table.write_text("\n".join(rows))
+    result = evaluate_checkpoints(tmp_path, table)
+    assert result.rmse == pytest.approx((0.2, 0.1), abs=0.002)
+    assert result.survey_m == pytest.approx(0.03 * np.sqrt(2))
+    assert result.statement().startswith("tested by the ASPRS")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "holds no points"),
+        ("EPSG:32632\n", "no points below"),
+        ("nowhere at all\n1 2 3 4 5 a.jpg\n", "no coordinate system"),
+        ("EPSG:32632\n1 2 3 four 5 a.jpg\n", "line 2"),
+        ("name,lat_deg\na,48\n", "no coordinates"),
+        ("name,lat_deg,lon_deg,image\na,48,11,x.jpg\n", "column 'column' is missing"),
+        ("name,lat_deg,lon_deg,image,column,row\na,nan,11,x.jpg,1,1\n", "no number"),
+        ("name,lat_deg,lon_deg,image,column,row\na,48,11,elsewhere.jpg,1,1\n", "check the names of the images"),
+    ],
+)
+def test_a_bad_table_is_one_sentence(tmp_path, text, said):
+    table = tmp_path / "points.txt"
+    table.write_text(text)
+    with pytest.raises(InputError, match=said):
+        evaluate_checkpoints(product(tmp_path / "out"), table)
+
+
+def test_a_name_that_two_photos_have_is_asked_about(tmp_path):
+    out = product(tmp_path / "out")
+    table = tmp_path / "gcp.txt"
+    table.write_text(f"EPSG:{EPSG}\n{EAST} {NORTH} 0 10 10 DJI_0000.JPG\n")
+    with pytest.raises(InputError, match="with their folders"):
+        evaluate_checkpoints(out, table)
+
+
+def test_the_command_prints_the_contract(tmp_path, capsys):
+    out, table = product(tmp_path / "out"), gcp_list(tmp_path / "gcp.txt")
+    assert main(["evaluate", str(out), "--checkpoints", str(table), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["checkpoints"] == 6
+    assert {"rmse_e_m", "rmse_n_m", "rmse_h_m"} <= set(figures)
+    assert main(["evaluate", str(out)]) == 2
+    assert "--checkpoints" in capsys.readouterr().err
+
+
+def test_real_control_points_are_read(real_data):
+    points = read_checkpoints(real_data("sheffield_cross_800") / "gcp_file_4000px.txt", 0.2)
+    assert len(points) == 5 and all(len(p.marks) == 5 for p in points)
