@@ -34,7 +34,20 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     from telemetry.formats.table.pose_csv import read_pose_csv
     from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
     from telemetry.photos.photo_tags import read_photo
-    from tests.telemetry import test_flight_logs, test_gpmf, test_klv, test_photos, test_reader_fuzz, test_srt
+    from telemetry.video.extraction import pictures
+    from telemetry.video.picture_poses import Poses
+    from telemetry.video.video_file import scan
+    from telemetry.write.sei_writer import add_sei
+    from tests.telemetry import (
+        test_can_logs,
+        test_flight_logs,
+        test_gpmf,
+        test_klv,
+        test_photos,
+        test_reader_fuzz,
+        test_srt,
+        test_video,
+    )
     from tests.telemetry.test_exposure_lists import write_mrk, write_pos
     from tests.telemetry.test_tables import TABLES
 
@@ -60,6 +73,18 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     def dataflash(path: Path) -> None:
         whole = [(name, tuple(int(v) if isinstance(v, float) and v else v for v in row)) for name, row in records]
         test_flight_logs.dataflash(path, older, whole)
+
+    def bus(path: Path) -> None:
+        test_can_logs.write(path, test_can_logs.bus_messages(1)[:80])
+
+    def video(path: Path) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            plain = test_video.make_video(Path(folder) / path.name, count=8)
+            add_sei(plain, path, test_video.pose)
+
+    def decode(path: Path) -> None:
+        found = scan(path)
+        list(pictures(found, Poses(found)))
 
     form = bitstream.StreamFormat("h264")
     return {
@@ -87,6 +112,17 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
             [made(lambda path: test_flight_logs.ulog(path, seconds=1, events=1), "a.ulg")], file(read_log, "a.ulg")
         ),
         "DataFlash": ([made(dataflash, "a.BIN")], file(read_log, "a.BIN")),
+        "tlog": ([made(lambda path: test_can_logs.tlog(path, seconds=2), "a.tlog")], file(read_log, "a.tlog")),
+        **{
+            f"CAN {suffix}": ([made(bus, f"a{suffix}")], file(read_log, f"a{suffix}"))
+            for suffix in (".log", ".asc", ".blf", ".trc")
+        },
+        **{
+            suffix[1:].upper(): ([made(video, f"a{suffix}")], file(scan, f"a{suffix}"))
+            for suffix in (".mp4", ".mov", ".ts")
+        },
+        "MP4 pictures": ([made(video, "a.mp4"), made(video, "b.mov")], file(decode, "a.mp4")),
+        "TS pictures": ([made(video, "a.ts")], file(decode, "a.ts")),
     }  # fmt: skip
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
-from gcs_plugin.daemon.intake.pose_relay import pose_values
+from gcs_plugin.daemon.intake.pose_relay import linked_pose
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.jobs.job_queue import Job, Jobs
@@ -31,7 +32,7 @@ from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.mission_journal import completion_rows, note_completion
-from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.settings import Settings, system_of
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_frames, packed, unpacked
@@ -44,7 +45,7 @@ from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.basemap import Basemap
-from telemetry.samples.sample import Sample
+from telemetry.live.live_poses import Poses
 
 _FEW: Final = 10
 _SOURCES_S: Final = 1.0
@@ -118,17 +119,18 @@ class Daemon:
             self.jobs.add("refine", vehicle, sortie)
         self.leg_watch = LegWatch(self._leg_over, self._refine_late)
         self.posted: Counter[str] = Counter()
+        self.poses = Poses()
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
         if settings.links:
-            self.links = VehicleLinks(settings, self.journal, self.events, self.jobs)
+            self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
         self.sources = [
             Source(
                 v.id,
                 v.pictures,
                 self.add_picture,
-                self._pose_at,
+                self.poses.at,
                 self._say,
                 folder / "videos",
                 self._link_log,
@@ -136,6 +138,12 @@ class Daemon:
             )
             for v in settings.vehicles
             if v.pictures
+        ]
+        fleet = None if self.links is None else self.links.fleet
+        self.buses = [
+            CanReader(v.id, v.can, self.poses.of(v.id), self._say, fleet, v.system or system_of(v.id))
+            for v in settings.vehicles
+            if v.can
         ]
 
     def start(self) -> None:
@@ -151,11 +159,15 @@ class Daemon:
             self.links.start()
         for source in self.sources:
             source.start()
+        for bus in self.buses:
+            bus.start()
 
     def close(self) -> None:
         """Stop; what is under way goes on at the next start."""
         self.jobs.give_up()
         self._close_sources()
+        for bus in self.buses:
+            bus.close()
         self.leg_watch.close()
         if self.takeoffs is not None:
             self.takeoffs.close()
@@ -209,11 +221,12 @@ class Daemon:
         require_space(self.settings.workspace, len(data))
         time_s = came if pose.time_s is None else pose.time_s
         path = self.store.put(key, suffix, data)
-        change = add_frame(key, pose.vehicle, pose.image, time_s, path, (width, height), pose.values)
+        values = pose.values | ({"origin": pose.origin} if pose.origin else {})
+        change = add_frame(key, pose.vehicle, pose.image, time_s, path, (width, height), values)
         seq, new = self.journal.write(change)
         if new:
             frame = frame_of(
-                pose.values, image=pose.image, path=self.store.path(path), vehicle=pose.vehicle, time_s=time_s,
+                values, image=pose.image, path=self.store.path(path), vehicle=pose.vehicle, time_s=time_s,
                 size=(width, height),
             )  # fmt: skip
             sortie = self.sortie(pose.vehicle)
@@ -230,12 +243,11 @@ class Daemon:
         """The pose; where its receiver had no fix, with what the vehicle's link says about that moment."""
         if pose.has_fix or pose.time_s is None:
             return pose
-        linked = self._pose_at(pose.vehicle, pose.time_s)
-        values = None if linked is None else pose_values(linked)
-        if values is None:
+        linked = linked_pose(pose.vehicle, pose.image, pose.time_s, self.poses.at(pose.vehicle, pose.time_s))
+        if linked is None:
             return pose
         without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
-        return replace(pose, values=values | without)
+        return replace(linked, values=linked.values | without, origin=linked.origin | pose.origin)
 
     def sortie(self, vehicle: str) -> int:
         """The vehicle's present sortie."""
@@ -253,7 +265,9 @@ class Daemon:
         linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
         for vehicle, takeoff in ({} if self.takeoffs is None else self.takeoffs.rows()).items():
             linked.setdefault(vehicle, {"id": vehicle})["takeoff"] = takeoff
-        return views.vehicle_rows(self.journal, self.settings.vehicles, self.sources, linked)
+        return views.vehicle_rows(
+            self.journal, self.settings.vehicles, self.sources, linked, self.buses, self.poses.origins()
+        )
 
     def legs(self) -> dict[str, Any]:
         """The legs as GeoJSON lines with state, confidence, sigma and stage (coarse: in flight)."""
@@ -263,13 +277,9 @@ class Daemon:
         """When vehicles completed, and what followed."""
         return completion_rows(self.journal)
 
-    def _pose_at(self, vehicle: str, time_s: float) -> Sample | None:
-        return None if self.links is None else self.links.pose_at(vehicle, time_s)
-
     def _link_log(self, vehicle: str, out: Path) -> bool:
         """Write what a vehicle has said on the links, in this run or before, into a log of its own."""
         from gcs_plugin.daemon.intake.vehicle_log import write_link_log
-        from gcs_plugin.daemon.settings import system_of
 
         systems = {v.id: v.system for v in self.settings.vehicles}
         system = systems.get(vehicle) or system_of(vehicle)

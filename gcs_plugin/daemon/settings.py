@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from gcs_plugin.daemon.intake.can_reader import check_bus
 from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"
@@ -29,6 +30,7 @@ TEMPLATE: Final = """\
 # system = 1
 # name = "Falcon"
 # pictures = "udp://0.0.0.0:5600" # a live stream (rtsp, udp, tcp), or a folder into which photos or videos arrive
+# can = "socketcan:can0"          # DroneCAN bus; "mavlink" for the vehicle's own one through its link
 """
 
 
@@ -39,12 +41,14 @@ class VehicleSettings:
     Attributes:
         id: in files and on the map. system: MAVLink system id, None without a link.
         name: shown to people. pictures: stream or folder, empty for none.
+        can: CAN bus with DroneCAN ("socketcan:can0", "mavlink"), empty for none.
     """
 
     id: str
     system: int | None = None
     name: str = ""
     pictures: str = ""
+    can: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +98,9 @@ class Settings:
         for what, values in (("id", names), ("system id", systems)):
             if len(set(values)) != len(values):
                 raise InputError(f"two vehicles in {FILE} have the same {what}; give each its own")
+        for vehicle in self.vehicles:
+            if vehicle.can:
+                check_bus(vehicle.can)
         return self
 
 
@@ -132,13 +139,14 @@ def read_settings(workspace: Path) -> Settings:
 def _vehicle(entry: Any, path: Path) -> VehicleSettings:
     if not isinstance(entry, dict) or not isinstance(entry.get("id"), str) or not entry["id"]:
         raise InputError(f'a [[vehicle]] in {path} has no id; give it one, for example id = "v1"')
-    unknown = set(entry) - {"id", "system", "name", "pictures"}
+    unknown = set(entry) - {"id", "system", "name", "pictures", "can"}
     if unknown:
-        raise InputError(f"a [[vehicle]] in {path} says '{unknown.pop()}'; it has id, system, name and pictures")
+        raise InputError(f"a [[vehicle]] in {path} says '{unknown.pop()}'; it has id, system, name, pictures and can")
     system = entry.get("system", system_of(entry["id"]))
     if system is not None and (isinstance(system, bool) or not isinstance(system, int) or not 1 <= system <= 255):
         raise InputError(f"the system id of {entry['id']} in {path} is not 1 to 255; correct it")
-    return VehicleSettings(entry["id"], system, str(entry.get("name", "")), str(entry.get("pictures", "")))
+    texts = (str(entry.get(key, "")) for key in ("name", "pictures", "can"))
+    return VehicleSettings(entry["id"], system, *texts)
 
 
 def system_of(vehicle: str) -> int | None:

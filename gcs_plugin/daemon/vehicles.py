@@ -37,7 +37,7 @@ from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from telemetry.samples.sample import Sample
+from telemetry.live.live_poses import Poses
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
@@ -80,8 +80,10 @@ class VehicleLinks:
         cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
     """
 
-    def __init__(self, settings: Settings, journal: Journal, events: Events, jobs: Jobs) -> None:
-        """Open the links.
+    def __init__(
+        self, settings: Settings, journal: Journal, events: Events, jobs: Jobs, poses: "Poses | None" = None
+    ) -> None:
+        """Open the links; what vehicles say about where they are goes into `poses`, by their ids.
 
         Raises:
             InputError: a link cannot be opened.
@@ -94,6 +96,7 @@ class VehicleLinks:
         self._titles = {v.id: v.name for v in settings.vehicles}
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._kept: dict[int, _Kept] = {}
+        self._poses = Poses() if poses is None else poses
         self._stop = threading.Event()
         self.cancel_takeoff: Callable[[str], float | None] = lambda _: None
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
@@ -147,14 +150,6 @@ class VehicleLinks:
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
         return self.fleet.call(collect).result(5.0)
-
-    def pose_at(self, vehicle: str, time_s: float) -> Sample | None:
-        """The pose of a vehicle's camera at a moment (UTC), None where nothing is known then."""
-        for kept in list(self._kept.values()):
-            if kept.id == vehicle:
-                sample = kept.poses.at(time_s)
-                return sample if sample.has_position else None
-        return None
 
     @staticmethod
     def clock() -> float:
@@ -352,10 +347,8 @@ class VehicleLinks:
 
     def _keep(self, system: int) -> _Kept:
         if system not in self._kept:
-            from telemetry.live.live_poses import LivePoses
-
             name = self.name_of(system)
-            self._kept[system] = _Kept(name, LivePoses(name))
+            self._kept[system] = _Kept(name, self._poses.of(name))
         return self._kept[system]
 
     def _message(self, vehicle: "Vehicle", message: Any, utc: float) -> None:

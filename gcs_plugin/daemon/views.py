@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
 from gcs_plugin.daemon.layers.layers import Layer, drawn_bounds
 from gcs_plugin.daemon.settings import VehicleSettings
@@ -47,12 +48,15 @@ def vehicle_rows(
     named: Sequence[VehicleSettings],
     sources: Iterable[Source],
     linked: Mapping[str, dict[str, Any]],
+    buses: Iterable[CanReader] = (),
+    origins: Mapping[str, Mapping[str, str]] | None = None,
 ) -> list[dict[str, Any]]:
     """All vehicles that were heard, that sent pictures, or that should.
 
     Args:
         journal: of the workspace. named: with names given by the operator. sources: of pictures.
-        linked: id -> what the vehicle's link says.
+        linked: id -> what the vehicle's link says. buses: CAN buses of vehicles.
+        origins: id -> where the vehicle's newest pose comes from.
 
     Returns:
         A row a vehicle; each has its `id`, and its `name` (empty if it was given none).
@@ -63,6 +67,12 @@ def vehicle_rows(
     for source in sources:
         documents.setdefault(source.vehicle, {"id": source.vehicle, "state": "waiting", "frames": {}, "sortie": 1})
         documents[source.vehicle]["pictures"] = source.document()
+    for bus in buses:
+        documents.setdefault(bus.vehicle, {"id": bus.vehicle, "state": "waiting", "frames": {}, "sortie": 1})
+        documents[bus.vehicle]["can"] = bus.document()
+    for name, origin in (origins or {}).items():
+        if name in documents:
+            documents[name]["poses"] = dict(origin)
     names = {v.id: v.name for v in named}
     return [row | {"name": names.get(row["id"], "")} for row in documents.values()]
 

@@ -201,7 +201,10 @@ def read_frames(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -> list[dict[str, Any]]:
-    """`vehicles` of report.json: those that were refined, then those that were placed as recorded."""
+    """`vehicles` of report.json: those that were refined, then those that were placed as recorded.
+
+    `positions_from` counts the pictures by the source of their recorded position.
+    """
     used = Counter(p.frame.vehicle for p in placed)
     rows: list[dict[str, Any]] = [
         {
@@ -218,6 +221,9 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
         assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
         fov = statistics.median(assumed)
         rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None})
+    for row in rows:
+        origins = [p.frame.origin.get("position", "") for p in placed if p.frame.vehicle == row["id"]]
+        row["positions_from"] = dict(Counter(origin for origin in origins if origin).most_common())
     return rows
 
 

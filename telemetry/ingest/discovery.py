@@ -10,12 +10,13 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
     | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
 )
-LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"})
+LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"}) | CAN_LOGS
 _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _SIDECARS = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
+from telemetry.formats.log.can_log import is_can_log
 from telemetry.formats.log.dataflash import has_dataflash_records
 from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
+from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
 from telemetry.ingest.event_pairing import Pairing, pair
 from telemetry.ingest.survey import SourceInfo, Survey
@@ -21,6 +24,7 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
+_BUS = "DroneCAN"
 _LEAST_SHARE = 0.5
 _SAME_EXPOSURE_S = 1.0
 _FAR_M = 60.0
@@ -29,13 +33,19 @@ _NAME_BONUS = 0.05
 
 @dataclass(slots=True)
 class LogSource:
-    """A log, the folder that it is about, and what of it was used."""
+    """A log, the folder that it is about, whether it was used, and what in it is from a log of the vehicle's bus."""
 
     folder: Path
     log: FlightLog
     source: SourceInfo
     timeline: Timeline
     used: bool = False
+    better: str = ""
+
+    @property
+    def name(self) -> str:
+        """The file's name, and what of it is from a CAN bus."""
+        return f"{self.log.path.name}, with {self.better}" if self.better else self.log.path.name
 
 
 def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
@@ -45,8 +55,11 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
         for path in folder.logs:
             vehicles = read_or_reason(read_log, path)
             if isinstance(vehicles, Unreadable):
-                # A .bin without DataFlash's marks may be anything: worth a note, no warning.
-                foreign = path.suffix.lower() == ".bin" and not has_dataflash_records(path)
+                # A .bin without DataFlash's marks, a .log that is none of a CAN bus: worth a note, no warning.
+                suffix = path.suffix.lower()
+                foreign = (suffix == ".bin" and not has_dataflash_records(path)) or (
+                    suffix in CAN_LOGS and not is_can_log(path)
+                )
                 result.findings.append(Finding("not-a-log", f"{found.name(path)}: {vehicles}", note=foreign))
                 continue
             source = SourceInfo(found.name(path), vehicles[0].kind)
@@ -57,7 +70,29 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
                 source.shown[log.vehicle] = 0
                 logs.append(LogSource(found.scope(path), log, source, log.timeline()))
     _count_once(logs)
-    return logs
+    return _with_buses(logs)
+
+
+def _with_buses(logs: Sequence[LogSource]) -> list[LogSource]:
+    """The logs, those of CAN buses put into the logs of their vehicles' autopilots where there are any."""
+    apart: list[LogSource] = []
+    flown = [entry for entry in logs if entry.log.kind != _BUS]
+    for bus in (entry for entry in logs if entry.log.kind == _BUS):
+        distances = [(apart_m(entry.log, bus.log), entry) for entry in flown]
+        near = sorted(((d, n) for n, (d, _) in enumerate(distances) if d is not None), key=lambda pair: pair[0])
+        found = bettered(flown[near[0][1]].log, bus.log) if near else None
+        if found is None:
+            apart.append(bus)
+            continue
+        entry = flown[near[0][1]]
+        entry.log, better = found
+        entry.timeline = entry.log.timeline()
+        entry.better = f"{' and '.join(better)} of {bus.log.path.name}"
+        text = (
+            f"{' and '.join(better)} of {bus.log.path.name} are used in place of its own: their stated sigma is lower"
+        )
+        entry.source.findings.append(Finding("dronecan-better", text, note=True))
+    return [*flown, *apart]
 
 
 def _count_once(logs: Sequence[LogSource]) -> None:
@@ -168,7 +203,7 @@ def _use_events(
         photo = photos[i]
         if photo.lat_deg is not None and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > _FAR_M:
             far += 1
-        origin = f"{event.kind} ({log.path.name})"
+        origin = f"{event.kind} ({entry.name})"
         if i in pairing.doubtful:
             spread = max((_apart_m(pose, log.events[k].sample) for k in pairing.doubtful[i]), default=0.0)
             pose = replace(pose, sigma_m=max(spread, pose.sigma_m or 0.0) or None)
@@ -263,7 +298,7 @@ def _use_timeline(
             if pose.has_position:
                 count += 1
                 pose = pose if entry.log.has_gimbal else fixed_camera(pose)
-                fill(photo, pose, f"track of {entry.log.path.name}", gimbal=entry.log.has_gimbal)
+                fill(photo, pose, f"track of {entry.name}", gimbal=entry.log.has_gimbal)
         if count:
             entry.used = True
             text = (

@@ -1,29 +1,37 @@
-"""A vehicle's recent poses from live MAVLink (or CAN), to be read at the moment of a picture.
+"""A vehicle's recent poses from its MAVLink link and its CAN bus, to be read at the moment of a picture.
 
-Cheap enough for a hundred vehicles: a message costs a few microseconds, memory is bounded by the time that is kept.
+Each source (MAVLink, each node of the bus) has series of its own; at any moment the one with the lowest stated sigma is
+used. Cheap enough for a hundred vehicles: a message costs a few microseconds, memory is bounded by the time that is
+kept.
 """
 
+import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Final
 
+from orthoswarm.config.records import RecordsConfig
 from orthoswarm.model.angles import wrap_deg
 from telemetry.formats.log.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.samples.sample import Sample
+
+MAVLINK: Final = "MAVLink"
+"""The source that a vehicle's link is."""
 
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
 _FLIGHT = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 _CAMERA = ("yaw_deg", "pitch_deg", "roll_deg")
 _HELD_S = 0.3
-_ACCURATE_M = 0.5
-_ACCURATE_FOR_S = 2.0
+_ALL_HEARD_S: Final = 0.5
+_UNSTATED_M: Final = RecordsConfig().position_sigma_m
+_UNSTATED_DEG: Final = 57.3 * RecordsConfig().tagged_tilt_sigma
 _TURNS = frozenset({"lon_deg", *_FLIGHT, *_CAMERA})
 
 
 class _Series:
-    """Values of some fields over time, in order of time, the oldest dropped."""
+    """Values of some fields over time with the sigma by which sources are compared, in order of time; bounded."""
 
     __slots__ = ("_keep_s", "names", "times", "values")
 
@@ -34,6 +42,7 @@ class _Series:
         self._keep_s = keep_s
 
     def add(self, time_s: float, values: tuple[float | None, ...]) -> None:
+        """Take the fields' values, and the sigma last."""
         if not self.times or time_s > self.times[-1]:
             self.times.append(time_s)
             self.values.append(values)
@@ -48,26 +57,19 @@ class _Series:
             old = bisect_left(self.times, self.times[-1] - self._keep_s)
             del self.times[:old], self.values[:old]
 
-    def read(self, time_s: float, gap_s: float, sample: Sample) -> None:
-        """Put the values at a moment into a sample, interpolated; the newest is held for a moment, no more."""
+    def at(self, time_s: float, gap_s: float) -> tuple[float | None, ...] | None:
+        """The values at a moment, interpolated; the newest is held for a moment, no more. None where unknown."""
         at = bisect_right(self.times, time_s)
         if at == 0:
-            return
+            return None
         if at == len(self.times):
-            if time_s - self.times[-1] <= _HELD_S:
-                self._put(sample, self.values[-1])
-            return
+            return self.values[-1] if time_s - self.times[-1] <= _HELD_S else None
         before, after = self.times[at - 1], self.times[at]
         if after - before > gap_s and time_s != before:
-            return
+            return None
         share = (time_s - before) / (after - before)
         one, two = self.values[at - 1], self.values[at]
-        self._put(sample, tuple(_between(n, a, b, share) for n, a, b in zip(self.names, one, two, strict=True)))
-
-    def _put(self, sample: Sample, values: tuple[float | None, ...]) -> None:
-        for name, value in zip(self.names, values, strict=True):
-            if value is not None:
-                setattr(sample, name, value)
+        return tuple(_between(n, a, b, share) for n, a, b in zip((*self.names, "sigma"), one, two, strict=True))
 
 
 def _between(name: str, a: float | None, b: float | None, share: float) -> float | None:
@@ -80,11 +82,58 @@ def _between(name: str, a: float | None, b: float | None, share: float) -> float
     return a + share * step
 
 
-class LivePoses:
-    """The recent poses of one vehicle.
+class _Sources:
+    """One kind of value, a series for each source of it."""
+
+    def __init__(self, names: tuple[str, ...], keep_s: float) -> None:
+        self._names, self._keep_s = names, keep_s
+        self._series = {MAVLINK: _Series(names, keep_s)}  # first: it is used where others are no better
+        self.told = False
+
+    def add(self, source: str, sample: Sample, sigma: float) -> None:
+        """Take a sample's values."""
+        series = self._series.get(source)
+        if series is None:
+            series = self._series[source] = _Series(self._names, self._keep_s)
+        series.add(sample.time_s or 0.0, (*(getattr(sample, name) for name in self._names), sigma))
+        self.told = True
+
+    def __len__(self) -> int:
+        return sum(len(series.times) for series in self._series.values())
+
+    def read(self, time_s: float, gap_s: float, sample: Sample) -> str | None:
+        """Put the values of the best source at a moment into a sample; returns the source, None if there is none."""
+        best: tuple[float, str, tuple[float | None, ...]] | None = None
+        for source, series in self._series.items():
+            values = series.at(time_s, gap_s)
+            if values is not None and (best is None or (values[-1] or 0.0) < best[0]):
+                best = values[-1] or 0.0, source, values
+        if best is None:
+            return None
+        for name, value in zip(self._names, best[2], strict=False):
+            if value is not None:
+                setattr(sample, name, value)
+        return best[1]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkPose:
+    """A pose at a moment, and where it comes from.
 
     Attributes:
-        vehicle: id. latest: the newest value of every field. last_event: the newest camera event.
+        sample: the pose. origin: of its `position`, `height`, `angles` and `flight_yaw`, as far as it has them.
+    """
+
+    sample: Sample
+    origin: dict[str, str] = field(default_factory=dict)
+
+
+class LivePoses:
+    """The recent poses of one vehicle; messages may come in other threads than those that read.
+
+    Attributes:
+        vehicle: id.
+        latest: the newest value of every field, whatever its source. last_event: the newest camera event.
     """
 
     def __init__(
@@ -97,12 +146,16 @@ class LivePoses:
         self._clock = clock
         self._mavlink = MavlinkPoses()
         self._arrival_offset: float | None = None
-        self._position = _Series(_POSITION, keep_s)
-        self._flight = _Series(_FLIGHT, keep_s)
-        self._camera = _Series(_CAMERA, keep_s)
-        self._height = _Series(("height_m",), keep_s)
-        self._ground = _Series(("height_m",), keep_s)
-        self._accurate_s = float("-inf")
+        self._lock = threading.Lock()
+        self._position = _Sources(_POSITION, keep_s)
+        self._flight = _Sources(_FLIGHT, keep_s)
+        self._camera = _Sources(_CAMERA, keep_s)
+        self._height = _Sources(("height_m",), keep_s)
+        self._ground = _Sources(("height_m",), keep_s)
+
+    def __len__(self) -> int:
+        """Number of positions that are kept."""
+        return len(self._position)
 
     def feed(self, message: Any, arrival_s: float | None = None) -> CameraEvent | None:
         """Take a MAVLink message of this vehicle; returns the camera event if it is one, with its pose complete.
@@ -121,53 +174,61 @@ class LivePoses:
             return self._event(found, arrival_s)
         boot_s = found.time_s or 0.0
         found.time_s = self._utc(boot_s, arrival_s)
-        self.add(found)
+        self.add(found, sigma=self._mavlink.position_sigma_m if found.has_position else None)
         return None
 
-    def add(self, sample: Sample) -> None:
-        """Take a sample from any source (its time UTC)."""
-        time_s = sample.time_s
-        if time_s is None:
-            return
-        if sample.has_position and not self._is_outdone(sample):
-            self._position.add(time_s, (sample.lat_deg, sample.lon_deg, sample.altitude_m, sample.sigma_m))
-        elif sample.has_position:
-            sample = replace(sample, lat_deg=None, lon_deg=None, altitude_m=None, sigma_m=None)
-        if sample.height_m is not None:
-            (self._ground if sample.height_is_ground else self._height).add(time_s, (sample.height_m,))
-        if sample.flight_yaw_deg is not None:
-            self._flight.add(time_s, (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg))
-        if sample.yaw_deg is not None:
-            self._camera.add(time_s, (sample.yaw_deg, sample.pitch_deg, sample.roll_deg))
-        self.latest = sample.merge(self.latest)
-        self.latest.vehicle = self.vehicle
+    def add(self, sample: Sample, *, source: str = MAVLINK, sigma: float | None = None) -> None:
+        """Take a sample.
 
-    def _is_outdone(self, sample: Sample) -> bool:
-        """Whether a better receiver (RTK on the bus) tells the position at this time already."""
-        time_s = sample.time_s or 0.0
-        if sample.sigma_m is not None and sample.sigma_m <= _ACCURATE_M:
-            self._accurate_s = time_s
-            return False
-        return abs(time_s - self._accurate_s) < _ACCURATE_FOR_S
+        Args:
+            sample: its time is UTC.
+            source: who says so.
+            sigma: one sigma that the source states, metres for a position, degrees for angles; None for none.
+        """
+        if sample.time_s is None:
+            return
+        metres, degrees = sigma or _UNSTATED_M, sigma or _UNSTATED_DEG
+        with self._lock:
+            if sample.has_position:
+                self._position.add(source, sample, metres)
+            if sample.height_m is not None:
+                (self._ground if sample.height_is_ground else self._height).add(source, sample, metres)
+            if sample.flight_yaw_deg is not None:
+                self._flight.add(source, sample, degrees)
+            if sample.yaw_deg is not None:
+                self._camera.add(source, sample, degrees)
+            self.latest = sample.merge(self.latest)
+            self.latest.vehicle = self.vehicle
 
     def at(self, time_s: float) -> Sample:
         """The pose at a moment (UTC), interpolated; fields are None where they are not known then.
 
         A camera whose own attitude is not reported is taken as fixed under the airframe.
         """
-        sample = Sample(time_s=time_s, vehicle=self.vehicle)
-        for series in (self._position, self._height, self._flight, self._camera):
-            series.read(time_s, self._max_gap_s, sample)
-        above = Sample()
-        self._ground.read(time_s, self._max_gap_s, above)
-        if above.height_m is not None:
-            sample.height_m, sample.height_is_ground = above.height_m, True
-        return sample if self._mavlink.has_gimbal else fixed_camera(sample)
+        return self.read(time_s).sample
+
+    def read(self, time_s: float) -> LinkPose:
+        """The same with the sources that it comes from."""
+        sample, above = Sample(time_s=time_s, vehicle=self.vehicle), Sample()
+        with self._lock:
+            origin = {
+                "position": self._position.read(time_s, self._max_gap_s, sample),
+                "height": self._height.read(time_s, self._max_gap_s, sample),
+                "flight_yaw": self._flight.read(time_s, self._max_gap_s, sample),
+                "angles": self._camera.read(time_s, self._max_gap_s, sample),
+            }
+            ground = self._ground.read(time_s, self._max_gap_s, above)
+        if ground is not None:
+            sample.height_m, sample.height_is_ground, origin["height"] = above.height_m, True, ground
+        if not self.has_gimbal and origin["angles"] is None and origin["flight_yaw"] is not None:
+            sample = fixed_camera(sample)
+            origin["angles"] = f"{origin['flight_yaw']}, camera fixed under the airframe"
+        return LinkPose(sample, {name: source for name, source in origin.items() if source is not None})
 
     @property
     def has_gimbal(self) -> bool:
         """Whether any message told the camera's own attitude."""
-        return self._mavlink.has_gimbal
+        return self._mavlink.has_gimbal or self._camera.told
 
     def _utc(self, boot_s: float, arrival_s: float | None) -> float:
         """UTC of a time since boot: by the vehicle's clock, else by the quickest arrival so far."""
@@ -180,16 +241,42 @@ class LivePoses:
         return boot_s + self._arrival_offset
 
     def _event(self, event: CameraEvent, arrival_s: float | None) -> CameraEvent:
+        """Complete an exposure: what the autopilot says about it, but for what the bus knows better."""
         if event.time_s is None:
             boot_s = event.boot_s
             now_s = self._clock() if arrival_s is None else arrival_s
             event.time_s = now_s if boot_s is None else self._utc(boot_s, arrival_s)
-        event.sample.vehicle = self.vehicle
-        event.sample.time_s = event.time_s
-        around = self.at(event.time_s)
-        if self._mavlink.has_gimbal:
-            event.sample = event.sample.merge(around)
-        else:
-            event.sample = fixed_camera(event.sample).merge(around)
+        own = event.sample
+        own.vehicle, own.time_s = self.vehicle, event.time_s
+        around = self.read(event.time_s)
+        if around.origin.get("position", MAVLINK) != MAVLINK:
+            own.lat_deg = own.lon_deg = own.altitude_m = own.sigma_m = None
+        if not self.has_gimbal:
+            own = fixed_camera(own)
+        elif around.origin.get("angles", MAVLINK) != MAVLINK:
+            own.yaw_deg = own.pitch_deg = own.roll_deg = None
+        event.sample = own.merge(around.sample)
         self.last_event = event
         return event
+
+
+class Poses:
+    """The recent poses of all vehicles, by their ids."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, LivePoses] = {}
+
+    def of(self, vehicle: str) -> LivePoses:
+        """Those of a vehicle, to be added to."""
+        return self._of.setdefault(vehicle, LivePoses(vehicle))
+
+    def at(self, vehicle: str, time_s: float) -> LinkPose | None:
+        """The pose of a vehicle's camera at a moment (UTC); None where its position is not known then."""
+        known = self._of.get(vehicle)
+        found = None if known is None else known.read(time_s)
+        return found if found is not None and found.sample.has_position else None
+
+    def origins(self) -> dict[str, dict[str, str]]:
+        """Where the newest pose of each vehicle comes from, by the vehicle's id; see `LinkPose.origin`."""
+        times = {vehicle: poses.latest.time_s for vehicle, poses in list(self._of.items())}
+        return {v: self._of[v].read(time_s - _ALL_HEARD_S).origin for v, time_s in times.items() if time_s}

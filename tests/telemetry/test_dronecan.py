@@ -1,4 +1,4 @@
-"""DroneCAN over python-can and through MAVLink CAN_FRAME."""
+"""DroneCAN over python-can and through MAVLink CAN_FRAME: the best source is used, loss and noise are borne."""
 
 import threading
 import time
@@ -8,167 +8,227 @@ import pytest
 
 from orthoswarm.model.errors import InputError
 from telemetry.live.live_poses import LivePoses
+from telemetry.samples.sample import Sample
 
 can = pytest.importorskip("can")
-dronecan = pytest.importorskip("dronecan")
+pytest.importorskip("dronecan")
 
-from telemetry.live.dronecan_bus import BusDriver, CanSource, TunnelDriver, open_bus  # noqa: E402
+from telemetry.live.dronecan_bus import CanSource, open_bus  # noqa: E402
+from tests.kit.can_node import CanNode, attitude, camera_down, fix, fix2  # noqa: E402
 
-
-def quaternion_xyzw(yaw, pitch, roll):
-    y, p, r = np.radians([yaw, pitch, roll]) / 2
-    cy, sy, cp, sp, cr, sr = np.cos(y), np.sin(y), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
-    return [
-        float(sr * cp * cy - cr * sp * sy), float(cr * sp * cy + sr * cp * sy),
-        float(cr * cp * sy - sr * sp * cy), float(cr * cp * cy + sr * sp * sy),
-    ]  # fmt: skip
+T0 = 1_700_000_000.0
 
 
-def fix2(number: int):
-    message = dronecan.uavcan.equipment.gnss.Fix2()
-    message.gnss_timestamp.usec = 1_700_000_000_000_000 + 100_000 * number
-    message.gnss_time_standard = message.GNSS_TIME_STANDARD_UTC
-    message.latitude_deg_1e8 = round((47.0 + 1e-5 * number) * 1e8)
-    message.longitude_deg_1e8 = round(8.25 * 1e8)
-    message.height_msl_mm = 512_000
-    message.status, message.mode, message.sub_mode = 3, message.MODE_RTK, message.SUB_MODE_RTK_FIXED
-    message.covariance = [0.0004, 0.0004, 0.001, 0.01, 0.01, 0.01]
-    return message
+def fix_at(number: int, sigma_m=0.02, lat_deg=47.0):
+    return fix2(lat_deg + 1e-5 * number, 8.25, 512.0, T0 + number / 10, sigma_m)
 
 
-def attitude(yaw, pitch=0.0, roll=0.0):
-    message = dronecan.uavcan.equipment.ahrs.Solution()
-    message.orientation_xyzw = quaternion_xyzw(yaw, pitch, roll)
-    return message
+class Bus:
+    """A CanSource on a virtual bus, with a clock that the test sets."""
+
+    def __init__(self, name, poses=None):
+        self.now = T0
+        self.poses = poses or LivePoses("uav1", clock=lambda: self.now)
+        self.source = CanSource(self.poses, clock=lambda: self.now)
+        self.bus = open_bus(f"virtual:{name}")
+        self.out = can.Bus(interface="virtual", channel=name)
+
+    def take(self):
+        while self.source.read(self.bus, 0.005):
+            pass
+
+    def send(self, node, message, now=None):
+        self.now = self.now if now is None else now
+        node.send(self.out, message)
+        self.take()
+
+    def close(self):
+        self.bus.shutdown()
+        self.out.shutdown()
 
 
-def camera_down_in_body():
-    """Camera z = body z (down), picture's up = body x: camera x right = body y, camera y down = -body x."""
-    message = dronecan.uavcan.equipment.camera_gimbal.Status()
-    message.camera_orientation_in_body_frame_xyzw = [0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5))]
-    return message
+@pytest.fixture
+def wire(request):
+    opened = Bus(request.node.name)
+    yield opened
+    opened.close()
 
 
-def sender(bus):
-    return dronecan.node.Node(BusDriver(bus), node_id=42)
-
-
-def test_fixes_attitude_and_gimbal_come_from_a_bus():
-    poses = LivePoses("uav1", clock=lambda: 1_700_000_005.0)
-    node = sender(can.Bus(interface="virtual", channel="t1"))
-    with CanSource(BusDriver(open_bus("virtual:t1")), poses, clock=lambda: 1_700_000_005.0) as source:
-        node.broadcast(attitude(30.0))
-        node.broadcast(camera_down_in_body())
-        for number in range(100):
-            node.broadcast(fix2(number))
-        deadline = time.monotonic() + 5.0
-        while source.received < 102 and time.monotonic() < deadline:
-            source.spin(0.05)
-        assert source.received == 102
-    node.close()
-    sample = poses.at(1_700_000_005.05)
-    assert sample.lat_deg == pytest.approx(47.0 + 50.5e-5, abs=1e-8)
-    assert sample.altitude_m == pytest.approx(512.0)
-    assert poses.latest.sigma_m == pytest.approx(0.02, abs=1e-3)
-    assert (poses.latest.yaw_deg, poses.latest.pitch_deg) == pytest.approx((30.0, -90.0), abs=0.2)
+def test_fixes_attitude_and_gimbal_come_from_a_bus(wire):
+    node = CanNode()
+    for number in range(100):
+        wire.send(node, fix_at(number), T0 + number / 10)
+        wire.send(node, attitude(30.0))
+        wire.send(node, camera_down())
+    assert wire.source.nodes() == {"42": {"received": 300, "lost": 0}}
+    found = wire.poses.read(T0 + 5.05)
+    assert found.sample.lat_deg == pytest.approx(47.0 + 50.5e-5, abs=1e-8)
+    assert found.sample.altitude_m == pytest.approx(512.0)
+    assert found.sample.sigma_m == pytest.approx(0.02, abs=1e-3)
+    assert (found.sample.yaw_deg, found.sample.pitch_deg) == pytest.approx((30.0, -90.0), abs=0.2)
+    assert found.origin == dict.fromkeys(("position", "flight_yaw", "angles"), "DroneCAN node 42")
 
 
 def test_fixes_come_over_udp_multicast():
     pytest.importorskip("msgpack")
-    group = "udp_multicast:239.74.163.2"
-    poses = LivePoses("uav1", clock=lambda: 1_700_000_005.0)
+    poses = LivePoses("uav1")
+    number = 0
+    source, stop, node = CanSource(poses, clock=lambda: T0 + number / 10), threading.Event(), CanNode()
     try:  # packets stay on this machine
-        node = sender(can.Bus(interface="udp_multicast", channel="239.74.163.2", hop_limit=0))
-        source = CanSource(BusDriver(open_bus(group)), poses, clock=lambda: 1_700_000_005.0)
-    except (OSError, can.CanError, InputError) as error:
+        out = can.Bus(interface="udp_multicast", channel="239.74.163.2", hop_limit=0)
+        thread = threading.Thread(target=source.run, args=("udp_multicast:239.74.163.2", stop))
+        thread.start()
+    except (OSError, can.CanError) as error:
         pytest.skip(f"no multicast here: {error}")
-    with source:
-        for number in range(20):
-            node.broadcast(fix2(number))
-        deadline = time.monotonic() + 20.0
-        while source.received < 20 and time.monotonic() < deadline:
-            source.spin(0.05)
-    assert source.received == 20
-    node.close()
+    end = time.monotonic() + 20.0
+    while source.received < 3 and time.monotonic() < end:
+        node.send(out, fix_at(number))
+        time.sleep(0.02)
+        number += 1
+    stop.set()
+    thread.join(5.0)
+    out.shutdown()
+    assert source.received >= 3
+    assert 47.0 <= poses.latest.lat_deg < 47.01
 
 
-def test_an_rtk_receiver_on_the_bus_outdoes_the_autopilots_position():
-    from telemetry.samples.sample import Sample
+@pytest.mark.parametrize(("stated", "used"), [(0.02, "DroneCAN node 42"), (3.0, "MAVLink")])
+def test_the_position_with_the_lower_stated_sigma_is_used(wire, stated, used):
+    node = CanNode()
+    for tenth in range(20):
+        at = T0 + tenth / 10
+        wire.poses.add(Sample(time_s=at, lat_deg=47.1, lon_deg=8.0, height_m=60.0 + tenth))
+        wire.send(node, fix_at(tenth, stated), at)
+    found = wire.poses.read(T0 + 0.55)
+    assert found.origin["position"] == used
+    assert (found.sample.lat_deg < 47.05) == (used != "MAVLink")
+    assert found.sample.height_m == pytest.approx(65.5)  # the autopilot's, whichever position is used
+    wire.poses.add(Sample(time_s=T0 + 30.0, lat_deg=47.1, lon_deg=8.0))
+    assert wire.poses.at(T0 + 30.0).lat_deg == 47.1  # the receiver on the bus fell silent
 
-    poses = LivePoses("uav1")
+
+def test_what_the_autopilots_receiver_states_is_compared(wire):
+    dialect = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+    node = CanNode()
+    raw = dialect.MAVLink_gps_raw_int_message(0, 6, 471000000, 80000000, 0, 0, 0, 0, 0, 12, h_acc=14)
+    wire.poses.feed(raw, T0)
     for tenth in range(10):
-        at = 100.0 + tenth / 10
-        poses.add(Sample(time_s=at, lat_deg=47.0, lon_deg=8.0, height_m=60.0 + tenth))
-        poses.add(Sample(time_s=at, lat_deg=47.0001, lon_deg=8.0, sigma_m=0.02))
-    sample = poses.at(100.55)
-    assert (sample.lat_deg, sample.sigma_m, sample.height_m) == pytest.approx((47.0001, 0.02, 65.5))
-    poses.add(Sample(time_s=110.0, lat_deg=47.0, lon_deg=8.0))  # the receiver fell silent
-    assert poses.at(110.0).lat_deg == 47.0
+        message = dialect.MAVLink_global_position_int_message(
+            1000 + 100 * tenth, 471000000, 80000000, 572000, 60000, 0, 0, 0, 0
+        )
+        wire.poses.feed(message, T0 + tenth / 10)
+        wire.send(node, fix_at(tenth, 0.5), T0 + tenth / 10)
+    assert wire.poses.read(T0 + 0.5).origin["position"] == "MAVLink"
 
 
-def test_the_older_fix_is_read_where_the_newer_is_missing():
-    poses = LivePoses("uav1")
-    node = sender(can.Bus(interface="virtual", channel="t2"))
-    message = dronecan.uavcan.equipment.gnss.Fix()
-    message.latitude_deg_1e8, message.longitude_deg_1e8, message.status = 4_700_000_000, 825_000_000, 3
-    with CanSource(BusDriver(open_bus("virtual:t2")), poses) as source:
-        node.broadcast(message)
-        source.spin(0.2)
-        assert poses.latest.lat_deg == pytest.approx(47.0)
-        node.broadcast(fix2(1))
-        node.broadcast(message)
-        source.spin(0.2)
-        assert poses.latest.lat_deg == pytest.approx(47.00001)
-    node.close()
+def test_of_two_receivers_the_better_one_is_used_and_the_other_when_it_falls_silent(wire):
+    good, poor = CanNode(10), CanNode(11)
+    for tenth in range(40):
+        wire.send(poor, fix_at(tenth, 1.0, 47.5), T0 + tenth / 10)
+        if tenth < 20:
+            wire.send(good, fix_at(tenth, 0.02), T0 + tenth / 10)
+    assert wire.poses.read(T0 + 1.0).origin["position"] == "DroneCAN node 10"
+    assert wire.poses.read(T0 + 3.5).origin["position"] == "DroneCAN node 11"
+    assert set(wire.source.nodes()) == {"10", "11"}
 
 
-def test_the_bus_comes_through_mavlink_too():
+@pytest.mark.parametrize(("stated", "used"), [(0.5, "DroneCAN node 42"), (None, "MAVLink")])
+def test_the_gimbal_with_the_lower_stated_sigma_is_used(wire, stated, used):
+    for tenth in range(10):
+        at = T0 + tenth / 10
+        wire.poses.add(Sample(time_s=at, flight_yaw_deg=30.0, flight_pitch_deg=0.0, flight_roll_deg=0.0))
+        wire.poses.add(Sample(time_s=at, yaw_deg=90.0, pitch_deg=-80.0, roll_deg=0.0))
+        wire.send(CanNode(), camera_down(15.0, stated), at)  # a bus without an attitude of the airframe
+    found = wire.poses.read(T0 + 0.5)
+    assert found.origin["angles"] == used
+    assert found.sample.yaw_deg == pytest.approx(45.0 if stated else 90.0, abs=0.2)
+
+
+def test_an_exposure_takes_what_the_bus_knows_better(wire):
+    dialect = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+    node = CanNode()
+    for tenth in range(10):
+        wire.send(node, attitude(30.0), T0 + tenth / 10)
+        wire.send(node, fix_at(tenth))
+        wire.send(node, camera_down(sigma_deg=0.5))
+    feedback = dialect.MAVLink_camera_feedback_message(
+        round((T0 + 0.5) * 1e6), 1, 0, 7, 471000000, 80000000, 512.0, 60.0, 0.0, 0.0, 99.0, 0.0, 0
+    )
+    event = wire.poses.feed(feedback, T0 + 0.6)
+    assert event.sample.lat_deg == pytest.approx(47.00005, abs=1e-7)
+    assert event.sample.yaw_deg == pytest.approx(30.0, abs=0.2)
+    assert event.sample.height_m == 60.0
+
+
+def test_the_older_fix_is_read_where_the_newer_is_missing(wire):
+    node = CanNode()
+    wire.send(node, fix(46.0, 8.25, 512.0), T0)
+    assert wire.poses.latest.lat_deg == pytest.approx(46.0)
+    wire.send(node, fix_at(1), T0 + 1)
+    wire.send(node, fix(46.0, 8.25, 512.0), T0 + 2)
+    assert wire.poses.latest.lat_deg == pytest.approx(47.00001)
+
+
+@pytest.mark.parametrize("fd", [False, True])
+def test_the_bus_comes_through_mavlink_too(fd):
     mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
-    frames = []
-
-    class Recorder(TunnelDriver):
-        def send_frame(self, frame):
-            frames.append(frame)
-
-    node = dronecan.node.Node(Recorder(), node_id=42)
-    for number in range(200):
-        node.broadcast(fix2(number))
+    now = [T0]
     poses = LivePoses("uav1")
-    source = CanSource(TunnelDriver(), poses)
-    for frame in frames:
-        data = list(bytes(frame.data)) + [0] * (8 - len(frame.data))
-        source.feed(mavlink.MAVLink_can_frame_message(0, 0, 0, len(frame.data), frame.id | 0x80000000, data))
+    source, node = CanSource(poses, clock=lambda: now[0]), CanNode(fd=fd)
+    make, size = (mavlink.MAVLink_canfd_frame_message, 64) if fd else (mavlink.MAVLink_can_frame_message, 8)
+    for number in range(200):
+        now[0] = T0 + number / 10
+        for identifier, data in node.frames(fix_at(number)):
+            padded = list(data) + [0] * (size - len(data))
+            source.feed(make(0, 0, 0, len(data), identifier | 0x80000000, padded))
     assert source.received == 200
     assert poses.latest.lat_deg == pytest.approx(47.0 + 199e-5)
 
 
 def test_reading_ends_when_told_to():
     stop = threading.Event()
-    with CanSource.open("virtual:t3", LivePoses("uav1")) as source:
-        thread = threading.Thread(target=source.run, args=(stop,))
-        thread.start()
-        stop.set()
-        thread.join(5.0)
-        assert not thread.is_alive()
+    source = CanSource(LivePoses("uav1"))
+    thread = threading.Thread(target=source.run, args=("virtual:ends", stop))
+    thread.start()
+    stop.set()
+    thread.join(5.0)
+    assert not thread.is_alive()
 
 
-def test_damaged_frames_are_dropped():
-    rng = np.random.default_rng(0)
-    poses = LivePoses("uav1")
-    node = sender(can.Bus(interface="virtual", channel="t4"))
-    noise = can.Bus(interface="virtual", channel="t4")
-    with CanSource(BusDriver(open_bus("virtual:t4")), poses) as source:
-        for number in range(50):
+def test_lost_frames_cost_their_messages_only_and_are_counted(wire):
+    rng, node = np.random.default_rng(0), CanNode()
+    for number in range(300):
+        wire.now = T0 + number / 10
+        kept = [m for m in node.messages(fix_at(number)) if rng.random() > 0.02]
+        for message in kept:
+            wire.out.send(message)
+        wire.take()
+    count = wire.source.nodes()["42"]
+    assert count["received"] + count["lost"] == pytest.approx(300, abs=2)
+    assert 200 < count["received"] < 300
+    span = [wire.poses.at(T0 + t).lat_deg for t in np.arange(0.5, 29.0, 0.1)]
+    known = np.array([(t, v) for t, v in zip(np.arange(0.5, 29.0, 0.1), span, strict=True) if v is not None])
+    assert len(known) > 0.95 * len(span)
+    assert np.abs(known[:, 1] - (47.0 + 1e-4 * known[:, 0])).max() < 1e-8
+
+
+def test_a_babbling_node_neither_moves_nor_stops_the_others(wire):
+    rng, node, babbler = np.random.default_rng(0), CanNode(), CanNode(77)
+    for number in range(50):
+        wire.now = T0 + number / 10
+        for _ in range(40):  # noise under all identifiers, and under those of the messages that are read
             data = bytes(rng.integers(0, 256, int(rng.integers(0, 9)), dtype=np.uint8))
-            ident = int(rng.integers(0, 1 << 29)) if number % 2 else 0x18042701 | 42
-            noise.send(can.Message(arbitration_id=ident, data=data, is_extended_id=True))
-            node.broadcast(fix2(number))
-            source.spin(0.0)
-        source.spin(0.2)
-    noise.shutdown()
-    node.close()
-    assert source.received >= 40
-    assert 47.0 <= poses.latest.lat_deg < 47.001
+            kind = int(rng.choice([1000, 1044, 1060, 1063, int(rng.integers(0, 1 << 16))]))
+            wire.out.send(can.Message(arbitration_id=16 << 24 | kind << 8 | 77, data=data, is_extended_id=True))
+        for _ in range(20):  # and one valid message over and over
+            babbler.send(wire.out, fix_at(0, 50.0, 10.0))
+        node.send(wire.out, fix_at(number))
+        wire.take()
+    assert wire.source.nodes()["42"] == {"received": 50, "lost": 0}
+    assert wire.source.nodes()["77"]["received"] <= 120
+    found = wire.poses.read(T0 + 2.55)
+    assert found.origin["position"] == "DroneCAN node 42"
+    assert found.sample.lat_deg == pytest.approx(47.0 + 25.5e-5, abs=1e-8)
 
 
 def test_a_bus_that_is_not_there_is_one_clear_error():

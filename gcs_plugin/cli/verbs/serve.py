@@ -17,7 +17,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
         "Starts without links, basemap or configuration; what a workspace holds is gone on with.\n"
-        "LINK is udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.\n\n"
+        "LINK is udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.\n"
+        "Give --source twice for a vehicle's pictures and its CAN bus (can:socketcan:can0, can:slcan:/dev/ttyACM0,\n"
+        "can:udp_multicast:239.74.163.2, or can:mavlink for the bus behind the vehicle's own link).\n\n"
         "example:\n  orthoswarm serve --link udpin:0.0.0.0:14550 --basemap before.tif --workspace flood"
     )
     add = parser.add_argument
@@ -30,7 +32,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm (default 70)")
     add("--gsd", type=float, metavar="M", help="ground pixel of the map (default: that of the first pictures)")
     add("--workers", type=int, metavar="N", help="processes that refine (default: one less than cores)")
-    add("--source", action="append", default=[], metavar="ID=WHERE", help="pictures of a vehicle: stream or folder")
+    add(
+        "--source",
+        action="append",
+        default=[],
+        metavar="ID=WHERE",
+        help="pictures of a vehicle (stream or folder), or its CAN bus: can:socketcan:can0, can:mavlink",
+    )
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
     add("--end-with-input", action="store_true", help="end when standard input ends, so with the program that holds it")
     add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
@@ -96,6 +104,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     """The workspace's file, with the flags over it."""
     from dataclasses import replace
 
+    from gcs_plugin.daemon.intake.can_reader import CAN
     from gcs_plugin.daemon.settings import VehicleSettings, read_settings
     from orthoswarm.compute.workers import cores
     from orthoswarm.model.errors import InputError
@@ -113,7 +122,8 @@ def settings_of(args: argparse.Namespace) -> "Settings":
         name, _, where = text.partition("=")
         if not name or not where:
             raise InputError(f"--source {text} is no ID=WHERE; for example v1=udp://0.0.0.0:5600")
-        vehicles[name] = replace(vehicles.get(name, VehicleSettings(name)), pictures=where)
+        where_to = {"can": where.removeprefix(CAN)} if where.startswith(CAN) else {"pictures": where}
+        vehicles[name] = replace(vehicles.get(name, VehicleSettings(name)), **where_to)
     return replace(settings, vehicles=tuple(vehicles.values())).check()
 
 

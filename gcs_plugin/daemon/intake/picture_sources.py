@@ -11,6 +11,7 @@ from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from gcs_plugin.daemon.intake.watched_folder import FolderReader, PictureIntake
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
+from telemetry.live.live_poses import LinkPose
 from telemetry.samples.sample import Sample
 
 _SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
@@ -18,7 +19,7 @@ _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://
 STREAM_THREAD: Final = "pictures of "
 _log = logging.getLogger(__name__)
 
-PoseAt = Callable[[str, float], Sample | None]
+PoseAt = Callable[[str, float], LinkPose | None]
 Take = Callable[[PostedPose, bytes], tuple[int, bool]]
 LinkLog = Callable[[str, Path], bool]
 
@@ -35,7 +36,7 @@ class Source:
         vehicle: id.
         where: stream or folder.
         take: takes a picture in.
-        pose_at: the vehicle's pose at a moment from its link, for pictures without one of their own.
+        pose_at: the vehicle's pose at a moment from its link and bus, for pictures without one of their own.
         tell: told what happens, in words.
         cache: folder for pictures of videos, and for what is remembered of folders.
         settled: told of a vehicle whose folder has come to rest after new pictures.
@@ -124,19 +125,22 @@ class Source:
             if picture.damaged:
                 continue
             name = f"live-{picture.time_s:.3f}.jpg"
-            self._offer(name, picture.time_s, picture.sample, partial(encode_jpeg, picture.rgb))
+            self._offer(name, picture.time_s, picture.sample, picture.origin, partial(encode_jpeg, picture.rgb))
 
-    def _offer(self, name: str, time_s: float, sample: Sample | None, data: Callable[[], bytes]) -> None:
+    def _offer(self, name: str, time_s: float, sample: Sample | None, origin: str, data: Callable[[], bytes]) -> None:
         """Take a picture with the pose that it carries, gaps filled from the vehicle's link."""
         own = sample if sample is not None else Sample()
+        given = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
+        origins = {name: origin for name, value in given.items() if value is not None}
         if not own.has_position or own.yaw_deg is None or own.height_m is None:
             linked = self._pose_at(self.vehicle, time_s)
-            own = own if linked is None else own.merge(linked)
+            if linked is not None:
+                own, origins = own.merge(linked.sample), linked.origin | origins
         values = pose_values(own)
         if values is None:
             self._without_pose += 1
             return
-        self._keep(PostedPose(self.vehicle, name, time_s, values), data())
+        self._keep(PostedPose(self.vehicle, name, time_s, values, origins), data())
 
     def _keep(self, pose: PostedPose, data: bytes) -> None:
         """Take a picture in; with the disk full, wait until there is room."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from orthoswarm.model.frame import Fix, Frame
+from telemetry.live.live_poses import LinkPose
 from telemetry.samples.sample import Sample
 
 
@@ -30,6 +31,12 @@ def pose_values(sample: Sample) -> dict[str, float] | None:
     return values
 
 
+def linked_pose(vehicle: str, name: str, time_s: float | None, linked: LinkPose | None) -> PostedPose | None:
+    """What a vehicle's link and bus say as if it had been posted; None without a position."""
+    values = None if linked is None else pose_values(linked.sample)
+    return None if linked is None or values is None else PostedPose(vehicle, name, time_s, values, linked.origin)
+
+
 def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
     """A frame of a file as if it had been posted."""
     values: dict[str, float] = {}
@@ -41,4 +48,4 @@ def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
             values[key] = math.degrees(value) if degrees else float(value)
     if frame.fov_hint_rad is not None:
         values["fov_deg"] = math.degrees(frame.fov_hint_rad)
-    return PostedPose(vehicle, name, frame.time_s, values)
+    return PostedPose(vehicle, name, frame.time_s, values, dict(frame.origin))

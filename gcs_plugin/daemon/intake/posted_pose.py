@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -26,12 +26,14 @@ class PostedPose:
     Attributes:
         vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if it was not said.
         values: lat_deg, lon_deg and what else is known, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE.
+        origin: where position, height, angles and time are from, as far as that is known.
     """
 
     vehicle: str
     image: str
     time_s: float | None
     values: dict[str, float]
+    origin: dict[str, str] = field(default_factory=dict)
 
     @property
     def has_fix(self) -> bool:
@@ -93,7 +95,7 @@ def parse_time(value: Any) -> float | None:
 
 def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str, time_s: float | None,
              size: tuple[int, int]) -> Frame:  # fmt: skip
-    """The frame of a stored picture and the pose values that `parse_pose` gave."""
+    """The frame of a stored picture and the pose values that `parse_pose` gave, with their `origin` if known."""
     v = dict(values)
 
     def radians(key: str) -> float | None:
@@ -104,7 +106,8 @@ def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str,
         lat_deg, lon_deg, v.get("height_m"), v.get("altitude_m"), radians("yaw_deg"), radians("pitch_deg"),
         radians("roll_deg"), radians("flight_yaw_deg"), v.get("position_sigma_m"), bool(v.get("height_is_ground")),
     )  # fmt: skip
-    return Frame(image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=radians("fov_deg"))
+    hint, origin = radians("fov_deg"), v.get("origin", {})
+    return Frame(image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=hint, origin=origin)
 
 
 def _text(document: Mapping[str, Any], key: str, default: str | None = None) -> str:

@@ -13,16 +13,16 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
 from gcs_plugin.daemon.intake.folder_state import FolderState, Stamp, digest_of, video_digest
-from gcs_plugin.daemon.intake.pose_relay import apart_m, pose_values, posted_frame
+from gcs_plugin.daemon.intake.pose_relay import apart_m, linked_pose, posted_frame
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from orthoswarm.model.errors import OrthoSwarmError
-from telemetry.samples.sample import Sample
+from telemetry.live.live_poses import LinkPose
 
 if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame, Ingest, Rejection
@@ -40,7 +40,7 @@ _AGAIN_S: Final = (20.0, 600.0)
 _NEAR_M: Final = 50.0
 _log = logging.getLogger(__name__)
 
-PoseAt = Callable[[float], Sample | None]
+PoseAt = Callable[[float], LinkPose | None]
 Keep = Callable[[PostedPose, bytes], None]
 LinkLog = Callable[[Path], bool]
 
@@ -248,13 +248,13 @@ class FolderReader:
             if rejection is None or not rejection.lacks_position:
                 _log.warning("%s: %s", self._name(path), rejection.reason if rejection else "it gives no picture")
                 continue
-            pose = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
-            values = None if pose is None else pose_values(pose)
-            if values is None:
+            linked = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
+            name = self._taken.name(self._name(path), digest)
+            posted = linked_pose(self._intake.vehicle, name, rejection.time_s, linked)
+            if posted is None:
                 self.poseless.add(path)
                 continue
-            name = self._taken.name(self._name(path), digest)
-            self._intake.keep(PostedPose(self._intake.vehicle, name, rejection.time_s, values), data)
+            self._intake.keep(posted, data)
             self._done(path, digest)
 
     def _take_video(self, path: Path, now: float) -> None:
@@ -298,12 +298,11 @@ class FolderReader:
         """Take a frame in; height and angles that it lacks come from the link, if that agrees where it was."""
         posted = posted_frame(frame, self._intake.vehicle, name)
         if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
-            linked = self._intake.pose_at(posted.time_s)
-            values = None if linked is None else pose_values(linked)
-            if values is not None and apart_m(values, posted.values) < _NEAR_M:
+            linked = linked_pose(posted.vehicle, name, posted.time_s, self._intake.pose_at(posted.time_s))
+            if linked is not None and apart_m(linked.values, posted.values) < _NEAR_M:
                 for key in ("lat_deg", "lon_deg", "position_sigma_m", "altitude_m"):
-                    values.pop(key, None)
-                posted = PostedPose(posted.vehicle, posted.image, posted.time_s, values | posted.values)
+                    linked.values.pop(key, None)
+                posted = replace(posted, values=linked.values | posted.values, origin=linked.origin | posted.origin)
         self._intake.keep(posted, data)
 
     def _done(self, path: Path, digest: str) -> None:

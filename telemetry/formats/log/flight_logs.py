@@ -1,4 +1,4 @@
-"""Flight logs: tlog, ArduPilot's DataFlash .BIN, PX4's .ulg, lists of exposures; poses and camera events.
+"""Flight logs: tlog, ArduPilot's DataFlash .BIN, PX4's .ulg, CAN buses, lists of exposures; poses and camera events.
 
 All give the same: samples over UTC and exposures in order. Readers take only the messages they need and survive
 truncation and damage: a bad record is skipped, the next good one found.
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
+from telemetry.formats.log.can_log import read_can_log
 from telemetry.formats.log.dataflash import read_dataflash
 from telemetry.formats.log.exposure_list import read_exposure_list
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
@@ -35,10 +37,11 @@ def read_log(path: Path) -> list[FlightLog]:
         ".ulg": lambda p: [read_ulog(p)],
         ".pos": lambda p: [read_exposure_list(p)],
         ".mrk": lambda p: [read_exposure_list(p)],
+        **dict.fromkeys(CAN_LOGS, lambda p: [read_can_log(p)]),
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg, .pos, .MRK)")
+        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg, .pos, .MRK, .log, .asc, .blf, .trc)")
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")
@@ -217,6 +220,7 @@ class _TlogVehicle:
     def log(self, path: Path, system: int) -> FlightLog:
         self._close()
         log = FlightLog(path, "tlog", f"sysid{system}", *self._done, has_gimbal=self._poses.has_gimbal)
+        log.position_sigma_m = self._poses.position_sigma_m
         if self._poses.reboots:
             text = f"the vehicle of {path.name} was started again {plural(self._poses.reboots, 'time')}"
             log.findings.append(Finding("reboot", text))

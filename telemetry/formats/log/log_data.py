@@ -30,10 +30,11 @@ class FlightLog:
     """One vehicle's log.
 
     Attributes:
-        path: the file. kind: "tlog", "DataFlash" or "ULog". vehicle: "sysid3" or the file's name.
+        path: the file. kind: "tlog", "DataFlash", "ULog", "DroneCAN" and so on. vehicle: "sysid3" or the file's name.
         samples: poses over UTC, in order. events: exposures, in order.
         has_gimbal: whether the camera's own attitude was logged.
         findings: what is odd.
+        position_sigma_m: horizontal sigma that the autopilot's receiver stated last, None where it stated none.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class FlightLog:
     events: list[CameraEvent] = field(default_factory=list)
     has_gimbal: bool = False
     findings: list[Finding] = field(default_factory=list)
+    position_sigma_m: float | None = None
 
     def timeline(self) -> Timeline:
         """Its poses, for reading at any moment."""

@@ -23,6 +23,7 @@ _LEAST_HEIGHT_M = 0.5
 _EARLIEST_UTC_S = 946_684_800.0  # 2000-01-01: clocks before that were never set
 _DOWNWARD = 25
 _REBOOT_S = 10.0
+_MOST_H_ACC_MM = 1_000_000
 _LOOKS_DOWN = 0.7
 """Sine of 45 degrees: no airframe flies that far nose down."""
 
@@ -30,7 +31,7 @@ TYPES = frozenset(
     {
         "SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "GIMBAL_DEVICE_ATTITUDE_STATUS",
         "MOUNT_ORIENTATION", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "CAMERA_TRIGGER",
-        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR", "HOME_POSITION",
+        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR", "HOME_POSITION", "GPS_RAW_INT",
     }
 )  # fmt: skip
 """Message types that say anything here."""
@@ -61,6 +62,7 @@ class MavlinkPoses:
         utc_minus_boot_s: what to add to times since boot, None until the vehicle knows UTC.
         heading_deg: of the airframe, latest. has_gimbal: whether any gimbal reported.
         reboots: how often the time since boot went back. home_altitude_m: altitude of home over the sea.
+        position_sigma_m: horizontal sigma that the receiver states, None where it states none.
     """
 
     utc_minus_boot_s: float | None = None
@@ -68,6 +70,7 @@ class MavlinkPoses:
     has_gimbal: bool = False
     reboots: int = 0
     home_altitude_m: float | None = None
+    position_sigma_m: float | None = None
     _boot_s: float = field(default=0.0, repr=False)
 
     def feed(self, message: Any) -> Sample | CameraEvent | None:
@@ -146,6 +149,10 @@ class MavlinkPoses:
 
     def _home(self, m: Any) -> None:
         self.home_altitude_m = m.altitude * 1e-3
+
+    def _receiver(self, m: Any) -> None:
+        stated = getattr(m, "h_acc", 0)  # an extension that MAVLink 1 does not have
+        self.position_sigma_m = stated * 1e-3 if 0 < stated < _MOST_H_ACC_MM else None
 
     def _terrain(self, m: Any) -> Sample | None:
         return _above_ground(m.current_height) if m.loaded else None
@@ -280,6 +287,7 @@ _HANDLERS: dict[str, Any] = {
     "RANGEFINDER": MavlinkPoses._rangefinder,
     "DISTANCE_SENSOR": MavlinkPoses._distance,
     "HOME_POSITION": MavlinkPoses._home,
+    "GPS_RAW_INT": MavlinkPoses._receiver,
     "CAMERA_FEEDBACK": MavlinkPoses._feedback,
     "CAMERA_IMAGE_CAPTURED": MavlinkPoses._captured,
     "CAMERA_TRIGGER": MavlinkPoses._trigger,

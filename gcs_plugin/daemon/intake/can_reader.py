@@ -1,0 +1,175 @@
+"""A vehicle's CAN bus, read into its poses: over an adapter, or through the vehicle's own MAVLink link.
+
+Through the link the vehicle forwards its bus as CAN_FRAME and CANFD_FRAME messages for as long as it is asked to
+(MAV_CMD_CAN_FORWARD); it is asked to forward the few messages that are read, and nothing else (CAN_FILTER_MODIFY).
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from telemetry.live.live_poses import LivePoses
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.links.mavlink import Message
+
+CAN: Final = "can:"
+"""What a source on a CAN bus begins with: can:socketcan:can0, can:slcan:/dev/ttyACM0, can:mavlink."""
+
+_TUNNEL: Final = "mavlink"
+_AGAIN_S: Final = 2.0
+_ASK_S: Final = 1.0  # ArduPilot stops 5 s after it was asked last
+_SILENT_S: Final = 5.0
+_log = logging.getLogger(__name__)
+
+
+def check_bus(bus: str) -> None:
+    """Check the name of a bus without opening it.
+
+    Raises:
+        InputError: there is no such kind of bus.
+    """
+    import can
+
+    kind, _, channel = bus.partition(":")
+    if kind == _TUNNEL and channel in ("", "1", "2", "3"):
+        return
+    if kind not in can.VALID_INTERFACES or not channel:
+        raise InputError(
+            f"'{CAN}{bus}' names no CAN bus; for example can:socketcan:can0, can:slcan:/dev/ttyACM0@1000000, "
+            "can:udp_multicast:239.74.163.2, can:mavlink (the vehicle's first bus) or can:mavlink:2"
+        )
+
+
+class CanReader:
+    """Reads one vehicle's bus in a thread of its own.
+
+    Attributes:
+        vehicle: id.
+    """
+
+    def __init__(
+        self,
+        vehicle: str,
+        bus: str,
+        poses: LivePoses,
+        tell: Callable[[str], None],
+        fleet: "Fleet | None",
+        system: int | None,
+    ) -> None:
+        """Make ready to read.
+
+        Args:
+            vehicle: id. bus: for example "socketcan:can0", or "mavlink" for the one behind the vehicle's link.
+            poses: of the vehicle; what the bus tells goes there.
+            tell: called with what happens, in words.
+            fleet: the links; None without any. system: the vehicle's MAVLink system id, None without.
+
+        Raises:
+            InputError: the bus is behind a link, and there is none.
+        """
+        from telemetry.live.dronecan_bus import CanSource
+
+        self.vehicle = vehicle
+        self._bus, self._tell, self._state = bus, tell, "waiting"
+        self._source = CanSource(poses)
+        self._stop = threading.Event()
+        self._heard, self._count = float("-inf"), 0
+        run: Callable[[], None] = self._read
+        if bus.partition(":")[0] == _TUNNEL:
+            if fleet is None or system is None:
+                raise InputError(
+                    f"the CAN bus of {vehicle} is behind its MAVLink link, and there is none; give --link, and the "
+                    f"vehicle's system id in the workspace's orthoswarm.toml where its name is not v1 to v255"
+                )
+            tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source.feed)
+            run = tunnel.run_until(self._stop)
+        self._thread = threading.Thread(target=run, name=f"CAN bus of {vehicle}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(5.0)
+
+    def document(self) -> dict[str, Any]:
+        """Its state as JSON values: `bus`, `state` and, by node id, messages `received` and `lost`."""
+        now, count = time.monotonic(), self._source.received
+        if count != self._count:
+            self._heard, self._count = now, count
+        state = "receiving" if now - self._heard < _SILENT_S else self._state
+        return {"bus": self._bus, "state": state, "nodes": self._source.nodes()}
+
+    def _read(self) -> None:
+        import can
+
+        while not self._stop.is_set():
+            try:
+                self._say("waiting")
+                self._source.run(self._bus, self._stop)
+                return
+            except (OrthoSwarmError, OSError, can.CanError) as error:
+                self._say(str(error))
+            self._stop.wait(_AGAIN_S)
+
+    def _say(self, state: str) -> None:
+        if state != self._state and state != "waiting":
+            self._tell(f"the CAN bus of {self.vehicle}: {state}")
+        self._state = state
+
+
+class _Tunnel:
+    """Asks a vehicle for the frames of one of its buses, and takes them from its link."""
+
+    def __init__(self, fleet: "Fleet", system: int, bus: int, take: Callable[[Any], None]) -> None:
+        self._fleet, self._system, self._bus, self._take = fleet, system, bus, take
+        fleet.subscribe(self._message, "CAN_FRAME", "CANFD_FRAME")
+
+    def run_until(self, stop: threading.Event) -> Callable[[], None]:
+        """What asks again and again until stopped."""
+
+        def run() -> None:
+            while not stop.is_set():
+                self._fleet.call(self._ask)
+                stop.wait(_ASK_S)
+            self._fleet.call(lambda: self._send([self._forward(0)]))
+
+        return run
+
+    def _message(self, vehicle: "Vehicle", message: "Message", utc_s: float) -> None:
+        if vehicle.system == self._system and message.bus in (self._bus - 1, self._bus):
+            self._take(message)
+
+    def _ask(self) -> None:
+        from gcs_plugin.links.mavlink import dialect
+        from telemetry.formats.log.dronecan_poses import MESSAGES
+
+        kinds = [*MESSAGES, *([0] * (16 - len(MESSAGES)))]
+        only = dialect.MAVLink_can_filter_modify_message(
+            self._system, 1, self._bus - 1, dialect.CAN_FILTER_REPLACE, len(MESSAGES), kinds
+        )
+        self._send([self._forward(self._bus), only])
+
+    def _forward(self, bus: int) -> "Message":
+        from gcs_plugin.links.mavlink import dialect
+
+        command = dialect.MAV_CMD_CAN_FORWARD
+        return dialect.MAVLink_command_long_message(self._system, 1, command, 0, bus, 0, 0, 0, 0, 0, 0)
+
+    def _send(self, messages: "list[Message]") -> None:
+        """In the fleet's thread; nothing while the vehicle is not heard."""
+        vehicle = self._fleet.vehicles.get(self._system)
+        if vehicle is None or vehicle.lost:
+            return
+        for route in vehicle.routes.towards(time.monotonic(), everywhere=False):
+            for message in messages:
+                self._fleet.hub.send(route.side, route.peer, message)

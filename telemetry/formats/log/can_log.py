@@ -1,0 +1,155 @@
+"""Logs of a CAN bus with DroneCAN on it: candump's .log, Vector's .asc and .blf, PEAK's .trc, by python-can's readers.
+
+Several nodes may tell the same thing; at each moment the one with the lowest stated sigma counts. Fixes carry UTC,
+which dates the rest of the log; without them the log's own times count where they are dates.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from telemetry.formats.log.dronecan_poses import DronecanPoses, NodePose
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+
+SUFFIXES: Final = frozenset({".log", ".asc", ".blf", ".trc"})
+
+_EARLIEST_UTC_S: Final = 946_684_800.0
+_MOST_DAMAGE: Final = 1000
+_SILENT_S: Final = 2.0
+_UNSTATED: Final = float("inf")
+_HEADS: Final = {
+    ".log": re.compile(rb"\s*\(\d+\.\d+\)\s+\S+\s+[0-9A-Fa-f]{3,8}#"),
+    ".asc": re.compile(rb"(\s*//[^\n]*\n)*\s*(date|base)\s", re.IGNORECASE),
+    ".blf": re.compile(rb"LOGG"),
+    ".trc": re.compile(rb"\s*;"),
+}
+
+
+def is_can_log(path: Path) -> bool:
+    """Whether a file begins as a log of a CAN bus does; others have these suffixes, too."""
+    head = _HEADS.get(path.suffix.lower())
+    try:
+        with path.open("rb") as handle:
+            return head is not None and head.match(handle.read(4096)) is not None
+    except OSError:
+        return False
+
+
+@dataclass(slots=True)
+class _Reading:
+    """What a log has given so far: poses, those of them without a date, frames, and places that are damaged."""
+
+    poses: list[tuple[str, NodePose]] = field(default_factory=list)
+    undated: list[tuple[DronecanPoses, NodePose]] = field(default_factory=list)
+    frames: int = 0
+    damaged: int = 0
+
+
+def read_can_log(path: Path) -> FlightLog:
+    """Read the positions and attitudes that nodes have told on a bus.
+
+    Raises:
+        OSError: it cannot be read. NotALog: it holds no CAN frame, or no DroneCAN message that is read here.
+    """
+    if not is_can_log(path):
+        raise NotALog(f"the file is no log of a CAN bus ({', '.join(sorted(SUFFIXES))}); it is left out")
+    reading, buses = _Reading(), dict[str, DronecanPoses]()
+    for message in _messages(path, reading):
+        reading.frames += 1
+        if message.is_extended_id and not message.is_error_frame and not message.is_remote_frame:
+            channel = str(message.channel)
+            _take(reading, buses.setdefault(channel, DronecanPoses()), channel, message)
+    if not reading.frames:
+        raise NotALog("the log holds no CAN frame that can be read; record it again")
+    if not reading.poses:
+        raise NotALog("the CAN log holds no DroneCAN position or attitude (gnss.Fix2, ahrs.Solution, gimbal Status)")
+    for bus, pose in reading.undated:
+        pose.sample.time_s = bus.utc(pose.sample.time_s or 0.0)
+    poses = [(key, pose) for key, pose in reading.poses if (pose.sample.time_s or 0.0) > _EARLIEST_UTC_S]
+    log = FlightLog(path, "DroneCAN", path.stem)
+    for kind in ("lat_deg", "flight_yaw_deg", "yaw_deg"):
+        log.samples += _best([(key, pose) for key, pose in poses if getattr(pose.sample, kind) is not None])
+    log.has_gimbal = any(sample.yaw_deg is not None for sample in log.samples)
+    log.findings = _findings(path, reading, buses, len(reading.poses) - len(poses))
+    return log
+
+
+def _take(reading: _Reading, bus: DronecanPoses, channel: str, message: Any) -> None:
+    pose = bus.feed(message.arbitration_id, bytes(message.data), message.timestamp, fd=message.is_fd)
+    if pose is None:
+        return
+    reading.poses.append((f"{channel}, node {pose.node}", pose))
+    if not bus.knows_utc:
+        reading.undated.append((bus, pose))
+
+
+def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
+    """The frames of a log; damaged places are skipped."""
+    import can
+
+    log = None
+    try:
+        log = can.LogReader(str(path))
+        while reading.damaged < _MOST_DAMAGE:
+            try:
+                yield from log
+                return
+            except OSError:
+                raise
+            except Exception:  # its readers promise nothing about damaged files; the next line or record may be whole
+                reading.damaged += 1
+    except OSError:
+        raise
+    except Exception as error:
+        raise NotALog(f"the CAN log cannot be read ({type(error).__name__}: {error}); record it again") from None
+    finally:
+        if log is not None:
+            log.stop()
+
+
+def _best(poses: list[tuple[str, NodePose]]) -> list[Sample]:
+    """Poses of one kind: of each node those of which no node with a lower sigma tells at that time."""
+    nodes: dict[str, list[NodePose]] = {}
+    for key, pose in poses:
+        nodes.setdefault(key, []).append(pose)
+
+    def sigma(key: str) -> float:
+        return float(np.median([_UNSTATED if pose.sigma is None else pose.sigma for pose in nodes[key]]))
+
+    taken: list[Sample] = []
+    times = np.zeros(0)
+    for key in sorted(nodes, key=sigma):
+        fresh: list[Sample] = []
+        for pose in nodes[key]:
+            time_s = pose.sample.time_s or 0.0
+            at = int(np.searchsorted(times, time_s))
+            told = any(abs(times[i] - time_s) < _SILENT_S for i in (at - 1, at) if 0 <= i < len(times))
+            if not told and (not fresh or not 0.0 <= time_s - (fresh[-1].time_s or 0.0) < LEAST_STEP_S):
+                fresh.append(pose.sample)
+        taken += fresh
+        times = np.sort([sample.time_s or 0.0 for sample in taken])
+    return taken
+
+
+def _findings(path: Path, reading: _Reading, buses: dict[str, DronecanPoses], undated: int) -> list[Finding]:
+    found = []
+    if reading.damaged:
+        text = f"{plural(reading.damaged, 'place')} of {path.name} are damaged and were skipped"
+        found.append(Finding("can-damaged", text))
+    if undated:
+        text = f"{plural(undated, 'message')} of {path.name} have no date: no receiver on the bus told UTC"
+        found.append(Finding("can-undated", text))
+    for bus in buses.values():
+        for node, lost in sorted(bus.lost.items()):
+            if lost > 0.02 * bus.received[node]:
+                text = (
+                    f"{plural(lost, 'message')} of node {node} are missing in {path.name} ({bus.received[node]} came)"
+                )
+                found.append(Finding("can-lost", text, note=True))
+    return found

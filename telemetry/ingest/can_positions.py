@@ -1,0 +1,65 @@
+"""A log of a vehicle's CAN bus beside its autopilot's log: what the bus knows better is used in its place."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from orthoswarm.config.records import RecordsConfig
+from telemetry.formats.log.log_data import FlightLog
+from telemetry.samples.course import EARTH_RADIUS_M
+from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
+
+_SAME_VEHICLE_M = 20.0
+_LEAST_COMMON = 10
+_POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
+
+
+def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
+    """Median distance of the tracks of two logs in metres; None where they have too little time in common."""
+    own = [sample for sample in log.samples if sample.has_position]
+    if not own:
+        return None
+    times = np.array([sample.time_s for sample in own])
+    track = bus.timeline()
+    lat, lon = (np.array([getattr(s, name) for s in own], np.float64) for name in ("lat_deg", "lon_deg"))
+    north = np.radians(track.values("lat_deg", times) - lat)
+    east = np.radians(track.values("lon_deg", times) - lon) * np.cos(np.radians(lat))
+    distance = EARTH_RADIUS_M * np.hypot(north, east)
+    common = distance[np.isfinite(distance)]
+    return float(np.median(common)) if len(common) >= _LEAST_COMMON else None
+
+
+def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
+    """An autopilot's log with what its vehicle's bus states a lower sigma for, and what that is, in words.
+
+    Positions are compared by their stated sigmas; a position whose sigma nobody states counts as 1.5 m. A gimbal on
+    the bus is used where the autopilot reports none. None where the logs are not of one vehicle, or nothing is better.
+    """
+    distance = apart_m(log, bus)
+    if distance is None or distance > _SAME_VEHICLE_M:
+        return None
+    track = bus.timeline()
+    sigma_m = log.position_sigma_m or RecordsConfig().position_sigma_m
+    samples = [_placed(sample, track, sigma_m) for sample in log.samples]
+    events = [replace(event, sample=_placed(event.sample, track, sigma_m)) for event in log.events]
+    changed = sum(new is not old for new, old in zip(samples, log.samples, strict=True))
+    better = ["positions"] if changed else []
+    gimbal = bus.has_gimbal and not log.has_gimbal
+    if gimbal:
+        better.append("camera angles")
+        samples += [sample for sample in bus.samples if sample.yaw_deg is not None]
+        samples.sort(key=lambda sample: sample.time_s or 0.0)
+    if not better:
+        return None
+    return replace(log, samples=samples, events=events, has_gimbal=log.has_gimbal or gimbal), better
+
+
+def _placed(sample: Sample, track: Timeline, sigma_m: float) -> Sample:
+    """A sample at the position of the bus, where that is known then and better; else the sample itself."""
+    if not sample.has_position or sample.time_s is None:
+        return sample
+    known = track.at(sample.time_s)
+    if not known.has_position or (known.sigma_m or RecordsConfig().position_sigma_m) >= (sample.sigma_m or sigma_m):
+        return sample
+    return replace(sample, **{name: getattr(known, name) for name in _POSITION})

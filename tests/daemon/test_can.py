@@ -1,0 +1,194 @@
+"""A vehicle's CAN bus beside its MAVLink link: pictures are placed by whichever states the lower sigma."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.settings import Settings, VehicleSettings
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.sim.multirotor import Airframe
+from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.errors import InputError
+from tests.daemon.test_daemon_flight import fly, square
+from tests.kit.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
+from tests.kit.mosaic_scene import EAST, NORTH
+
+can = pytest.importorskip("can")
+pytest.importorskip("dronecan")
+pytest.importorskip("msgpack")
+
+from tests.kit.can_node import CanNode, attitude, camera_down, fix2  # noqa: E402
+
+GROUP = "239.74.163.2"
+SPEED = 3.0
+TURN_DEG = 15.0  # of the camera in its gimbal, which MAVLink does not tell
+HOME = tuple(float(v) for v in GRID.to_geographic([EAST, NORTH]))
+
+
+def messages(vehicle, time_s):
+    """What the nodes on a vehicle's bus say at a time since its boot."""
+    pose = vehicle.pose_at(time_s)
+    yaw, pitch, roll = (math.degrees(a) for a in (pose.yaw_rad, pose.pitch_rad, pose.roll_rad))
+    return [
+        fix2(pose.lat_deg, pose.lon_deg, pose.alt_m, vehicle.utc_s(time_s)),
+        attitude(yaw, pitch, roll),
+        camera_down(TURN_DEG, 0.5),
+    ]
+
+
+class Camera:
+    """Takes pictures at the vehicle's triggers, turned in the gimbal, and posts them with no tag but the time."""
+
+    def __init__(self):
+        self.served, self.truth, self.over = None, {}, False
+
+    def expose(self, vehicle, exposure):
+        threading.Timer(0.5, self.post, (vehicle, exposure)).start()
+
+    def post(self, vehicle, exposure):
+        pose, time_s = exposure.pose, vehicle.utc_s(exposure.time_s)
+        east, north = GRID.to_grid(pose.lat_deg, pose.lon_deg)
+        turn = float(GRID.convergence_rad(pose.lat_deg, pose.lon_deg))
+        yaw_deg = math.degrees(pose.yaw_rad) + TURN_DEG
+        camera = camera_at(east - EAST, north - NORTH, pose.height_m, yaw_deg - math.degrees(turn))
+        name = f"{exposure.index}.jpg"
+        whole = pose_of(camera, name, "v1", time_s)
+        bare = {k: whole[k] for k in ("vehicle", "image", "time")} | {"lat_deg": 0.0, "lon_deg": 0.0, "gps_fix": 0}
+        if not self.over:
+            assert self.served.send(Shot(bare, jpeg(camera))).status_code == 201
+            self.truth[name] = (pose.lat_deg, pose.lon_deg, yaw_deg)
+
+
+def talk(vehicle, began, stop, loss, babble):
+    """A node with receiver, attitude and gimbal at 10 Hz, one with a poor receiver, and one that babbles."""
+    bus = can.Bus(interface="udp_multicast", channel=GROUP, hop_limit=0)  # packets stay on this machine
+    node, poor, rng = CanNode(42), CanNode(43), np.random.default_rng(0)
+    while not stop.wait(0.1):
+        time_s = SPEED * (time.monotonic() - began) - 0.1
+        far = fix2(HOME[0] + 0.01, HOME[1], 500.0, vehicle.utc_s(time_s), 5.0)
+        frames = [f for m in messages(vehicle, time_s) for f in node.messages(m)] + poor.messages(far)
+        for frame in frames:
+            if rng.random() >= loss:
+                bus.send(frame)
+        for _ in range(babble):
+            data = bytes(rng.integers(0, 256, 8, dtype=np.uint8))
+            kind = int(rng.choice([1063, 1044, 20000]))
+            bus.send(can.Message(arbitration_id=kind << 8 | 99, data=data, is_extended_id=True))
+    bus.shutdown()
+
+
+def placed(tmp_path, vehicle, camera, *sources):
+    """Fly a small square; gives the vehicle's row in flight, and the frames once all pictures are drawn."""
+    with (
+        SimSwarm([vehicle], "tcpin:127.0.0.1:0", speed=SPEED) as swarm,
+        serving(tmp_path / "w", "--link", swarm.addresses[0], *sources) as served,
+    ):
+        camera.served = served
+        served.until("/api/vehicles", lambda rows: rows and rows[0].get("can", {}).get("nodes"))
+        plan = served.command(
+            "/api/plans",
+            {"area": square(60), "vehicles": 1, "altitude_m": 40, "fov_min_deg": 65, "end": "hover",
+             "speed_m_s": 8},
+        ).json()["id"]  # fmt: skip
+        fly(served, "v1", plan)
+        served.until("/api/frames", lambda rows: len(rows) >= 6)
+        row = served.get("/api/vehicles").json()[0]
+        frames = served.until(
+            "/api/frames", lambda rows: all(r["on_map"] or r["reason"] for r in rows) and len(rows) >= 6
+        )
+        camera.over = True
+        return row, frames
+
+
+def errors(camera, frames):
+    """Metres and degrees that frames are off the true poses."""
+    metres, degrees = [], []
+    for row in frames:
+        if row["image"] in camera.truth:
+            lat, lon, yaw = camera.truth[row["image"]]
+            north, east = (
+                (row["lat_deg"] - lat) * 111_000,
+                (row["lon_deg"] - lon) * 111_000 * math.cos(math.radians(lat)),
+            )
+            metres.append(math.hypot(north, east))
+            degrees.append(abs(float(wrap_deg(row["yaw_deg"] - yaw))))
+    return np.array(metres), np.array(degrees)
+
+
+@pytest.mark.parametrize(("loss", "babble"), [(0.0, 0), (0.03, 100)], ids=["quiet", "loss and a babbling node"])
+def test_pictures_lie_where_the_receiver_on_the_bus_says(tmp_path, loss, babble):
+    camera, stop = Camera(), threading.Event()
+    [vehicle] = make_swarm(1, home=(*HOME, 500.0), airframe=Airframe(climb_m_s=8.0), on_exposure=camera.expose)
+    try:
+        can.Bus(interface="udp_multicast", channel=GROUP, hop_limit=0).shutdown()
+    except (OSError, can.CanError) as error:
+        pytest.skip(f"no multicast here: {error}")
+    thread = threading.Thread(target=talk, args=(vehicle, time.monotonic(), stop, loss, babble))
+    thread.start()
+    try:
+        row, frames = placed(tmp_path, vehicle, camera, "--source", f"v1=can:udp_multicast:{GROUP}")
+    finally:
+        stop.set()
+        thread.join(5.0)
+    assert row["can"]["state"] == "receiving"
+    assert {"42", "43"} <= set(row["can"]["nodes"]) <= {"42", "43", "99"}
+    assert row["can"]["nodes"]["42"]["lost"] > 0 or not loss
+    assert row["poses"]["position"] == row["poses"]["angles"] == "DroneCAN node 42"
+    assert row["poses"]["height"] == "MAVLink"
+    by_bus = [frame for frame in frames if frame["origin"]["position"] == "DroneCAN node 42"]
+    assert len(by_bus) > 0.8 * len(frames)
+    assert all(frame["on_map"] for frame in by_bus)
+    metres, degrees = errors(camera, by_bus)
+    assert np.median(metres) < 0.3
+    assert np.median(degrees) < 1.0
+    assert all(frame["position_sigma_m"] == pytest.approx(0.02, rel=0.1) for frame in by_bus)
+
+
+class Forwarder(SimVehicle):
+    """A vehicle that forwards its bus for as long as it is asked to."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.asked, self.node = (), CanNode(42)
+
+    def handle(self, message, sender, now):
+        if message.get_type() == "CAN_FILTER_MODIFY":
+            self.asked = tuple(message.ids[: message.num_ids])
+            return []
+        if message.get_type() != "COMMAND_LONG" or message.command != dialect.MAV_CMD_CAN_FORWARD:
+            return super().handle(message, sender, now)
+        answers = [dialect.MAVLink_command_ack_message(message.command, 0)]
+        if message.param1 == 1:
+            frames = [f for m in messages(self, now) for f in self.node.frames(m)]
+            answers += [
+                dialect.MAVLink_can_frame_message(
+                    0, 0, 0, len(data), identifier | 0x80000000, [*data, *[0] * (8 - len(data))]
+                )
+                for identifier, data in frames
+            ]
+        return answers
+
+
+def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
+    vehicle = Forwarder(1, Autopilot.ARDUPILOT, (*HOME, 500.0), boot_utc_s=time.time())
+    with (
+        SimSwarm([vehicle], "tcpin:127.0.0.1:0") as swarm,
+        serving(tmp_path / "w", "--link", swarm.addresses[0], "--source", "v1=can:mavlink") as served,
+    ):
+        rows = served.until(
+            "/api/vehicles", lambda rows: rows and "DroneCAN" in rows[0].get("poses", {}).get("position", "")
+        )
+    assert vehicle.asked == (1000, 1044, 1060, 1063)
+    assert rows[0]["can"]["bus"] == "mavlink"
+    assert rows[0]["poses"]["position"] == "DroneCAN node 42"
+
+
+def test_a_wrong_name_of_a_bus_is_refused(tmp_path):
+    for bus in ("nothing:can0", "socketcan", "mavlink:7"):
+        with pytest.raises(InputError, match="names no CAN bus"):
+            Settings(tmp_path, vehicles=(VehicleSettings("v1", can=bus),)).check()
