@@ -7,7 +7,7 @@ from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, RunContext,
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Refinement
-from orthoswarm.mosaic.extent import from_takeoff, ground_level
+from orthoswarm.mosaic.extent import from_takeoff, ground_level, solved_level
 from orthoswarm.report.page import write_page
 
 
@@ -19,7 +19,9 @@ def write_products(
         if name not in _made(run, state.fault is not None):
             (run.out / name).unlink(missing_ok=True)
     with run.clock.stage("final: report", len(placed)) as stage:
-        stated, z = from_takeoff(placed, ground_level(placed, state.terrain))
+        solved = refinement is not None and state.terrain is refinement.terrain
+        level = solved_level(refinement.fine) if refinement and solved else ground_level(placed, state.terrain)
+        stated, z = from_takeoff(placed, level, state.terrain)
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z)
         report = _report(run, state, placed, refinement, z)
         left_out = list(state.rejected.values())

@@ -105,7 +105,7 @@ class Solution:
         legs: its legs.
         fov_deg: estimated horizontal field of view of its (main) camera; fov_sigma_deg: one sigma.
         terrain: ground height under its frames (same datum as the cameras), None for flat at `ground_z_m`.
-        ground_z_m: height of the plane on which homographies are stated.
+        ground_z_m: level of the ground that its vehicles map, the plane on which homographies are stated.
         map_lean: metres of shift per metre of height in the basemap, (east, north).
         state: what a second pass needs (refiner's own, picklable).
         warnings: findings in plain words (yaw flips, wrong altitude, lag...).

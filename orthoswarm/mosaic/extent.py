@@ -8,11 +8,15 @@ import numpy as np
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
-from orthoswarm.model.placement import MapWindow, PlacedFrame, Terrain
+from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
 
-RAISED_M = 2.0
-"""Corners lie no higher than this over the ground around them (rubble, bushes, cars)."""
+RECORDED_SIGMA_M = 1.0
+"""One sigma of the heights that a vehicle records over its takeoff level."""
+LEVEL_SIGMA_M = 0.2
+"""How well the level of solved ground is known, one sigma."""
+DATUM_LIMIT_M = 3.0
+"""The refiner holds heights near the takeoff level; what says that it lies farther off is not believed."""
 
 
 def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> BoundingBox:
@@ -29,29 +33,50 @@ def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> Bou
 
 
 def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> float:
-    """Height of the plane on which homographies are stated: the middle of the bare ground below the cameras."""
+    """Median height of the bare ground below the cameras, metres; 0 without a terrain."""
     if terrain is None or not placed:
         return 0.0
     return float(np.median(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))))
 
 
-def from_takeoff(placed: Sequence[PlacedFrame], level: float) -> tuple[Sequence[PlacedFrame], float]:
-    """Cameras and ground raised together until the ground lies on the takeoff level, where nothing else is known.
+def solved_level(solutions: Sequence[Solution]) -> float:
+    """Level of the mapped ground, metres: the solutions' median, weighted by pictures; 0 where none has a terrain."""
+    levels = [np.full(len(s.placed), s.ground_z_m) for s in solutions if s.terrain is not None]
+    return float(np.median(np.concatenate(levels))) if any(map(len, levels)) else 0.0
 
-    The refiner holds the level of CORNERS, which sit on raised things, at the takeoff level, so that the ground comes
-    out some decimetres below it and every camera with it. No homography changes by this, only what it is stated on.
+
+def from_takeoff(
+    placed: Sequence[PlacedFrame], level: float, terrain: Terrain | None
+) -> tuple[Sequence[PlacedFrame], float]:
+    """Cameras and ground moved together until heights count from the takeoff level as well as that is known.
+
+    Images leave the zero of the heights open by some decimetres. Two things tell it: the recorded heights count from
+    the takeoff level, and the takeoff spot is a piece of the mapped ground, as far from its median level as the relief
+    makes it. Their weighted mean becomes zero. No homography changes by this, only the heights stated with it.
 
     Args:
         placed: placed frames.
-        level: ground level below them, metres.
+        level: of the mapped ground, metres.
+        terrain: the ground below them; None: nothing was solved, and heights stay as they are.
 
     Returns:
-        The frames, and their ground level: 0, or as it was where it is farther off than things on the ground are high.
+        The frames, and the level of the ground.
     """
-    if not 0.0 < abs(level) <= RAISED_M:
+    if terrain is None or not placed:
         return placed, level
-    up = np.array([0.0, 0.0, -level])
-    return [replace(p, camera=replace(p.camera, position=p.camera.position + up)) for p in placed], 0.0
+    relief = float(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed])).std())
+    recorded = [p.camera.position[2] - p.frame.fix.height_m for p in placed if p.frame.fix.height_m is not None]
+    zeros = [(level, LEVEL_SIGMA_M**2 + relief**2)]
+    if recorded:
+        zeros.append((float(np.median(recorded)), RECORDED_SIGMA_M**2))
+    zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= DATUM_LIMIT_M]
+    if not zeros:
+        return placed, level
+    weight = np.array([1.0 / variance for _, variance in zeros])
+    zero = float(weight @ [z for z, _ in zeros] / weight.sum())
+    down = np.array([0.0, 0.0, zero])
+    moved = [replace(p, camera=replace(p.camera, position=p.camera.position - down)) for p in placed]
+    return moved, level - zero
 
 
 def drawn_window(canvas: Canvas) -> tuple[int, int, int, int]:

@@ -18,8 +18,7 @@ from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.export import cog
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.mosaic.extent import from_takeoff, ground_level
-from orthoswarm.mosaic.recorded_pose import recorded_cameras
+from orthoswarm.mosaic.extent import ground_level
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.report.page import write_page
 from telemetry import LoadOptions, load
@@ -341,18 +340,6 @@ def test_legs_become_vehicles(flight, tmp_path):
 def test_ground_level_is_that_below_the_cameras(mapped):
     assert ground_level([], None) == 0.0
     assert abs(mapped[1]["ground_z_m"]) < 2.0
-
-
-def test_ground_is_stated_at_the_takeoff_level_and_no_picture_moves(flight):
-    scene, _, photos = flight
-    placed = recorded_cameras(load([photos / "photos"]).frames, scene.grid, None).placed
-    raised, level = from_takeoff(placed, -0.43)
-    assert level == 0.0
-    for before, after in zip(placed, raised, strict=True):
-        assert after.camera.position[2] == pytest.approx(before.camera.position[2] + 0.43)
-        np.testing.assert_allclose(after.camera.homography(level), before.camera.homography(-0.43), rtol=1e-12)
-    assert from_takeoff(placed, -12.0) == (placed, -12.0), "a valley is no lift"
-    assert from_takeoff([], 0.0) == ([], 0.0)
 
 
 def test_the_command_prints_one_json_document(flight, tmp_path, capsys):

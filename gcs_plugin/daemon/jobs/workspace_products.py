@@ -177,10 +177,10 @@ def _writable(frame: Frame) -> Frame:
 
 def _stated(placed: list[PlacedFrame], solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
     """The frames and the level of the ground below them as they are written."""
-    from orthoswarm.mosaic.extent import from_takeoff, ground_level
+    from orthoswarm.mosaic.extent import from_takeoff, solved_level
 
     terrain = next((s.terrain for s in solutions if s.terrain is not None), None)
-    frames, level = from_takeoff(placed, ground_level(placed, terrain))
+    frames, level = from_takeoff(placed, solved_level(solutions), terrain)
     return list(frames), level
 
 

@@ -113,6 +113,7 @@ def to_solution(
     *,
     coarse: bool = False,
     map_lean: tuple[float, float] = (0.0, 0.0),
+    ground_z_m: float = 0.0,
 ) -> Solution:
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
@@ -136,7 +137,7 @@ def to_solution(
         float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
         state.fov_sigma_deg,
         terrain,
-        0.0,
+        ground_z_m,
         map_lean,
         state,
         findings(state),

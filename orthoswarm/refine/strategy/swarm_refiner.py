@@ -28,6 +28,7 @@ from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
     coarse_terrain,
     common_terrain,
+    mapped_level,
     neighbours_of,
     pooled_lean,
 )
@@ -122,9 +123,11 @@ class SwarmRefiner:
             beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
             item = (own[k], beside, float(network.correction_m[k]) - anchor)
             done[k] = second_pass(item, basemap=basemap, origin=self.origin)
-        terrain = _shifted(common_terrain([*done, *others], self.options.ground(self.origin).dem)[0], self.origin)
+        terrain = common_terrain([*done, *others], self.options.ground(self.origin).dem)[0]
+        level = mapped_level(done, terrain)
+        terrain = _shifted(terrain, self.origin)
         lean = pooled_lean(everyone)
-        return merge_units([to_solution(s, self.origin, terrain, map_lean=lean) for s in done])[0]
+        return merge_units([to_solution(s, self.origin, terrain, map_lean=lean, ground_z_m=level) for s in done])[0]
 
     def refine_batch(
         self,
@@ -146,9 +149,10 @@ class SwarmRefiner:
         states = _second_passes(states, basemap, self.epsg, origin, run, progress)
         _level(states)
         terrain, warnings = common_terrain(states, self.options.ground(origin).dem)
+        level = mapped_level(states, terrain)
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
-        fine = [to_solution(s, origin, terrain, map_lean=lean) for s in states]
+        fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
         left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 

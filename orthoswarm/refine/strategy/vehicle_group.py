@@ -13,6 +13,7 @@ from orthoswarm.refine.registration.block_state import VehicleState, seen_from_a
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import dense_cell, flying_height
+from orthoswarm.refine.surface.mapped_level import mapped_ground_level
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
@@ -81,6 +82,12 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
     drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
     return drawn, _doubts(given, fit is None, off, states) if given is not None else []
+
+
+def mapped_level(states: Sequence[VehicleState], terrain: Terrain | None) -> float:
+    """Level of the ground that vehicles map, metres; terrain: theirs, in the local frame."""
+    position = np.concatenate([np.zeros((0, 3)), *(s.flight.adjustment.cameras.position for s in states)])
+    return mapped_ground_level(terrain, position, [s.dense[0] for s in states])
 
 
 def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:

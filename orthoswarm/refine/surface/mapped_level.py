@@ -1,0 +1,46 @@
+"""The level of the mapped ground: the height of the plane on which homographies are stated."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from orthoswarm.config import active
+from orthoswarm.model.placement import Terrain
+from orthoswarm.refine.surface.terrain import lower_flank
+
+Array = NDArray[np.float64]
+
+
+def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: Sequence[Array]) -> float:
+    """Median height of the mapped ground, metres, in the datum of the cameras.
+
+    Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is the lower
+    flank of their heights (`lower_flank`). On level ground these are heights over zero, else heights over the terrain,
+    whose median below the cameras and around them is added.
+
+    Args:
+        terrain: the ground, in the frame of the cameras; None: 0.
+        camera_position: float64 (N, 3).
+        dense: ground points (K, 3) at free positions (not at corners), of each vehicle.
+    """
+    if terrain is None or not len(camera_position):
+        return 0.0
+    config = active().surface
+    ground = terrain.bare_ground()
+    position = np.asarray(camera_position, float)
+    below = ground.height(position[:, :2])
+    height = float(np.median(position[:, 2] - below))
+    rows, columns = np.indices(ground.z.shape)
+    nodes = np.column_stack([columns.ravel(), rows.ravel()]) * ground.step_m + [ground.west, ground.south]
+    near = cKDTree(position[:, :2]).query(nodes, distance_upper_bound=config.level_reach_heights * height)[0]
+    mapped = np.isfinite(near)
+    heights = ground.z.ravel()[mapped] if mapped.any() else below
+    level = float(np.median(heights))
+    points = np.concatenate([np.zeros((0, 3)), *dense])
+    if len(points) < config.terrain_points:
+        return level
+    if float(np.std(heights)) <= config.flat_relief_m:
+        return lower_flank(points[:, 2])
+    return level + lower_flank(points[:, 2] - ground.height(points[:, :2]))
