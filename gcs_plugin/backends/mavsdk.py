@@ -26,7 +26,7 @@ from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.control import unflyable
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
-from gcs_plugin.mission.flight_modes import modes_of
+from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
 from gcs_plugin.mission.items import Mission, MissionItem
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -304,6 +304,8 @@ class MavsdkBackend(Backend):
             return Outcome(False, f"vehicle {system} is not on the links; check links and system ids")
         if craft.vehicle.detector.phase is Phase.ACTIVE and craft.vehicle.armed:
             return Outcome(False, f"vehicle {system} is flying its mission; pause it or let it return first")
+        if why := why_no_missions(craft.vehicle.kind):
+            return Outcome(False, f"vehicle {system} {why}")
         wrong = ""
         for _ in range(_ATTEMPTS):
             refused = self._write(craft, mission)
@@ -382,10 +384,12 @@ class MavsdkBackend(Backend):
             return vehicle.pilot.land()
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {vehicle.system} is flying its mission already")
+        if why := why_no_missions(vehicle.kind):
+            raise OrthoSwarmError(f"vehicle {vehicle.system} {why}")
         mission = vehicle.mission or self._read(vehicle.system)
         in_air = vehicle.in_air and vehicle.armed
         wrong = unflyable(mission.items if mission else (), vehicle.autopilot, in_air=in_air)
         if mission is None or wrong:
             raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not hand out its mission'}")
         vehicle.detector.knows_mission(mission)
-        return vehicle.pilot.start(in_air=in_air, check=False)
+        return vehicle.pilot.start(in_air=in_air, armed=vehicle.armed, check=False)

@@ -248,7 +248,7 @@ class Fleet:
             if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
                 raise OrthoSwarmError(f"vehicle {system} is flying its mission already")
             check = vehicle.mission is None or not vehicle.detector.knows
-            return vehicle.pilot.start(in_air=vehicle.flying, check=check)
+            return vehicle.pilot.start(in_air=vehicle.flying, armed=vehicle.armed, check=check)
         vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
         if verb == "pause" and sure and not vehicle.armed:

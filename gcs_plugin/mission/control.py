@@ -289,6 +289,31 @@ class InOrder(_Several):
 
 
 @dataclass(slots=True)
+class OrUndo(_Several):
+    """A step, and what undoes the one before it where the vehicle refuses this one; the refusal is the outcome.
+
+    Attributes:
+        undone: what to add when that was done; left: when it was not.
+    """
+
+    undone: str = field(kw_only=True)
+    left: str = field(kw_only=True)
+    _refusal: str = field(default="", init=False)
+
+    def _step_expires(self, now: float) -> float:
+        return self.expires if self._at == 0 else now + COMMAND_S
+
+    def _ended(self, outcome: Outcome, last: bool) -> bool:
+        if last:
+            self._end(False, f"{self._refusal}; {self.undone if outcome.ok else self.left}")
+        elif outcome.verdict is Verdict.REFUSED:
+            self._refusal = outcome.text
+        else:
+            self._end(outcome.ok, outcome.text, outcome.failure)
+        return self.outcome is not None
+
+
+@dataclass(slots=True)
 class Either(_Several):
     """A way of doing something, and another one where the vehicle refuses the first or does not answer to it."""
 
@@ -328,8 +353,13 @@ class Pilot:
             insist_s=insist_s,
         )  # fmt: skip
 
-    def start(self, *, in_air: bool = False, check: bool = True) -> Exchange:
-        """Fly the mission from its beginning: check it, then mode, arm, MISSION_START, and wait until it flies."""
+    def start(self, *, in_air: bool = False, armed: bool = False, check: bool = True) -> Exchange:
+        """Fly the mission from its beginning: check it, then mode, arm, MISSION_START, and wait until it flies.
+
+        Args:
+            in_air: whether it flies. armed: whether its motors run; if not, they stop again when the start is refused.
+            check: whether its mission has to be read first.
+        """
         steps: list[Exchange] = []
         if check:
             steps.append(CheckMission(self.vehicle, self.own, autopilot=self.autopilot, in_air=in_air))
@@ -337,9 +367,15 @@ class Pilot:
             self.vehicle, self.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(1.0,), verb="arm",
             insist_s=COMMAND_S,
         )  # fmt: skip
-        go = Command(
+        go: Exchange = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_MISSION_START, verb="start the mission", insist_s=3.0
         )
+        if not (in_air or armed):
+            disarm = Command(
+                self.vehicle, self.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(0.0,), verb="disarm"
+            )
+            left = "it is still armed: disarm it with the radio control"
+            go = OrUndo(self.vehicle, self.own, steps=[go, disarm], undone="it was disarmed again", left=left)
         flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
         steps += [self.set_mode(self.modes.ready), arm, go, flies]
         return InOrder(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)

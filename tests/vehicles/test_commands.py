@@ -14,7 +14,7 @@ from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import TcpLink
 from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
-from gcs_plugin.mission.items import MissionItem
+from gcs_plugin.mission.items import TAKEOFF, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.memory_link import SimLink, VirtualClock, World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -73,6 +73,18 @@ def test_an_acknowledged_command_is_done(make_world, autopilot, verb):
     if verb != "pause":
         world.until(lambda: not world.vehicles[1].flight.armed, 120.0)
         assert not world.vehicles[1].flight.armed
+
+
+@BOTH
+def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world, autopilot):
+    world = make_world(SimVehicle(1, autopilot))
+    world.meet()
+    good = mission(autopilot, END)
+    no_takeoff = type(good)(autopilot, tuple(item for item in good.items if item.command != TAKEOFF))
+    assert world.finish(world.fleet.upload(1, no_takeoff))[0].ok
+    result = end_of(world, give(world, "start", 1))
+    assert result.outcome is Verdict.REFUSED and result.reason.endswith("it was disarmed again")
+    assert "akeoff" in result.reason and not world.vehicles[1].flight.armed
 
 
 @BOTH
