@@ -1,18 +1,18 @@
 """The daemon without its web server: owns the workspace, takes pictures and telemetry in, has maps made of them."""
 
-import contextlib
 import json
 import logging
 import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.exports import Exports
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
 from gcs_plugin.daemon.intake.pose_relay import linked_pose
@@ -25,9 +25,8 @@ from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
-from gcs_plugin.daemon.jobs.workspace_products import FORMATS, ExportTask, facts_of, write_products
+from gcs_plugin.daemon.jobs.workspace_products import FORMATS, facts_of
 from gcs_plugin.daemon.layers.anchor import Anchor
-from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
@@ -35,9 +34,10 @@ from gcs_plugin.daemon.mission_journal import completion_rows, note_completion
 from gcs_plugin.daemon.settings import Settings, system_of
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Change, Journal, add_frame, late_frames, packed, unpacked
+from gcs_plugin.daemon.store.journal import Journal, add_frame, late_frames, packed, unpacked
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
+from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
@@ -105,9 +105,13 @@ class Daemon:
             self._make_way, lambda: self.jobs.stopping,
         )  # fmt: skip
         self.together = JointRefinement(self.journal, publisher, self.background, settings.basemap, self._published)
+        self.exports = Exports(
+            settings, self.journal, self.store, self.layers, self.console, self.background,
+            lambda: self.drawer.area, self.vehicles, self._facts,
+        )  # fmt: skip
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
-            "redraw": lambda job, tell: publisher.draw_again(self.background, tell), "export": self._export,
+            "redraw": lambda job, tell: publisher.draw_again(self.background, tell), "export": self.exports.write,
         }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
@@ -125,6 +129,7 @@ class Daemon:
         if settings.links:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
+        self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
         self.sources = [
             Source(
                 v.id,
@@ -157,6 +162,8 @@ class Daemon:
         self.leg_watch.start()
         if self.links is not None:
             self.links.start()
+        if self.settings.tak:
+            self.tak.start()
         for source in self.sources:
             source.start()
         for bus in self.buses:
@@ -169,6 +176,7 @@ class Daemon:
         for bus in self.buses:
             bus.close()
         self.leg_watch.close()
+        self.tak.close()
         if self.takeoffs is not None:
             self.takeoffs.close()
         if self.links is not None:
@@ -407,42 +415,24 @@ class Daemon:
             raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")
         return self.jobs.add("export", formats=list(dict.fromkeys(formats)))
 
-    def _export(self, job: Job, tell: Callable[[float, str], None]) -> Change:
-        """The handler of `export`."""
-        tell(0.05, "writing")
-        area = self.drawer.area
-        if area is None:
-            raise InputError("there is no map yet; wait for pictures")
-        rows = self.journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
-        kept = self.settings.workspace / "solutions"
-        solutions = self.journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
-        coarse = self.journal.rows(
-            "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
-            " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
-        )
-        facts = facts_of(
+    def _facts(self) -> dict[str, Any]:
+        """What only the daemon knows for the report."""
+        return facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
             time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
         )  # fmt: skip
-        with contextlib.ExitStack() as held:  # a generation that another one replaces stays while it is read
-            canvases = {name: held.enter_context(layer.reading()) for name, layer in self.layers.items()}
-            task = ExportTask(
-                self.settings.workspace, tuple(job.detail["formats"]),
-                {name: canvas.path for name, canvas in canvases.items() if canvas is not None}, area.epsg, area.gsd_m,
-                [frame_of_row(row, self.store) for row in rows],
-                {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-                [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions],
-                self.settings.basemap,
-                None if self.settings.fov_min_deg is None else math.radians(self.settings.fov_min_deg), facts,
-            )  # fmt: skip
-            job.detail["files"] = self.background.run(write_products, task)
-        return lambda db: None
 
     # -- health ---------------------------------------------------------------------------------------------------
 
     def problems(self) -> list[str]:
         """What is wrong at present, in words."""
-        found = [self.drawer.problem, self.drawer.overload, self.jobs.problem, *self.refused.problems()]
+        found = [
+            self.drawer.problem,
+            self.drawer.overload,
+            self.jobs.problem,
+            self.tak.problem,
+            *self.refused.problems(),
+        ]
         for source in self.sources:
             if source.without_pose:
                 text = f"{source.without_pose} pictures of {source.vehicle} have no pose"

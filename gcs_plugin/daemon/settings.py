@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.can_reader import check_bus
+from orthoswarm.export.tactical.tak_sender import TakAddress
 from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"
@@ -24,6 +25,9 @@ TEMPLATE: Final = """\
 # workers = 1                     # processes that refine
 # coarse = true                   # place legs on the coarse layer as they finish, in one more process of low priority
 # lost_after_s = 120              # a vehicle that is silent for so long in its mission is refined as it is
+# tak = ["udp://239.2.3.1:6969"]  # where vehicles and finds are sent to as Cursor-on-Target: udp, tcp or tls
+# tak_certificate = "station.pem" # for tls: certificate and key of this station
+# tak_authority = "ca.pem"        # for tls: the server's certificate authority
 
 # [[vehicle]]
 # id = "v1"                       # v and the MAVLink system id, unless system says otherwise
@@ -62,6 +66,8 @@ class Settings:
         workers: processes that refine. coarse: whether legs are placed in flight.
         lost_after_s: when a silent vehicle's sortie counts as over.
         vehicles: those that were named. token_file: where the token is, or goes.
+        tak: receivers of Cursor-on-Target events, see `tak_address`. tak_certificate: PEM file with this station's
+            certificate and key for TLS. tak_authority: PEM file of the server's certificate authority.
     """
 
     workspace: Path
@@ -76,6 +82,17 @@ class Settings:
     lost_after_s: float = 120.0
     vehicles: tuple[VehicleSettings, ...] = field(default=())
     token_file: Path | None = None
+    tak: tuple[str, ...] = ()
+    tak_certificate: Path | None = None
+    tak_authority: Path | None = None
+
+    def tak_address(self, text: str) -> TakAddress:
+        """A receiver of Cursor-on-Target events.
+
+        Raises:
+            InputError: it is no address.
+        """
+        return TakAddress.parse(text, self.tak_certificate, self.tak_authority)
 
     def check(self) -> "Settings":
         """Itself.
@@ -93,6 +110,11 @@ class Settings:
             raise InputError(f"{self.gsd_m:g} m is no ground pixel; give metres, for example 0.1")
         if self.workers < 1:
             raise InputError(f"{self.workers} workers are too few; give 1 or more")
+        for text in self.tak:
+            self.tak_address(text)
+        for path in (self.tak_certificate, self.tak_authority):
+            if path is not None and not path.is_file():
+                raise InputError(f"{path} does not exist; name the PEM file")
         names = [v.id for v in self.vehicles]
         systems = [v.system for v in self.vehicles if v.system is not None]
         for what, values in (("id", names), ("system id", systems)):
@@ -107,6 +129,7 @@ class Settings:
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "fov_min_deg": (int, float),
     "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
+    "tak": (list,), "tak_certificate": (str,), "tak_authority": (str,),
 }  # fmt: skip
 
 
@@ -131,8 +154,11 @@ def read_settings(workspace: Path) -> Settings:
     vehicles = tuple(_vehicle(entry, path) for entry in document.pop("vehicle", ()))
     if "links" in document:
         document["links"] = tuple(str(link) for link in document["links"])
-    if "basemap" in document:
-        document["basemap"] = workspace / document["basemap"]
+    if "tak" in document:
+        document["tak"] = tuple(str(address) for address in document["tak"])
+    for key in ("basemap", "tak_certificate", "tak_authority"):
+        if key in document:
+            document[key] = workspace / document[key]
     return replace(Settings(workspace), vehicles=vehicles, **document)
 
 

@@ -23,6 +23,7 @@ from gcs_plugin.web.guard import Guard
 from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
+from orthoswarm.export.tactical.places import feature
 
 Result = TypeVar("Result")
 
@@ -124,7 +125,10 @@ class Routes:
         return JsonAnswer([job.document() for job in jobs], status_code=202)
 
     async def export(self, request: Request) -> Response:
-        """Write {"formats": [...]} (cog, mbtiles, kmz, gpkg, odm) into the workspace. Answers with the job."""
+        """Write {"formats": [...]} into the workspace; answers with the job.
+
+        Formats: cog, mbtiles, kmz, gpkg, odm, stac, pmtiles, pdf, places, tak, pack.
+        """
         body = await json_body(request)
         formats = body.get("formats", ["cog", "gpkg"])
         if not isinstance(formats, list) or not all(isinstance(name, str) for name in formats):
@@ -200,6 +204,19 @@ class Routes:
             raise HTTPException(404, "there is no such find; see /api/finds")
         return Response(status_code=204)
 
+    async def find_pictures(self, number: int) -> Response:
+        """The pictures that show a find, best first: `seq`, `vehicle`, `image`, `column`, `row`, `stage`."""
+        return JsonAnswer(await self.work(self.daemon.exports.find_pictures, number))
+
+    async def picture(self, seq: int) -> Response:
+        """A picture as it came; `seq` is its number in /api/frames."""
+        return FileResponse(await self.work(self.daemon.exports.picture, seq))
+
+    async def places(self) -> Response:
+        """Finds and vehicles as GeoJSON."""
+        found = await self.work(self.daemon.exports.places)
+        return JsonAnswer({"type": "FeatureCollection", "features": [feature(place) for place in found]})
+
     async def events(self, socket: WebSocket) -> None:
         """News as they come, and a heartbeat each second."""
         await stream_events(socket, self.daemon.events)
@@ -274,6 +291,9 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/plan", routes.put_console_plan, methods=["PUT"])
     add("/api/finds", routes.finds)
     add("/api/finds", routes.add_find, methods=["POST"], status_code=201)
+    add("/api/finds/{number}/pictures", routes.find_pictures)
+    add("/api/frames/{seq}/picture", routes.picture)
+    add("/api/places", routes.places)
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
     app.add_api_websocket_route("/api/events", routes.events)

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-FORMATS = ("mbtiles", "kmz", "gpkg", "odm", "cog")
+FORMATS = ("mbtiles", "kmz", "gpkg", "odm", "cog", "stac", "pmtiles", "pdf", "places", "tak", "pack")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,7 +16,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "kmz      Google Earth, ATAK and other globes\n"
         "gpkg     footprints of the pictures as polygons\n"
         "odm      pictures and refined positions for OpenDroneMap\n"
-        "cog      the orthoimage in another coordinate system or as a small JPEG\n\n"
+        "cog      the orthoimage in another coordinate system or as a small JPEG\n"
+        "stac     a STAC item beside the orthoimage, for catalogues\n"
+        "pmtiles  web map tiles in one file for web servers\n"
+        "pdf      a sheet of A3 with grid, scale and accuracy (GeoPDF)\n"
+        "places   finds and vehicles as GeoJSON, KML, GPX and CSV\n"
+        "tak      finds and vehicles as a data package for ATAK and WinTAK\n"
+        "pack     all of it in one ZIP, with a page that opens without a server\n\n"
         "example:\n  orthoswarm export map --to mbtiles kmz"
     )
     add = parser.add_argument
@@ -143,10 +149,25 @@ def _cog(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> 
     return path
 
 
+def _form(name: str, args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    from orthoswarm.export.sheets.forms import write_form
+    from orthoswarm.export.tactical.places import read_places
+
+    places = read_places(args.map)
+    if not places and name in ("places", "tak"):
+        notes.append(
+            "there are no finds and no vehicles; `orthoswarm serve` keeps them as places.geojson in its folder"
+        )
+    path = write_form(name, _layer(args), dest, places, tell)
+    tell(1, 1)
+    return path
+
+
 _WRITERS: dict[str, Callable[[argparse.Namespace, Path, Tell, list[str]], Path]] = {
     "mbtiles": _mbtiles,
     "kmz": _kmz,
     "gpkg": _gpkg,
     "odm": _odm,
     "cog": _cog,
+    **{name: partial(_form, name) for name in ("stac", "pmtiles", "pdf", "places", "tak", "pack")},
 }

@@ -39,6 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="ID=WHERE",
         help="pictures of a vehicle (stream or folder), or its CAN bus: can:socketcan:can0, can:mavlink",
     )
+    add("--tak", action="append", default=[], metavar="URL", help="send vehicles and finds there: udp://239.2.3.1:6969")
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
     add("--end-with-input", action="store_true", help="end when standard input ends, so with the program that holds it")
     add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
@@ -113,6 +114,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     flags = {
         "bind": args.bind, "port": args.port, "basemap": args.basemap, "fov_min_deg": args.fov_min,
         "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
+        "tak": tuple(args.tak) or None,
     }  # fmt: skip
     if args.workers is None and settings.workers == 1:
         flags["workers"] = max(1, cores() - 1)

@@ -12,6 +12,9 @@ import numpy as np
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import Usage
+from orthoswarm.export.sheets.forms import FORMS, write_form
+from orthoswarm.export.tactical import places as place_files
+from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
@@ -21,7 +24,7 @@ from orthoswarm.raster.basemap import Basemap
 if TYPE_CHECKING:
     from orthoswarm.mosaic.recorded_pose import Recorded
 
-FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm")
+FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm", *FORMS)
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
 
 
@@ -34,7 +37,7 @@ class ExportTask:
         canvases: layer -> its canvas's folder, those that there are. epsg, gsd_m: the area's.
         frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
         coarse, solutions: solution files, those only placed in flight and those refined.
-        basemap: the map, or None. fov_rad: theta-hat.
+        basemap: the map, or None. fov_rad: theta-hat. facts: for the report. places: finds and vehicles.
     """
 
     workspace: Path
@@ -49,6 +52,7 @@ class ExportTask:
     basemap: Path | None
     fov_rad: float | None
     facts: dict[str, Any] = field(default_factory=dict)
+    places: tuple[Place, ...] = ()
 
 
 def write_products(task: ExportTask) -> dict[str, str]:
@@ -79,6 +83,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
     write_page(out, report, placed, rejected, basemap)
     write_json(out / "report.json", report)
+    place_files.write_geojson(task.places, out / place_files.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
     others = [name for name in task.formats if name not in files]
     if others:
@@ -167,6 +172,11 @@ def _placements(
     return placed, [Rejection(f.image, why, f.vehicle, f.time_s) for f, why in left_out]
 
 
+def placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
+    """Each frame as it was placed last, and the level of the ground below them, metres."""
+    return _stated(_placements(task, _recorded(task), solutions)[0], solutions)
+
+
 def _writable(frame: Frame) -> Frame:
     """A frame whose names can be written in UTF-8 and by C libraries."""
     image, vehicle = (
@@ -214,7 +224,9 @@ def _converted(task: ExportTask, picture: Path, formats: list[str], placed: list
     files: dict[str, str] = {}
     for name in formats:
         path = dest / (f"{picture.stem}.{name}" if name != "odm" else "odm")
-        if name == "mbtiles":
+        if name in FORMS:
+            path = write_form(name, picture, dest, task.places)
+        elif name == "mbtiles":
             write_mbtiles(picture, path, name=picture.stem)
         elif name == "kmz":
             write_kmz(picture, path, name=picture.stem)

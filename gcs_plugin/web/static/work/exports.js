@@ -6,8 +6,8 @@ import { notice } from "/static/core/notices.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 
-const FORMATS = ["cog", "gpkg", "mbtiles", "kmz", "odm"];
-const CHOSEN = new Set(["cog", "kmz"]);
+const FORMATS = ["pack", "cog", "gpkg", "mbtiles", "kmz", "odm", "pdf", "tak", "places", "pmtiles", "stac"];
+const CHOSEN = new Set(["pack"]);
 
 export function exportPanel() {
   const boxes = FORMATS.map((key) => make("input", { type: "checkbox", name: key, checked: CHOSEN.has(key) }));

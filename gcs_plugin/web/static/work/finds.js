@@ -13,8 +13,11 @@ import { circle } from "/static/map/geodesy.js";
 import { sigmaAt } from "/static/map/legs.js";
 import { feature, map, maplibregl, show } from "/static/map/map.js";
 import { dropTool, takeTool, tool } from "/static/map/tools.js";
+import { picturesDialog } from "/static/work/find_pictures.js";
 
 const markers = new Map();
+const { box: pictures, show: showPictures } = picturesDialog();
+document.body.append(pictures);
 let absent = false;
 
 export async function loadFinds() {
@@ -54,7 +57,7 @@ export function findPanel() {
     }
   };
   const draw = keyedList(list, (row) => make("li", {}, button("", () => map.flyTo({ center: [row.lon_deg, row.lat_deg], zoom: Math.max(18, map.getZoom()), duration: 0 }), { class: "find" }),
-    button("×", () => remove(row.id), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
+    button(t("finds.pictures"), () => showPictures(row), { class: "small" }), button("×", () => remove(row.id), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
     setText(line.firstChild, `${text(row.note) || t("finds.unnamed")}: ${positionText(row.lat_deg, row.lon_deg, settings.coordinates)}${row.sigma_m == null ? "" : ` ± ${units.distance(row.sigma_m)}`}`);
   });
   subscribe("finds ready", "finds", () => {

@@ -1,0 +1,122 @@
+"""Exports of the workspace, and which pictures show a find."""
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gcs_plugin.daemon.jobs.job_queue import Job
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.jobs.workspace_products import ExportTask, write_products
+from gcs_plugin.daemon.layers.journal_frames import frame_of_row
+from gcs_plugin.daemon.layers.layers import Area, Layer
+from gcs_plugin.daemon.places import pictures_at, places_of
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.console_state import ConsoleState
+from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.export.tactical.places import Place
+from orthoswarm.model.errors import InputError
+
+
+class Exports:
+    """Writes what the workspace holds in the forms of other programs.
+
+    Args:
+        settings: of the daemon. journal, store, layers, console: the workspace's.
+        workers: where files are written. area: gives the map's area, None before the first picture.
+        vehicles: gives the rows of /api/vehicles. facts: gives what only the daemon knows for the report.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        journal: Journal,
+        store: PictureStore,
+        layers: Mapping[str, Layer],
+        console: ConsoleState,
+        workers: WorkerPool,
+        area: Callable[[], Area | None],
+        vehicles: Callable[[], list[dict[str, Any]]],
+        facts: Callable[[], dict[str, Any]],
+    ) -> None:
+        self._settings, self._journal, self._store = settings, journal, store
+        self._layers, self._console, self._workers = layers, console, workers
+        self._area, self._vehicles, self._facts = area, vehicles, facts
+
+    def write(self, job: Job, tell: Callable[[float, str], None]) -> Change:
+        """The handler of an `export` job.
+
+        Raises:
+            InputError: there is no map yet.
+        """
+        tell(0.05, "writing")
+        area = self._area()
+        if area is None:
+            raise InputError("there is no map yet; wait for pictures")
+        with contextlib.ExitStack() as held:  # a generation that another one replaces stays while it is read
+            canvases = {name: held.enter_context(layer.reading()) for name, layer in self._layers.items()}
+            folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
+            task = replace(self._task(area), formats=tuple(job.detail["formats"]), canvases=folders)
+            shown = [
+                find | {"pictures": [row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])]}
+                for find in self._console.finds()
+            ]
+            task = replace(task, facts=self._facts(), places=tuple(self._places(shown)))
+            job.detail["files"] = self._workers.run(write_products, task)
+        return lambda db: None
+
+    def places(self) -> list[Place]:
+        """The finds, and the vehicles that said where they are."""
+        return self._places(self._console.finds())
+
+    def find_pictures(self, number: int) -> list[dict[str, Any]]:
+        """The pictures that show a find, best first; see `pictures_at`. Each has its `seq`.
+
+        Raises:
+            InputError: there is no such find.
+        """
+        find = next((row for row in self._console.finds() if row["id"] == number), None)
+        if find is None:
+            raise InputError(f"there is no find {number}; see /api/finds")
+        area = self._area()
+        rows = [] if area is None else pictures_at(self._task(area), find["lat_deg"], find["lon_deg"])
+        query = "SELECT seq FROM frames WHERE vehicle = ? AND image = ?"
+        for row in rows:
+            found = self._journal.one(query, (packed(row["vehicle"]), packed(row["image"])))
+            row["seq"] = None if found is None else found["seq"]
+        return rows
+
+    def picture(self, seq: int) -> Path:
+        """The file of a picture.
+
+        Raises:
+            InputError: there is no such picture.
+        """
+        row = self._journal.one("SELECT path FROM frames WHERE seq = ?", (seq,)) if 0 <= seq < 2**63 else None
+        if row is None or not self._store.path(row["path"]).is_file():
+            raise InputError(f"there is no picture {seq}; see /api/frames")
+        return self._store.path(row["path"])
+
+    def _places(self, finds: list[dict[str, Any]]) -> list[Place]:
+        return places_of(self._settings.workspace.resolve().name, finds, self._vehicles(), time.time())
+
+    def _task(self, area: Area) -> ExportTask:
+        """What the workspace holds, without layers and formats."""
+        rows = self._journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
+        kept, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
+        solutions = self._journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
+        coarse = self._journal.rows(
+            "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
+            " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
+        )
+        return ExportTask(
+            self._settings.workspace, (), {}, area.epsg, area.gsd_m,
+            [frame_of_row(row, self._store) for row in rows],
+            {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
+            [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions],
+            self._settings.basemap, None if fov_deg is None else math.radians(fov_deg),
+        )  # fmt: skip

@@ -1,0 +1,71 @@
+"""Vehicles and finds to TAK programs as they change: Cursor-on-Target over UDP, TCP or TLS."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from orthoswarm.export.tactical.cursor_on_target import event
+from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
+from orthoswarm.model.errors import OrthoSwarmError
+
+_EVERY_S: Final = 2.0
+_FINDS_EVERY: Final = 15
+_log = logging.getLogger(__name__)
+
+
+class TakFeed:
+    """Sends all vehicles every two seconds, and all finds when one is new and every half minute.
+
+    Args:
+        addresses: the receivers. places: gives the finds and vehicles of the moment.
+
+    Attributes:
+        problem: why a receiver gets nothing at present, empty if all do.
+    """
+
+    def __init__(self, addresses: Sequence[TakAddress], places: Callable[[], Sequence[Place]]) -> None:
+        self._senders = [TakSender(address) for address in addresses]
+        self._places = places
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="tak", daemon=True)
+        self.problem = ""
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(10.0)
+        for sender in self._senders:
+            sender.close()
+
+    def _run(self) -> None:
+        number, known = 0, set[str]()
+        while not self._stop.wait(_EVERY_S):
+            try:
+                places = self._places()
+            except (OrthoSwarmError, TimeoutError) as error:
+                _log.warning("TAK: %s", error)
+                continue
+            finds = {place.uid for place in places if place.kind == "find"}
+            everything = number % _FINDS_EVERY == 0 or not finds <= known
+            number, known = number + 1, finds
+            now = time.time()
+            events = [event(place, now) for place in places if everything or place.kind == "vehicle"]
+            self.problem = "; ".join(text for sender in self._senders if (text := _sent(sender, events)))
+
+
+def _sent(sender: TakSender, events: Sequence[bytes]) -> str:
+    """Send all; gives what went wrong, empty if nothing did."""
+    try:
+        for one in events:
+            sender.send(one)
+    except OrthoSwarmError as error:
+        return str(error)
+    return ""

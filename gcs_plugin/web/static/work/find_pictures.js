@@ -1,0 +1,37 @@
+// The pictures that show a find, best first, with the place marked in each.
+
+import { get, withToken } from "/static/core/api.js";
+import { button, make, setText } from "/static/core/dom.js";
+import { state } from "/static/core/store.js";
+import { text } from "/static/core/values.js";
+import { t } from "/static/core/strings.js";
+
+const MOST = 12;
+
+export function picturesDialog() {
+  const title = make("h2", { id: "find-pictures" });
+  const list = make("ul", { class: "pictures" });
+  const box = make("dialog", { class: "find-pictures", "aria-labelledby": "find-pictures" }, make("div", { class: "row" }, title, button("×", () => box.close(), { class: "close", "aria-label": t("finds.pictures.close") })), list);
+  const say = (words) => list.replaceChildren(make("li", { class: "quiet" }, words));
+  async function show(find) {
+    setText(title, t("finds.pictures.of", { note: text(find.note) || t("finds.unnamed") }));
+    say("…");
+    if (!box.open) box.showModal();
+    try {
+      const rows = (await get(`/api/finds/${encodeURIComponent(find.id)}/pictures`)).filter((row) => row.seq != null);
+      if (rows.length) list.replaceChildren(...rows.slice(0, MOST).map(figure));
+      else say(t("finds.pictures.none"));
+    } catch (error) {
+      say(error.message);
+    }
+  }
+  return { box, show };
+}
+
+function figure(row) {
+  const name = t("finds.pictures.one", { image: text(row.image), name: state.vehicles.get(row.vehicle)?.name ?? text(row.vehicle) });
+  const image = make("img", { src: withToken(`/api/frames/${row.seq}/picture`), alt: name, loading: "lazy" });
+  const mark = make("i", {});
+  image.addEventListener("load", () => { mark.style.left = `${(100 * row.column) / image.naturalWidth}%`; mark.style.top = `${(100 * row.row) / image.naturalHeight}%`; });
+  return make("li", {}, make("figure", {}, make("a", { href: image.getAttribute("src"), target: "_blank", rel: "noopener" }, image, mark), make("figcaption", {}, name)));
+}

@@ -1,0 +1,1 @@
+"""The map as others file or print it: STAC item, PMTiles, GeoPDF sheet, and an offline pack with a page."""

@@ -1,0 +1,261 @@
+"""A sheet to print, and to load as a map: GeoPDF (ISO 32000) of A3 with grid, scale, legend and accuracy."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.sheets.mgrs import grid_zone, square, utm_zone
+from orthoswarm.export.sheets.stac_item import picture_times
+from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.export.tactical.places import Place
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.geo import LocalGrid
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+
+_DPI: Final = 200
+_MM: Final = _DPI / 25.4
+_A3_MM: Final = (420.0, 297.0)
+_MARGIN_MM: Final = 14.0
+_FOOT_MM: Final = 46.0
+_SCALES: Final = tuple(int(m * 10**k) for k in range(2, 6) for m in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5))
+_STEPS_M: Final = tuple(m * 10**k for k in range(5) for m in (1, 2, 5))
+_STEP_MM: Final = 30.0
+_INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """The map's frame on the page.
+
+    Attributes:
+        page: width and height of the page in pixels. box: left, top, right, bottom of the frame in pixels.
+        scale: denominator. west, north: grid metres of the frame's upper left corner. metres: of a pixel.
+    """
+
+    page: tuple[int, int]
+    box: tuple[int, int, int, int]
+    scale: int
+    west: float
+    north: float
+    metres: float
+
+    def pixel(self, east_m: float, north_m: float) -> tuple[float, float]:
+        """Column and row on the page."""
+        return self.box[0] + (east_m - self.west) / self.metres, self.box[1] + (self.north - north_m) / self.metres
+
+
+def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str = "Orthoimage") -> None:
+    """Write an orthoimage as one sheet of A3 at the greatest round scale at which it fits.
+
+    Args:
+        cog: the orthoimage, in a projected system in metres; `report.json` and `frames.jsonl` beside it give accuracy
+            and time. path: the PDF. places: finds to mark. title: of the sheet.
+
+    Raises:
+        InputError: the COG cannot be read.
+        OrthoSwarmError: the disk is full, or the PDF cannot be written.
+    """
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.errors import RasterioError
+    from rasterio.vrt import WarpedVRT
+
+    try:
+        with rasterio.open(cog) as raster:
+            frame, epsg = _frame(_drawn(raster)), int(raster.crs.to_epsg())
+            left, top, right, bottom = frame.box
+            transform = rasterio.transform.from_origin(frame.west, frame.north, frame.metres, frame.metres)
+            with WarpedVRT(
+                raster, transform=transform, width=right - left, height=bottom - top, resampling=Resampling.average
+            ) as vrt:
+                rgba = vrt.read().transpose(1, 2, 0)
+    except RasterioError as error:
+        raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
+    page = _page(frame, rgba, epsg, cog.parent, places, title)
+    with written_whole(path) as part:
+        _save(page, frame, epsg, part, title)
+
+
+def _drawn(raster: Any) -> BoundingBox:
+    """Grid bounds of what is drawn, to a 512th of the raster."""
+    factor = max(1, max(raster.shape) // 512)
+    shape = math.ceil(raster.height / factor), math.ceil(raster.width / factor)
+    rows, cols = np.nonzero(raster.dataset_mask(out_shape=shape))
+    west, south, east, north = raster.bounds
+    if not len(rows):
+        return BoundingBox(west, south, east, north)
+    x, y = (east - west) / shape[1], (north - south) / shape[0]
+    return BoundingBox(
+        west + x * cols.min(), north - y * (rows.max() + 1), west + x * (cols.max() + 1), north - y * rows.min()
+    )
+
+
+def _frame(bounds: BoundingBox) -> _Frame:
+    """The page upright or lying, whichever shows the map larger."""
+    wide, high = bounds.width, bounds.height
+    best: _Frame | None = None
+    for width_mm, height_mm in (_A3_MM, _A3_MM[::-1]):
+        room = width_mm - 2 * _MARGIN_MM, height_mm - 2 * _MARGIN_MM - _FOOT_MM
+        need = 1000.0 * max(wide / room[0], high / room[1])
+        scale = next((s for s in _SCALES if s >= need), math.ceil(need))
+        metres = scale * 0.0254 / _DPI
+        box = tuple(round(v * _MM) for v in (_MARGIN_MM, _MARGIN_MM, _MARGIN_MM + room[0], _MARGIN_MM + room[1]))
+        west = 0.5 * (bounds.west + bounds.east) - 0.5 * (box[2] - box[0]) * metres
+        north = 0.5 * (bounds.north + bounds.south) + 0.5 * (box[3] - box[1]) * metres
+        page = round(width_mm * _MM), round(height_mm * _MM)
+        frame = _Frame(page, (box[0], box[1], box[2], box[3]), scale, west, north, metres)
+        if best is None or frame.scale < best.scale:
+            best = frame
+    assert best is not None
+    return best
+
+
+def _page(frame: _Frame, rgba: Any, epsg: int, folder: Path, places: Sequence[Place], title: str) -> Any:
+    from PIL import Image, ImageDraw
+
+    sheet = Image.new("RGB", frame.page, "white")
+    picture = Image.fromarray(np.ascontiguousarray(rgba))
+    sheet.paste(picture.convert("RGB"), frame.box[:2], picture.getchannel("A"))
+    draw = ImageDraw.Draw(sheet)
+    grid = LocalGrid(epsg)
+    step = _grid(draw, frame)
+    finds = [place for place in places if place.kind == "find"]
+    for place in finds:
+        east, north = (float(v) for v in grid.to_grid(place.lat_deg, place.lon_deg))
+        _mark(draw, frame.pixel(east, north), place.name, frame)
+    draw.rectangle(frame.box, outline=_INK, width=3)
+    _foot(draw, frame, grid, folder, len(finds), step, title)
+    return sheet
+
+
+def _grid(draw: "ImageDraw", frame: _Frame) -> float:
+    """Grid lines with their numbers outside the frame; gives their distance in metres."""
+    left, top, right, bottom = frame.box
+    step = next((s for s in _STEPS_M if s / frame.metres / _MM >= _STEP_MM), _STEPS_M[-1])
+    font = _font(2.6)
+    for k in range(math.ceil(frame.west / step), math.floor((frame.west + (right - left) * frame.metres) / step) + 1):
+        x = frame.pixel(k * step, 0.0)[0]
+        draw.line((x, top, x, bottom), fill=_GRID, width=1)
+        draw.text((x, top - 6), f"{k * step % 100_000:05.0f}", fill=_INK, font=font, anchor="mb")
+    south = frame.north - (bottom - top) * frame.metres
+    for k in range(math.ceil(south / step), math.floor(frame.north / step) + 1):
+        y = frame.pixel(0.0, k * step)[1]
+        draw.line((left, y, right, y), fill=_GRID, width=1)
+        draw.text((left - 6, y), f"{k * step % 100_000:05.0f}", fill=_INK, font=font, anchor="rm")
+    return float(step)
+
+
+def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) -> None:
+    x, y = at
+    left, top, right, bottom = frame.box
+    if left <= x <= right and top <= y <= bottom:
+        size = 2.2 * _MM
+        draw.ellipse((x - size, y - size, x + size, y + size), outline=_MARK, width=5)
+        draw.text(
+            (x + 1.4 * size, y),
+            name[:60],
+            fill=_MARK,
+            font=_font(3.2),
+            anchor="lm",
+            stroke_width=3,
+            stroke_fill="white",
+        )
+
+
+def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, folder: Path, finds: int, step: float, title: str) -> None:
+    left, _, right, bottom = frame.box
+    lat, lon = (float(v) for v in grid.to_geographic([frame.west, frame.north]))
+    zone = utm_zone(grid.epsg)
+    where = f"EPSG:{grid.epsg}"
+    if zone is not None:
+        where = (
+            f"MGRS {grid_zone(zone, lat)} {square(zone, frame.west, frame.north)}, UTM zone {zone} (EPSG:{grid.epsg})"
+        )
+    first, last = picture_times(folder)
+    taken = (
+        "time of the pictures is not known"
+        if first is None
+        else f"pictures of {_minute(first)} to {_minute(last or first)} UTC"
+    )
+    stated = stated_accuracy(folder)
+    lines = [
+        f"Scale 1:{frame.scale:,} on A3; grid lines every {step:g} m, WGS 84, {where}; up is grid north",
+        f"Upper left corner {_degrees(lat, 'NS')}, {_degrees(lon, 'EW')}; {taken}",
+        stated.sentence if stated else "Accuracy: no leg was found on a map; the sheet lies where the receivers say.",
+    ]
+    y = bottom + 4.0 * _MM
+    draw.text((left, y), title[:80], fill=_INK, font=_font(6.0))
+    for k, line in enumerate(lines):
+        draw.text((left, y + (9.0 + 5.0 * k) * _MM), line, fill=_INK, font=_font(3.0))
+    y += 27.0 * _MM
+    _scale_bar(draw, frame, left, y)
+    x = right - 90.0 * _MM
+    draw.line((x, y, x + 8 * _MM, y), fill=_GRID, width=2)
+    draw.text((x + 10 * _MM, y), f"grid, {step:g} m", fill=_INK, font=_font(3.0), anchor="lm")
+    if finds:
+        draw.ellipse((x + 2 * _MM, y + 3 * _MM, x + 6 * _MM, y + 7 * _MM), outline=_MARK, width=5)
+        draw.text((x + 10 * _MM, y + 5 * _MM), f"find ({finds})", fill=_INK, font=_font(3.0), anchor="lm")
+
+
+def _scale_bar(draw: "ImageDraw", frame: _Frame, x: float, y: float) -> None:
+    """Four alternating parts of a round length, some 100 mm in all."""
+    part = max(s for s in _STEPS_M if s / frame.metres <= 28.0 * _MM or s == _STEPS_M[0])
+    wide = part / frame.metres
+    for k in range(4):
+        box = (x + k * wide, y, x + (k + 1) * wide, y + 2.5 * _MM)
+        draw.rectangle(box, outline=_INK, fill=_INK if k % 2 == 0 else "white")
+        draw.text((box[0], y + 3.2 * _MM), f"{k * part:g}", fill=_INK, font=_font(2.6), anchor="mt")
+    draw.text((x + 4 * wide, y + 3.2 * _MM), f"{4 * part:g} m", fill=_INK, font=_font(2.6), anchor="mt")
+
+
+def _degrees(value: float, letters: str) -> str:
+    return f"{abs(value):.5f}° {letters[value < 0]}"
+
+
+def _minute(text: str) -> str:
+    return text[:16].replace("T", " ")
+
+
+def _font(height_mm: float) -> Any:
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(
+        Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", round(height_mm * _MM)
+    )
+
+
+def _save(page: Any, frame: _Frame, epsg: int, path: Path, title: str) -> None:
+    """Write the page; its neat line says that only the frame is a map."""
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.io import MemoryFile
+    from rasterio.shutil import copy
+    from rasterio.transform import from_origin
+
+    left, top, right, bottom = frame.box
+    west, north = frame.west - left * frame.metres, frame.north + top * frame.metres
+    corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
+    ring = ", ".join(f"{west + x * frame.metres} {north - y * frame.metres}" for x, y in corners)
+    width, height = frame.page
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": 3, "dtype": "uint8", "crs": f"EPSG:{epsg}"}
+    try:
+        with MemoryFile() as memory:
+            with memory.open(**profile, transform=from_origin(west, north, frame.metres, frame.metres)) as raster:
+                raster.write(np.asarray(page).transpose(2, 0, 1))
+            with rasterio.open(memory.name) as raster:
+                copy(
+                    raster, str(path), driver="PDF", DPI=str(_DPI), COMPRESS="JPEG", JPEG_QUALITY="88",
+                    GEO_ENCODING="ISO32000", NEATLINE=f"POLYGON (({ring}))", LAYER_NAME="Map", TITLE=title,
+                )  # fmt: skip
+    except RasterioError as error:
+        raise OrthoSwarmError(f"{path.name} cannot be written ({error}); see whether the disk is full") from None
+    path.with_name(path.name + ".aux.xml").unlink(missing_ok=True)

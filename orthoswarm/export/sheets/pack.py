@@ -1,0 +1,141 @@
+"""The offline pack: one ZIP with the map in every form, and a page that shows it without a server and internet."""
+
+import json
+import shutil
+import sqlite3
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.kmz import write_kmz
+from orthoswarm.export.mbtiles import write_mbtiles
+from orthoswarm.export.sheets.geopdf import write_geopdf
+from orthoswarm.export.sheets.pmtiles import write_pmtiles
+from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
+from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.export.tactical.cursor_on_target import write_data_package
+from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
+from orthoswarm.export.tactical.places import Place, write_geojson
+
+_PAGE: Final = Path(__file__).with_name("pack_page.html")
+_PURPOSES: Final = {
+    "orthoimage.tif": "For QGIS: the orthoimage (GeoTIFF)",
+    "orthoimage.stac.json": "For catalogues: what it is, when and how accurate (STAC)",
+    "footprints.gpkg": "For QGIS: footprints of the pictures (GeoPackage)",
+    "orthoimage.mbtiles": "For phones and tablets (MBTiles)",
+    "orthoimage.pmtiles": "For web maps (PMTiles)",
+    "orthoimage.kmz": "For Google Earth (KMZ)",
+    "sheet.pdf": "For print: a sheet with grid and scale (GeoPDF)",
+    "places-tak.zip": "For ATAK and WinTAK: finds and vehicles (data package)",
+    "places.geojson": "Finds and vehicles (GeoJSON)",
+    "places.kml": "Finds and vehicles (KML)",
+    "places.gpx": "For CalTopo and receivers: finds and vehicles (GPX)",
+    "places.csv": "Finds and vehicles as a table (CSV)",
+    "report.html": "Report of the map",
+}
+_STORED: Final = frozenset({".tif", ".webp", ".kmz", ".pdf", ".zip", ".mbtiles", ".pmtiles"})
+
+
+def write_pack(
+    cog: Path, path: Path, places: Sequence[Place] = (), progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write the pack of a map.
+
+    Args:
+        cog: the orthoimage; footprints.gpkg, report.html, report.json and frames.jsonl beside it go in if there.
+        path: the ZIP. places: finds and vehicles. progress: called with steps done and steps in all.
+
+    Raises:
+        InputError: the map cannot be read.
+        OrthoSwarmError: the disk is full.
+    """
+    tell = progress or (lambda done, of: None)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".pack") as name:
+        folder = Path(name)
+        tiles = folder / "orthoimage.mbtiles"
+        title = cog.resolve().parent.name or "map"
+        steps: list[Callable[[], None]] = [
+            lambda: write_mbtiles(cog, tiles, tile_format="webp"),
+            lambda: write_pmtiles(tiles, folder / "orthoimage.pmtiles"),
+            lambda: write_kmz(cog, folder / "orthoimage.kmz"),
+            lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
+            lambda: write_data_package(places, folder / "places-tak.zip", title),
+            lambda: write_geojson(places, folder / "places.geojson"),
+            lambda: write_kml(places, folder / "places.kml"),
+            lambda: write_gpx(places, folder / "places.gpx"),
+            lambda: write_csv(places, folder / "places.csv"),
+            lambda: _copy(cog, folder),
+            lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json"),
+        ]
+        for number, step in enumerate(steps):
+            tell(number, len(steps) + 1)
+            step()
+        with closing(sqlite3.connect(tiles)) as database, written_whole(path) as part:
+            _zip(database, folder, part, places, title)
+        tell(len(steps) + 1, len(steps) + 1)
+
+
+def _copy(cog: Path, folder: Path) -> None:
+    """The files that there are beside the orthoimage already; report.json and frames.jsonl say time and accuracy."""
+    shutil.copyfile(cog, folder / "orthoimage.tif")
+    for name in ("footprints.gpkg", "report.html", "report.json", "frames.jsonl"):
+        if (cog.parent / name).is_file():
+            shutil.copyfile(cog.parent / name, folder / name)
+
+
+def _zip(database: sqlite3.Connection, folder: Path, path: Path, places: Sequence[Place], title: str) -> None:
+    top = f"{title}-map"
+    about = dict(database.execute("SELECT name, value FROM metadata"))
+    files = [name for name in _PURPOSES if (folder / name).is_file()]
+    names = []
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in _tiles(database):
+            names.append(name)
+            archive.writestr(f"{top}/tiles/{name}.webp", data, zipfile.ZIP_STORED)
+        page = _PAGE.read_text(encoding="utf-8").replace(
+            "/*PACK*/null", _script(_document(folder, about, names, files, places, title))
+        )
+        archive.writestr(f"{top}/index.html", page)
+        for name in files:
+            packed = zipfile.ZIP_STORED if Path(name).suffix in _STORED else zipfile.ZIP_DEFLATED
+            archive.write(folder / name, f"{top}/{name}", packed)
+
+
+def _tiles(database: sqlite3.Connection) -> Iterator[tuple[str, bytes]]:
+    """Name (zoom/column/row from the north) and bytes of each tile."""
+    for zoom, x, row, data in database.execute("SELECT zoom_level, tile_column, tile_row, tile_data FROM tiles"):
+        yield f"{zoom}/{x}/{2**zoom - 1 - row}", data
+
+
+def _document(
+    folder: Path, about: dict[str, str], tiles: list[str], files: list[str], places: Sequence[Place], title: str
+) -> dict[str, Any]:
+    first, last = picture_times(folder)
+    stated = stated_accuracy(folder)
+    return {
+        "title": title,
+        "about": "" if first is None or last is None else f"Pictures of {_minute(first)} to {_minute(last)} UTC.",
+        "accuracy": "" if stated is None else stated.sentence,
+        "bounds": [float(v) for v in about["bounds"].split(",")],
+        "minzoom": int(about["minzoom"]), "maxzoom": int(about["maxzoom"]), "tiles": tiles,
+        "finds": [
+            {"name": p.name, "lat": p.lat_deg, "lon": p.lon_deg, "sigma": p.sigma_m, "note": p.note}
+            for p in places
+            if p.kind == "find"
+        ],
+        "files": [{"name": name, "purpose": _PURPOSES[name]} for name in files],
+    }  # fmt: skip
+
+
+def _minute(text: str) -> str:
+    return text[:16].replace("T", " ")
+
+
+def _script(document: dict[str, Any]) -> str:
+    """JSON that cannot end the script it stands in."""
+    return json.dumps(document, ensure_ascii=True).replace("<", "\\u003c")

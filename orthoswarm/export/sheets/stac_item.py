@@ -1,0 +1,98 @@
+"""A STAC item (STAC 1.1.0, extensions projection 2.0.0 and raster 1.1.0) beside the COG that it describes."""
+
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.model.errors import InputError
+
+_EXTENSIONS: Final = [
+    "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
+    "https://stac-extensions.github.io/raster/v1.1.0/schema.json",
+]
+_COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
+_COLOURS: Final = ("red", "green", "blue", "alpha")
+
+
+def write_stac_item(cog: Path, path: Path) -> None:
+    """Write the item of an orthoimage.
+
+    Time is that of its pictures (`frames.jsonl` beside it), accuracy what `report.json` beside it states.
+
+    Args:
+        cog: the orthoimage. path: the item, best in the same folder: it names the COG relatively to itself.
+
+    Raises:
+        InputError: the COG cannot be read.
+        OrthoSwarmError: the disk is full.
+    """
+    import os
+
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.warp import transform_geom
+
+    try:
+        with rasterio.open(cog) as raster:
+            west, south, east, north = raster.bounds
+            ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+            outline = {"type": "Polygon", "coordinates": [ring]}
+            geometry = transform_geom(raster.crs, "EPSG:4326", outline, precision=8)
+            epsg, shape, transform = raster.crs.to_epsg(), list(raster.shape), list(raster.transform)
+            bands, gsd = raster.count, float(raster.res[0])
+    except RasterioError as error:
+        raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
+    corners = np.asarray(geometry["coordinates"][0])
+    asset = {
+        "href": Path(os.path.relpath(cog, path.parent)).as_posix(), "type": _COG, "roles": ["data"],
+        "title": "Orthoimage", "proj:shape": shape, "proj:transform": transform,
+        "raster:bands": [
+            {"name": name, "data_type": "uint8", "spatial_resolution": gsd, "sampling": "area"}
+            for name in _COLOURS[:bands]
+        ],
+        "bands": [{"name": name} for name in _COLOURS[:bands]],
+    }  # fmt: skip
+    item = {
+        "type": "Feature", "stac_version": "1.1.0", "stac_extensions": _EXTENSIONS, "id": _identifier(cog),
+        "geometry": {"type": "Polygon", "coordinates": [corners.tolist()]},
+        "bbox": [*corners.min(0).tolist(), *corners.max(0).tolist()],
+        "properties": _properties(cog) | {"proj:code": f"EPSG:{epsg}", "gsd": gsd},
+        "links": [], "assets": {"orthoimage": asset},
+    }  # fmt: skip
+    with written_whole(path) as part:
+        part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _identifier(cog: Path) -> str:
+    return f"{cog.resolve().parent.name or 'map'}-{cog.stem}"
+
+
+def _properties(cog: Path) -> dict[str, Any]:
+    """Time, platforms and accuracy."""
+    first, last = picture_times(cog.parent)
+    made = datetime.fromtimestamp(cog.stat().st_mtime, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    properties: dict[str, Any] = {"title": "Orthoimage", "created": made, "datetime": None}
+    if first is None or last is None:
+        properties["datetime"] = made
+    else:
+        properties |= {"datetime": first, "start_datetime": first, "end_datetime": last}
+    stated = stated_accuracy(cog.parent)
+    if stated is not None:
+        properties["description"] = stated.sentence
+        properties |= stated.values
+    return properties
+
+
+def picture_times(folder: Path) -> tuple[str | None, str | None]:
+    """First and last moment of a map's pictures (ISO 8601, UTC); None where they say none."""
+    lines = folder / "frames.jsonl"
+    rows: list[Mapping[str, Any]] = list(read_frames(lines)) if lines.exists() else []
+    times = sorted(str(row["time"]) for row in rows if row.get("time"))
+    return (times[0], times[-1]) if times else (None, None)

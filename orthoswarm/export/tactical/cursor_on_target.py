@@ -1,0 +1,90 @@
+"""Cursor-on-Target events (MITRE, "Cursor-on-Target Message Router User's Guide", schema 2.0) for TAK programs.
+
+A file for ATAK, WinTAK and iTAK is a data package: a ZIP with a manifest and one event a file.
+"""
+
+import time
+import uuid
+import zipfile
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.tactical.places import Place
+
+_TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
+"""Friendly unmanned rotary wing; spot map marker."""
+_UNKNOWN: Final = "9999999.0"
+_STALE_S: Final = {"vehicle": 30.0, "find": 7 * 86_400.0}
+_MAGENTA: Final = "-65281"
+"""ARGB of a find's marker as a signed 32-bit integer."""
+
+
+def event(place: Place, now_s: float | None = None) -> bytes:
+    """A place as one event, UTF-8 XML.
+
+    Args:
+        place: what it is about. now_s: when it is sent, UTC epoch seconds; the present unless said. The event is
+            stale 30 s (vehicles) or seven days (finds) later.
+    """
+    now = time.time() if now_s is None else now_s
+    start = place.time_s if place.kind == "vehicle" else now
+    root = ElementTree.Element(
+        "event", version="2.0", uid=place.uid, type=_TYPES[place.kind], how="m-g" if place.kind == "vehicle" else "h-e",
+        time=_zulu(now), start=_zulu(start), stale=_zulu(now + _STALE_S[place.kind]),
+    )  # fmt: skip
+    ElementTree.SubElement(
+        root, "point", lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}",
+        hae=_UNKNOWN if place.height_m is None else f"{place.height_m:.1f}",
+        ce=_UNKNOWN if place.sigma_m is None else f"{place.sigma_m:.2f}", le=_UNKNOWN,
+    )  # fmt: skip
+    detail = ElementTree.SubElement(root, "detail")
+    ElementTree.SubElement(detail, "contact", callsign=_legal(place.name))
+    if place.course_deg is not None or place.speed_m_s is not None:
+        track = {"course": f"{(place.course_deg or 0.0) % 360.0:.1f}", "speed": f"{place.speed_m_s or 0.0:.2f}"}
+        ElementTree.SubElement(detail, "track", track)
+    if place.kind == "find":
+        ElementTree.SubElement(detail, "color", argb=_MAGENTA)
+        ElementTree.SubElement(detail, "archive")
+    remarks = [place.note, *([f"pictures: {', '.join(place.pictures)}"] if place.pictures else [])]
+    ElementTree.SubElement(detail, "remarks").text = _legal("\n".join(text for text in remarks if text))
+    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+
+
+def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSwarm") -> None:
+    """Write places as a data package that TAK programs import.
+
+    Args:
+        places: finds and vehicles. path: the ZIP. name: what the program lists it as.
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    now = time.time()
+    with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        manifest = ElementTree.Element("MissionPackageManifest", version="2")
+        settings = ElementTree.SubElement(manifest, "Configuration")
+        uid = str(uuid.uuid5(uuid.NAMESPACE_URL, f"orthoswarm/{name}"))
+        for key, value in (("uid", uid), ("name", _legal(name))):
+            ElementTree.SubElement(settings, "Parameter", name=key, value=value)
+        contents = ElementTree.SubElement(manifest, "Contents")
+        for place in places:
+            inside = f"{uuid.uuid5(uuid.NAMESPACE_URL, place.uid)}.cot"
+            archive.writestr(inside, event(place, now))
+            content = ElementTree.SubElement(contents, "Content", ignore="false", zipEntry=inside)
+            ElementTree.SubElement(content, "Parameter", name="uid", value=place.uid)
+        archive.writestr("MANIFEST/manifest.xml", ElementTree.tostring(manifest, encoding="utf-8"))
+
+
+def _zulu(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.") + f"{int(time_s % 1 * 1000):03d}Z"
+
+
+def _legal(text: str) -> str:
+    """Without what XML 1.0 cannot hold."""
+    return "".join(
+        c for c in text if c in "\t\n\r" or " " <= c <= "\ud7ff" or "\ue000" <= c <= "\ufffd" or c > "\uffff"
+    )

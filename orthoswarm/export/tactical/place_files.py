@@ -1,0 +1,89 @@
+"""Places as KML (Google Earth), CSV (spreadsheets) and GPX (CalTopo, handheld receivers)."""
+
+import csv
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.tactical.places import Place
+
+_COLUMNS: Final = (
+    "uid", "kind", "name", "lat_deg", "lon_deg", "height_m", "sigma_m", "time", "note", "course_deg", "speed_m_s",
+    "pictures",
+)  # fmt: skip
+_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
+
+
+def write_csv(places: Iterable[Place], path: Path) -> None:
+    """Write a row a place. Texts that a spreadsheet would take for a formula get an apostrophe before them.
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    out = io.StringIO(newline="")
+    rows = csv.writer(out)
+    rows.writerow(_COLUMNS)
+    for place in places:
+        values = [getattr(place, key) for key in _COLUMNS[:-1]]
+        rows.writerow(_cell(value) for value in [*values, " ".join(place.pictures)])
+    with written_whole(path) as part:
+        part.write_text(out.getvalue(), encoding="utf-8")
+
+
+def _cell(value: object) -> object:
+    if value is None:
+        return ""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def write_gpx(places: Iterable[Place], path: Path) -> None:
+    """Write places as waypoints of GPX 1.1 (topografix.com/GPX/1/1).
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    root = ElementTree.Element("gpx", version="1.1", creator="OrthoSwarm", xmlns="http://www.topografix.com/GPX/1/1")
+    for place in places:
+        point = ElementTree.SubElement(root, "wpt", lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}")
+        rows = {"ele": None if place.height_m is None else f"{place.height_m:.1f}", "time": place.time,
+                "name": place.name, "desc": _words(place), "type": place.kind}  # fmt: skip
+        _texts(point, rows)
+    _write(root, path)
+
+
+def write_kml(places: Iterable[Place], path: Path) -> None:
+    """Write places as KML 2.2 placemarks (OGC 12-007r2).
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    document = ElementTree.SubElement(root, "Document")
+    _texts(document, {"name": "OrthoSwarm"})
+    for place in places:
+        mark = ElementTree.SubElement(document, "Placemark")
+        _texts(mark, {"name": place.name, "description": _words(place)})
+        _texts(ElementTree.SubElement(mark, "TimeStamp"), {"when": place.time})
+        _texts(ElementTree.SubElement(mark, "Point"), {"coordinates": f"{place.lon_deg:.7f},{place.lat_deg:.7f}"})
+    _write(root, path)
+
+
+def _words(place: Place) -> str:
+    parts = [place.note, "" if place.sigma_m is None else f"standard deviation {place.sigma_m:.2f} m"]
+    parts += [f"pictures: {', '.join(place.pictures)}"] if place.pictures else []
+    return "; ".join(part for part in parts if part)
+
+
+def _texts(parent: ElementTree.Element, texts: dict[str, str | None]) -> None:
+    for tag, text in texts.items():
+        if text:
+            child = ElementTree.SubElement(parent, tag)
+            child.text = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff"))
+
+
+def _write(root: ElementTree.Element, path: Path) -> None:
+    with written_whole(path) as part:
+        part.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

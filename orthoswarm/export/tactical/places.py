@@ -1,0 +1,93 @@
+"""Places on the map that others should know of: finds and vehicles; kept in a workspace as `places.geojson`."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.model.errors import InputError
+
+FILE: Final = "places.geojson"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """A find or a vehicle.
+
+    Attributes:
+        uid: unique and lasting. kind: what it is. name: for people.
+        lat_deg, lon_deg: WGS 84. height_m: above the WGS 84 ellipsoid, None if unknown.
+        sigma_m: standard deviation of each horizontal coordinate, None if unknown.
+        time_s: when it was there, UTC epoch seconds. note: more, in words.
+        course_deg: from true north, None if unknown. speed_m_s: over ground.
+        pictures: names of pictures that show it.
+    """
+
+    uid: str
+    kind: Literal["find", "vehicle"]
+    name: str
+    lat_deg: float
+    lon_deg: float
+    time_s: float
+    height_m: float | None = None
+    sigma_m: float | None = None
+    note: str = ""
+    course_deg: float | None = None
+    speed_m_s: float | None = None
+    pictures: tuple[str, ...] = ()
+
+    @property
+    def time(self) -> str:
+        """When it was there, ISO 8601 in UTC with milliseconds."""
+        return datetime.fromtimestamp(self.time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+_OPTIONAL: Final = ("height_m", "sigma_m", "course_deg", "speed_m_s")
+
+
+def feature(place: Place) -> dict[str, Any]:
+    """A place as a GeoJSON feature (RFC 7946)."""
+    at = [place.lon_deg, place.lat_deg, *([] if place.height_m is None else [place.height_m])]
+    about: dict[str, Any] = {"kind": place.kind, "name": place.name, "note": place.note, "time": place.time}
+    about |= {key: value for key in _OPTIONAL if (value := getattr(place, key)) is not None}
+    if place.pictures:
+        about["pictures"] = list(place.pictures)
+    return {"type": "Feature", "id": place.uid, "geometry": {"type": "Point", "coordinates": at}, "properties": about}
+
+
+def write_geojson(places: Iterable[Place], path: Path) -> None:
+    """Write places as GeoJSON.
+
+    Raises:
+        OrthoSwarmError: the disk is full.
+    """
+    document = {"type": "FeatureCollection", "features": [feature(place) for place in places]}
+    with written_whole(path) as part:
+        part.write_text(json.dumps(document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+
+
+def read_places(folder: Path) -> list[Place]:
+    """The places that `write_geojson` kept in a map's folder; none if it has no such file.
+
+    Raises:
+        InputError: the file was changed to something else.
+    """
+    path = folder / FILE
+    if not path.exists():
+        return []
+    try:
+        return [_place(row) for row in json.loads(path.read_text(encoding="utf-8"))["features"]]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{path} is no list of places; remove it, and export again") from None
+
+
+def _place(row: Mapping[str, Any]) -> Place:
+    about, (lon, lat, *_) = row["properties"], row["geometry"]["coordinates"]
+    return Place(
+        uid=str(row["id"]), kind=about["kind"], name=about["name"], lat_deg=float(lat), lon_deg=float(lon),
+        time_s=datetime.fromisoformat(about["time"]).timestamp(), note=about.get("note", ""),
+        pictures=tuple(about.get("pictures", ())), **{key: about.get(key) for key in _OPTIONAL},
+    )  # fmt: skip

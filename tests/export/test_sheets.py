@@ -1,0 +1,127 @@
+"""The map as others file or print it: read back with their own rules."""
+
+import gzip
+import json
+import sqlite3
+import zipfile
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import rasterio
+
+from gcs_plugin.cli.main import main
+from orthoswarm.export.mbtiles import write_mbtiles
+from orthoswarm.export.sheets.geopdf import write_geopdf
+from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
+from orthoswarm.export.sheets.pmtiles import tile_number, write_pmtiles
+from orthoswarm.export.sheets.stac_item import write_stac_item
+from orthoswarm.export.tactical.places import FILE, Place, write_geojson
+
+WEST, NORTH, GSD = 465_500.0, 5_249_600.0, 0.25
+FIND = Place(uid="f", kind="find", name="Roof", lat_deg=47.3975, lon_deg=8.5437, time_s=1.78e9, note="</script>")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A map's folder as `orthoswarm mosaic` leaves it: 200 m by 150 m, nothing drawn in the east."""
+    out = tmp_path / "flood"
+    out.mkdir()
+    chance = np.random.default_rng(1)
+    rgba = np.full((4, 600, 800), 255, np.uint8)
+    rgba[:3] = chance.integers(0, 255, (3, 600, 800))
+    rgba[3, :, 500:] = 0
+    profile = {"driver": "GTiff", "width": 800, "height": 600, "count": 4, "dtype": "uint8", "crs": "EPSG:32632"}
+    transform = rasterio.transform.from_origin(WEST, NORTH, GSD, GSD)
+    with rasterio.open(out / "orthoimage.tif", "w", **profile, transform=transform) as raster:
+        raster.write(rgba)
+        raster.colorinterp = [rasterio.enums.ColorInterp[c] for c in ("red", "green", "blue", "alpha")]
+    legs = [{"state": "matched", "sigma_m": 0.2}, {"state": "matched", "sigma_m": 0.4}, {"state": "failed"}]
+    (out / "report.json").write_text(json.dumps({"legs": legs, "root": None}))
+    row = {"image": "a.jpg", "vehicle": "v1", "time": "2026-05-28T20:26:40Z"}
+    (out / "frames.jsonl").write_text(json.dumps(row) + "\n")
+    return out
+
+
+def test_mgrs_is_that_of_the_tables():
+    assert mgrs(32, 47.3977, 465_741.9, 5_249_460.2) == "32T MT 65741 49460"
+    assert mgrs(56, -33.8568, 334_897.0, 6_252_288.0).startswith("56H LH 34897 52288")  # Sydney's opera house
+    assert mgrs(31, 0.5, 166_021.0, 55_000.0).startswith("31N AA")
+    assert utm_zone(32632) == 32 and utm_zone(32760) == 60 and utm_zone(2056) is None and utm_zone(32661) is None
+
+
+def test_a_stac_item_is_valid_and_names_the_cog(folder):
+    write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json")
+    item = json.loads((folder / "orthoimage.stac.json").read_text())
+    jsonschema.validate(item, json.loads(Path(__file__).with_name("stac_item.schema.json").read_text()))
+    assert (folder / item["assets"]["orthoimage"]["href"]).is_file()
+    assert item["properties"]["proj:code"] == "EPSG:32632" and item["properties"]["gsd"] == GSD
+    assert item["properties"]["datetime"] == "2026-05-28T20:26:40Z"
+    assert "2 of 3 legs" in item["properties"]["description"]
+    assert item["bbox"][0] == pytest.approx(8.5426, abs=1e-3) and item["bbox"][3] == pytest.approx(47.399, abs=1e-3)
+
+
+def varints(data):
+    value = shift = 0
+    for byte in data:
+        value |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            yield value
+            value = shift = 0
+
+
+def test_pmtiles_hold_every_tile_under_its_number(folder, tmp_path):
+    assert [tile_number(*at) for at in ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (1, 1, 0))] == [0, 1, 2, 3, 4]
+    assert tile_number(12, 3423, 1763) == 19_078_479  # the specification's example
+    write_mbtiles(folder / "orthoimage.tif", tmp_path / "m.mbtiles", tile_format="webp")
+    write_pmtiles(tmp_path / "m.mbtiles", tmp_path / "m.pmtiles")
+    data = (tmp_path / "m.pmtiles").read_bytes()
+    assert data[:8] == b"PMTiles\x03"
+    word = [int.from_bytes(data[8 + 8 * k : 16 + 8 * k], "little") for k in range(11)]
+    numbers = list(varints(gzip.decompress(data[word[0] : word[0] + word[1]])))
+    count = numbers[0]
+    ids = np.cumsum(numbers[1 : 1 + count])
+    runs, sizes, offsets = (numbers[1 + k * count : 1 + (k + 1) * count] for k in (1, 2, 3))
+    found, end = {}, 0
+    for number, run, size, offset in zip(ids, runs, sizes, offsets, strict=True):
+        begin = offset - 1 if offset else end
+        end = begin + size
+        found |= {int(number) + k: data[word[6] + begin : word[6] + end] for k in range(run)}
+    with sqlite3.connect(tmp_path / "m.mbtiles") as database:
+        rows = database.execute("SELECT zoom_level, tile_column, tile_row, tile_data FROM tiles").fetchall()
+    database.close()
+    assert found == {tile_number(z, x, 2**z - 1 - row): tile for z, x, row, tile in rows}
+    assert json.loads(gzip.decompress(data[word[2] : word[2] + word[3]]))["name"] == "orthoimage"
+
+
+def test_a_sheet_is_a_pdf_with_georeferencing_and_a_round_scale(folder, tmp_path):
+    write_geopdf(folder / "orthoimage.tif", tmp_path / "sheet.pdf", [FIND], "Flood")
+    data = (tmp_path / "sheet.pdf").read_bytes()
+    assert data.startswith(b"%PDF") and b"/Measure" in data and b"/GPTS" in data and b"/LPTS" in data
+    assert b"/MediaBox" in data and not (tmp_path / "sheet.pdf.aux.xml").exists()
+
+
+def test_every_form_is_written_by_the_command_line(folder, capsys):
+    write_geojson([FIND], folder / FILE)
+    assert main(["export", str(folder), "--to", "stac", "pmtiles", "pdf", "places", "tak", "pack"]) == 0
+    written = [Path(line) for line in capsys.readouterr().out.split()]
+    assert all(path.exists() for path in written) and len(written) == 6
+    assert {p.name for p in (folder / "export" / "places").iterdir()} == {
+        f"places.{s}" for s in ("geojson", "kml", "gpx", "csv")
+    }
+    with zipfile.ZipFile(folder / "export" / "flood-map.zip") as archive:
+        names = set(archive.namelist())
+        page = archive.read("flood-map/index.html").decode()
+    inside = ("index.html", "orthoimage.tif", "orthoimage.stac.json", "orthoimage.mbtiles", "orthoimage.pmtiles",
+              "orthoimage.kmz", "sheet.pdf", "places-tak.zip", "places.geojson", "places.kml", "places.gpx",
+              "places.csv")  # fmt: skip
+    assert {f"flood-map/{name}" for name in inside} <= names
+    assert page.count("</script>") == 1  # a note cannot end the page's script
+    assert not [p for p in (folder / "export").iterdir() if p.name.startswith(".")]
+
+
+def test_without_places_the_command_line_says_where_they_come_from(folder, capsys):
+    assert main(["export", str(folder), "--to", "tak"]) == 0
+    assert "orthoswarm serve" in capsys.readouterr().out

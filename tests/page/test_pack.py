@@ -1,0 +1,35 @@
+"""The offline pack's page, opened from a folder: no server, no internet."""
+
+import zipfile
+
+from orthoswarm.export.sheets.pack import write_pack
+from orthoswarm.export.tactical.places import FILE, read_places, write_geojson
+from tests.export.test_sheets import FIND, folder  # noqa: F401
+from tests.kit.page_kit import DESK, PHONE
+
+
+def test_the_packs_page_shows_map_finds_and_files_from_a_folder(browser, folder, tmp_path):  # noqa: F811
+    write_geojson([FIND], folder / FILE)
+    write_pack(folder / "orthoimage.tif", tmp_path / "pack.zip", read_places(folder))
+    with zipfile.ZipFile(tmp_path / "pack.zip") as archive:
+        archive.extractall(tmp_path / "out")
+    for size in (DESK, PHONE):
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]})
+        page = context.new_page()
+        errors, asked = [], []
+        page.on("pageerror", lambda error, errors=errors: errors.append(str(error)))
+        page.on("request", lambda request, asked=asked: asked.append(request.url))
+        page.goto((tmp_path / "out" / "flood-map" / "index.html").as_uri())
+        page.wait_for_function("() => [...document.querySelectorAll('#map img')].some((i) => i.naturalWidth === 256)")
+        assert page.locator(".mark").count() == 1 and "Roof" in page.inner_text("#finds")
+        assert "2 of 3 legs" in page.inner_text("#accuracy")
+        for href in page.eval_on_selector_all(".file", "links => links.map((l) => l.getAttribute('href'))"):
+            assert (tmp_path / "out" / "flood-map" / href).is_file()
+        before = page.locator(".mark").bounding_box()
+        page.focus("#map")
+        page.keyboard.press("ArrowRight")
+        assert page.locator(".mark").bounding_box()["x"] < before["x"]
+        page.click("#in")
+        page.click("#finds button")
+        assert errors == [] and all(url.startswith("file:") for url in asked)
+        context.close()
