@@ -7,10 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, RunContext, RunState
+from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.cog import write_cog
+from orthoswarm.export.product_files import describe_frame
+from orthoswarm.export.seamlines import write_seamlines
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
@@ -19,7 +21,7 @@ from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.realtime import mosaic
-from orthoswarm.mosaic.renderer import Layer, RenderStats, render, render_layers
+from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
 from orthoswarm.raster.height_model import read_dem
 from orthoswarm.refine.registration.map_offset import measure_map_offset
 
@@ -106,12 +108,13 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
         with _canvas(run, COARSE, coarse[0], coarse_ground, state) as first:
             layers = [
                 Layer(coarse[0], coarse_ground, first, state.gains),
-                Layer(fine[0], fine_ground, second, state.gains),
+                Layer(fine[0], fine_ground, second, state.gains, seams=_seams(run, state)),
             ]
             drawn = partial(run.progress, "drawing orthoimage")
             stats = render_layers(layers, run=run.workers.map, progress=drawn)
             _write(run, first, COARSE)
         _write(run, second, ORTHOIMAGE)
+        _write_seamlines(run, second, fine[0])
     run.space.clear_scratch()
     state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
     run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
@@ -153,12 +156,20 @@ def draw(
     drawn = partial(run.progress, f"drawing {name.removesuffix('.tif')}")
     with _canvas(run, name, placed, terrain, state) as canvas:
         if realtime:
-            stats = mosaic(placed, canvas, run=run.workers.map, progress=drawn)
+            stats = mosaic(placed, canvas, previews=state.previews, run=run.workers.map, progress=drawn)
         else:
-            stats = render(placed, terrain, canvas, gains=state.gains, run=run.workers.map, progress=drawn)
+            seams = _seams(run, state) if name == ORTHOIMAGE else None
+            stats = render(placed, terrain, canvas, gains=state.gains, seams=seams, run=run.workers.map, progress=drawn)
         _write(run, canvas, name)
+        if name == ORTHOIMAGE:
+            _write_seamlines(run, canvas, placed)
     run.space.clear_scratch()
     return stats
+
+
+def _seams(run: RunContext, state: RunState) -> Seams | None:
+    """How the seams of the orthoimage are chosen."""
+    return None if state.previews is None else Seams(state.previews, run.options.blend)
 
 
 def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState) -> Canvas:
@@ -176,6 +187,11 @@ def _write(run: RunContext, canvas: Canvas, name: str) -> None:
     """Write a canvas as a COG."""
     written = partial(run.progress, f"writing {name}")
     write_cog(canvas, run.out / name, window=drawn_window(canvas), progress=written, threads=run.workers.count)
+
+
+def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFrame]) -> None:
+    """Write which picture shows which ground."""
+    write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed])
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:

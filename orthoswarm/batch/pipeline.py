@@ -34,6 +34,7 @@ from orthoswarm.mosaic.extent import partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd
 from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras
+from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem
 
@@ -126,6 +127,9 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     """The picture from recorded poses; the frames that it holds."""
     aside = strays(state.recorded.placed)
     placed = [p for p in state.recorded.placed if p.frame.image not in aside]
+    if run.options.until != "realtime":
+        images = [p.frame.image for p in state.recorded.placed]
+        state.previews = PreviewFile.create(run.space.file("previews"), images)
     known = run.space.recall("realtime")
     if known is not None and (run.out / REALTIME).exists():
         stats, stage = known

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, RunContext, RunState
+from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, SEAMLINES, RunContext, RunState
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Refinement
@@ -40,7 +40,7 @@ def write_products(
 def _made(run: RunContext, faulty: bool) -> set[str]:
     names = set(PRODUCTS)
     if run.options.until != "fine" or faulty:
-        names.discard(ORTHOIMAGE)
+        names -= {ORTHOIMAGE, SEAMLINES}
     if run.options.until == "realtime" or faulty:
         names.discard(COARSE)
     return names

@@ -17,6 +17,8 @@ from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.recorded_pose import Recorded
+from orthoswarm.mosaic.renderer import Blend
+from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.refine.registration.map_offset import MapOffset
@@ -27,7 +29,17 @@ Progress = Callable[[str, int, int], None]
 Load = Callable[[Progress], Ingest]
 
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
-PRODUCTS = (REALTIME, COARSE, ORTHOIMAGE, "frames.jsonl", "footprints.gpkg", "report.json", "report.html")
+SEAMLINES = "seamlines.gpkg"
+PRODUCTS = (
+    REALTIME,
+    COARSE,
+    ORTHOIMAGE,
+    "frames.jsonl",
+    "footprints.gpkg",
+    SEAMLINES,
+    "report.json",
+    "report.html",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +52,7 @@ class Options:
         fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
         dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
-        gains: even out brightness between pictures.
+        gains: even out brightness between pictures. blend: mix the two pictures at each seam, see Seams.
         config: thresholds of the refiner in the place of their defaults.
     """
 
@@ -52,6 +64,7 @@ class Options:
     dem: Path | None = None
     split_legs: bool = False
     gains: bool = True
+    blend: Blend = "seam"
     config: Overrides = field(default_factory=dict)
 
 
@@ -83,6 +96,7 @@ class RunState:
         thumbnails, gains: image -> small picture, factors that even out brightness.
         still: frames of vehicles that stood at one spot. odd: frames that look elsewhere than their vehicle's others.
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
+        previews: small copies of the pictures, for the seams.
         undrawn: image -> why the real-time picture does not show it.
         map_offset: the map against the receivers, None where nothing lies on a map.
         fault: what went wrong inside the refiner, None if nothing did.
@@ -102,6 +116,7 @@ class RunState:
     odd: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
+    previews: PreviewFile | None = None
     undrawn: Mapping[str, str] = field(default_factory=dict)
     map_offset: MapOffset | None = None
     fault: str | None = None

@@ -99,6 +99,10 @@ class Workspace:
         with written_whole(self._work / f"{name}.pickle") as part, part.open("wb") as file:
             pickle.dump(value, file, pickle.HIGHEST_PROTOCOL)
 
+    def file(self, name: str) -> Path:
+        """A file of intermediate results that a later run goes on from, whether it is there or not."""
+        return self._work / name
+
     def scratch(self, name: str) -> Path:
         """An empty sub-folder of `.work`."""
         path = self._work / "scratch" / name

@@ -11,6 +11,7 @@ from orthoswarm.config.bundle import BundleConfig
 from orthoswarm.config.features import FeaturesConfig
 from orthoswarm.config.flight import FlightConfig
 from orthoswarm.config.initial import InitialConfig
+from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.records import RecordsConfig
 from orthoswarm.config.registration import RegistrationConfig
 from orthoswarm.config.strategy import StrategyConfig
@@ -33,6 +34,7 @@ class Config:
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
+    mosaic: MosaicConfig = field(default_factory=MosaicConfig)
 
 
 _DEFAULT = Config()

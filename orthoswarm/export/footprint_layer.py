@@ -1,6 +1,7 @@
 """Footprints of frames as polygons in a GeoPackage, for QGIS."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ Array = NDArray[np.float64]
 Feature = tuple[Mapping[str, Any], Array]
 """What is known about a frame, and its outline."""
 
-_COLUMNS: dict[str, type[np.generic]] = {
+Column = type[np.generic]
+"""np.object_ for text, np.float64 for numbers."""
+_COLUMNS: dict[str, Column] = {
     "image": np.object_,
     "vehicle": np.object_,
     "time": np.object_,
@@ -37,15 +40,26 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
+    shown = (feature for feature in features if len(feature[1]) >= 3)
+    with gpkg_file(path) as part:
+        batch = list(islice(shown, _AT_ONCE))
+        while batch or not part.exists():
+            append_polygons(part, "footprints", _polygons([r for _, r in batch]), [v for v, _ in batch], _COLUMNS, epsg)
+            batch = list(islice(shown, _AT_ONCE))
+
+
+@contextlib.contextmanager
+def gpkg_file(path: Path) -> Iterator[Path]:
+    """A path to write a GeoPackage to, which appears under its name when it is complete.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
     import pyogrio
 
-    shown = (feature for feature in features if len(feature[1]) >= 3)
     with written_whole(path) as part:
         try:
-            batch = list(islice(shown, _AT_ONCE))
-            while batch or not part.exists():
-                _append(part, batch, epsg)
-                batch = list(islice(shown, _AT_ONCE))
+            yield part
         except (pyogrio.errors.DataSourceError, RuntimeError) as error:
             # GDAL does not say why; a folder that takes a file of a page is not full and may be written.
             part.with_suffix(".probe").write_bytes(bytes(65536))
@@ -53,22 +67,39 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
             raise OSError(0, str(error)) from None
 
 
-def _append(part: Path, batch: Sequence[Feature], epsg: int) -> None:
+def _polygons(rings: Sequence[Array]) -> NDArray[Any]:
+    """Polygons of rings that are not closed."""
+    import shapely
+
+    if not rings:
+        return np.empty(0, object)
+    points = np.concatenate([piece for ring in rings for piece in (ring, ring[:1])])
+    index = np.repeat(np.arange(len(rings)), [len(ring) + 1 for ring in rings])
+    return np.asarray(shapely.polygons(shapely.linearrings(points, indices=index)))
+
+
+def append_polygons(
+    part: Path, layer: str, shapes: NDArray[Any], rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Column],
+    epsg: int,
+) -> None:  # fmt: skip
+    """Append (multi)polygons of shapely to a layer of a GeoPackage, made if absent.
+
+    Args:
+        part: the file. layer: its layer. shapes: one a feature. rows: values by column, None or absent for unknown.
+        columns: names and kinds. epsg: the grid.
+    """
     import pyogrio
     import shapely
 
-    rings = [ring for _, ring in batch]
-    points = np.concatenate([piece for ring in rings for piece in (ring, ring[:1])]) if rings else np.empty((0, 2))
-    index = np.repeat(np.arange(len(rings)), [len(ring) + 1 for ring in rings])
-    shapes = shapely.polygons(shapely.linearrings(points, indices=index)) if rings else np.empty(0, object)
+    multi = len(shapes) > 0 and shapely.get_type_id(shapes[0]) == 6
     pyogrio.raw.write(
         str(part),
         shapely.to_wkb(shapes),
-        [_column([row.get(name) for row, _ in batch], kind) for name, kind in _COLUMNS.items()],
-        list(_COLUMNS),
-        layer="footprints",
+        [_column([row.get(name) for row in rows], kind) for name, kind in columns.items()],
+        list(columns),
+        layer=layer,
         driver="GPKG",
-        geometry_type="Polygon",
+        geometry_type="MultiPolygon" if multi else "Polygon",
         crs=f"EPSG:{epsg}",
         append=part.exists(),
     )

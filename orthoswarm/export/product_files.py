@@ -165,12 +165,12 @@ def write_frames(
             yield json.dumps(row, ensure_ascii=False) + "\n"
 
     write_text(out / "frames.jsonl", lines())
-    outlines = ((_feature(p), footprint(p.camera, z, inset_px=-0.5)) for p in placed)
+    outlines = ((describe_frame(p), footprint(p.camera, z, inset_px=-0.5)) for p in placed)
     write_footprints(out / "footprints.gpkg", outlines, grid.epsg)
 
 
-def _feature(placed: PlacedFrame) -> dict[str, Any]:
-    """What a footprint tells about its picture."""
+def describe_frame(placed: PlacedFrame) -> dict[str, Any]:
+    """Attributes of a picture's footprint and of the ground that the orthoimage takes from it."""
     frame, fov = placed.frame, math.degrees(placed.camera.lens.fov_rad)
     return {
         "image": frame.image, "vehicle": frame.vehicle, "time": iso_time(frame.time_s), "stage": placed.stage,

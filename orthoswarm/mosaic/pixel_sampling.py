@@ -79,7 +79,7 @@ def _scaled(level, field, x, y):  # type: ignore[no-untyped-def]
 def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, picture, factor, field, weights):  # type: ignore[no-untyped-def]
     """Colour a tile's pixels of one label from a picture by bicubic interpolation; gives their number.
 
-    The projection is lattice.project, its sums over a row taken out of the loop (labels made sure that it is seen).
+    The projection is lattice.project, its sums over a row taken out of the loop; what the picture does not show stays.
 
     Args:
         rgba: uint8 (T, T, 4), changed in place.
@@ -130,6 +130,8 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
                 r2 = px * px + py * py
                 scale = focal * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
             u, v = (px * scale + lens[U]) * shrink + offset, (py * scale + lens[V]) * shrink + offset
+            if u < -1.0 or v < -1.0 or u > right + 1.5 or v > bottom + 1.5:
+                continue  # beside a seam at the picture's very border
             fu, fv = np.int64(min(max(u, zero), right) * UNIT), np.int64(min(max(v, zero), bottom) * UNIT)
             j, i = fu >> 7, fv >> 7
             wx, wy = weights[fu & (UNIT - 1)], weights[fv & (UNIT - 1)]

@@ -24,6 +24,7 @@ from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
 from orthoswarm.mosaic.realtime_kernel import RUN, aim, fuse, touches
 from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Progress, RenderStats, Run, render, serial
+from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.picture_file import read_rgb
 
 Array = NDArray[np.float64]
@@ -163,6 +164,7 @@ def mosaic(
     canvas: Canvas,
     ground_z_m: float = 0.0,
     *,
+    previews: PreviewFile | None = None,
     read: Read = read_rgb,
     run: Run = serial,
     progress: Progress | None = None,
@@ -176,6 +178,7 @@ def mosaic(
         frames: with the recorded poses and the assumed field of view; "weak" means nothing here.
         canvas: made with plane "frame".
         ground_z_m: height of the ground plane.
+        previews: see Layer.
         read: see render.
         run: see render.
         progress: see render.
@@ -185,4 +188,4 @@ def mosaic(
         OrthoSwarmError: if the disk is full.
     """
     alike = [replace(frame, weak=False) for frame in frames]
-    return render(alike, Terrain.flat(ground_z_m), canvas, read=read, run=run, progress=progress)
+    return render(alike, Terrain.flat(ground_z_m), canvas, previews=previews, read=read, run=run, progress=progress)

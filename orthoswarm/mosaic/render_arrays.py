@@ -117,7 +117,8 @@ def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
     r0 = int(np.clip(np.floor((bounds[1] - terrain.south) / terrain.step_m) - 2, 0, rows - 2))
     r1 = int(np.clip(np.ceil((bounds[3] - terrain.south) / terrain.step_m) + 3, r0 + 2, rows))
     step = terrain.step_m
-    return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy())
+    bare = None if terrain.bare is None else terrain.bare[r0:r1, c0:c1].copy()
+    return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy(), bare)
 
 
 @kernel

@@ -3,6 +3,7 @@
 A label task owns one tile; sample tasks write disjoint pixels (their own labels) of tiles that they may share.
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,9 @@ from orthoswarm.mosaic.downsampling import reduced
 from orthoswarm.mosaic.pixel_sampling import WEIGHTS, sample
 from orthoswarm.mosaic.render_arrays import Shots, heights
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
+from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
+from orthoswarm.mosaic.seams.previews import write_preview
+from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
 
 Bytes = NDArray[np.uint8]
@@ -39,6 +43,10 @@ class Place:
     def store(self) -> TileStore:
         """The tiles, mapped in small number: tasks walk from tile to tile."""
         return TileStore(self.folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
+
+    def other_pictures(self) -> TileStore:
+        """Beside them tiles of what the other picture shows near each seam."""
+        return TileStore(self.folder / "seams", tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
 
     def corner(self, key: Key) -> tuple[float, float]:
         """West and north of a tile."""
@@ -78,6 +86,7 @@ class LabelTask:
         ids: int32 (K,), indices of the candidate frames. shots: their cameras.
         terrain: the ground there.
         again: int32, frames that turned out to be unreadable: only their pixels are labelled anew.
+        seams: what seam lines are chosen by; None takes the nearest nadir point alone.
     """
 
     place: Place
@@ -86,6 +95,7 @@ class LabelTask:
     shots: Shots
     terrain: Terrain
     again: Ints
+    seams: SeamCells | None = None
 
 
 def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
@@ -100,6 +110,10 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
         local[~lost] = -1
         old.rgba[:rows, :cols][lost] = 0
         owner[lost] = 0
+    elif task.seams is not None:
+        local = seam_labels(
+            store, task.key, (rows, cols), *place.corner(task.key), place.grid.gsd_m, task.ids, task.shots, task.seams
+        )
     marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
     lattice = place.heights(task.key, task.terrain)
     label_tile(local, task.shots, marks, lattice, *place.corner(task.key), place.grid.gsd_m)
@@ -113,13 +127,71 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
 
 
 @dataclass(frozen=True, slots=True)
+class FeatherTask:
+    """Find or mix what lies near the seams of a tile.
+
+    Attributes:
+        place: where. key: the tile. width_px: how far from a seam pictures are mixed.
+    """
+
+    place: Place
+    key: Key
+    width_px: int
+
+
+def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
+    """Label the pixels near a tile's seams with the other picture; gives where each frame is wanted.
+
+    To be called once all tiles are labelled.
+    """
+    other, _ = transition(labels_around(task.place.store(), task.key, task.width_px), task.width_px)
+    rows, cols = task.place.shape(task.key)
+    other = np.ascontiguousarray(other[:rows, :cols])
+    wanted = np.unique(other[other > 0])
+    if len(wanted) == 0:
+        return []
+    tile = task.place.other_pictures().get(task.key, create=True)
+    assert tile is not None
+    tile.plane[:rows, :cols] = other
+    local = np.where(other > 0, np.searchsorted(wanted, other) + 1, 0).astype(np.int32)
+    boxes = label_windows(local, len(wanted))
+    return [(int(mark) - 1, Window(task.key, *map(int, box))) for mark, box in zip(wanted, boxes)]
+
+
+def mix_pass(task: FeatherTask) -> None:
+    """Mix the pictures near a tile's seams, once all are drawn."""
+    store = task.place.store()
+    tile, second = store.get(task.key), task.place.other_pictures().get(task.key)
+    if tile is not None and second is not None:
+        other, share = transition(labels_around(store, task.key, task.width_px), task.width_px)
+        mix(tile.rgba, second.plane, second.rgba, other, share)
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewTask:
+    """Write previews of pictures: the file, and each picture's path and record; read reads a picture."""
+
+    previews: Path
+    pictures: list[tuple[Path, int]]
+    read: Read
+
+
+def preview_pass(task: PreviewTask) -> None:
+    """Write previews; a picture that cannot be read is left without, and is found out when it is drawn."""
+    for path, row in task.pictures:
+        with contextlib.suppress(PictureError):
+            write_preview(task.previews, row, task.read(path))
+
+
+@dataclass(frozen=True, slots=True)
 class Shot:
     """A picture's share of a layer.
 
     Attributes:
         layer: which of the task's layers. row: of its camera there. index: of its frame.
         field: float32 (3, 6), factors of its colours, see radiometry. factor: how much to reduce it first.
-        windows: where it won.
+        windows: where it won. near_seams: where it is wanted beyond that, to be mixed in.
+        preview: file and record for its preview; None where none is wanted.
     """
 
     layer: int
@@ -128,6 +200,8 @@ class Shot:
     field: NDArray[np.float32]
     factor: int
     windows: list[Window]
+    near_seams: list[Window]
+    preview: tuple[Path, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,20 +245,25 @@ class _Ground:
 
     def __init__(self, layer: TaskLayer) -> None:
         self.layer, self.store = layer, layer.place.store()
+        self.second = layer.place.other_pictures()
         self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
     def draw(self, shot: Shot, small: Bytes, factor: int) -> None:
-        lens = self.layer.shots.lens[shot.row]
-        for w in shot.windows:
-            tile = self.store.get(w.key)
-            assert tile is not None
-            position, rotation = self.about[w.key]
-            window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
-            sample(
-                tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row], lens,
-                self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor, shot.field, WEIGHTS,
-            )  # fmt: skip
+        for store, windows in ((self.store, shot.windows), (self.second, shot.near_seams)):
+            for window in windows:
+                self.draw_window(store, window, shot, small, factor)
+
+    def draw_window(self, store: TileStore, w: Window, shot: Shot, small: Bytes, factor: int) -> None:
+        tile = store.get(w.key)
+        assert tile is not None
+        position, rotation = self.about[w.key]
+        window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
+        sample(
+            tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row],
+            self.layer.shots.lens[shot.row], self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor,
+            shot.field, WEIGHTS,
+        )  # fmt: skip
 
 
 def sample_pass(task: SampleTask) -> list[Sampled]:
@@ -197,6 +276,8 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
         except OrthoSwarmError as error:
             results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
             continue
+        for to in {shot.preview for shot in shots if shot.preview is not None}:
+            write_preview(*to, picture)
         sizes = {shot.factor: reduced(picture, shot.factor) for shot in shots}
         for shot in shots:
             grounds[shot.layer].draw(shot, *sizes[shot.factor])

@@ -11,14 +11,16 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -28,17 +30,24 @@ from orthoswarm.mosaic.footprint import rejections
 from orthoswarm.mosaic.radiometry import Field, uniform
 from orthoswarm.mosaic.render_arrays import Shots, crop
 from orthoswarm.mosaic.render_passes import (
+    FeatherTask,
     LabelTask,
     Place,
+    PreviewTask,
     Read,
     Sampled,
     SampleTask,
     Shot,
     TaskLayer,
     Window,
+    feather_pass,
     label_pass,
+    mix_pass,
+    preview_pass,
     sample_pass,
 )
+from orthoswarm.mosaic.seams.previews import PreviewFile, unwritten
+from orthoswarm.mosaic.seams.seam_tiles import BORDER_PX, SeamCells, cell_size_px
 from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
 
@@ -48,6 +57,7 @@ Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a module-level function to every argument, in this process or in others; results in any order. It should
 take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
 Progress = Callable[[int, int], None]
+Blend = Literal["none", "seam"]
 
 _FRAMES_PER_TASK = 64
 _STAGING = "staging"
@@ -85,6 +95,19 @@ class RenderStats:
 
 
 @dataclass(frozen=True, slots=True)
+class Seams:
+    """How the seams of a map are chosen and drawn.
+
+    Attributes:
+        previews: of all its frames; those that are missing are made first.
+        blend: "seam" mixes the two pictures over a few pixels at each seam, "none" takes every pixel from one.
+    """
+
+    previews: PreviewFile
+    blend: Blend = "seam"
+
+
+@dataclass(frozen=True, slots=True)
 class Layer:
     """One of the maps that are drawn together.
 
@@ -94,6 +117,8 @@ class Layer:
         canvas: made with plane "frame"; gets colours, and per pixel the index of its frame in `frames` plus 1.
         gains: image -> factors of its colours (radiometry.Field); 1 where absent.
         bounds: renew only the tiles that touch these (west, south, east, north); all if None.
+        seams: how seams are chosen; None takes each pixel from the nearest nadir point (paper III.B).
+        previews: previews of the pictures are written here as they are read, for the seams of a later map.
     """
 
     frames: Sequence[PlacedFrame]
@@ -101,6 +126,8 @@ class Layer:
     canvas: Canvas
     gains: Mapping[str, Field] = field(default_factory=dict)
     bounds: BoundingBox | None = None
+    seams: Seams | None = None
+    previews: PreviewFile | None = None
 
 
 def render(
@@ -110,12 +137,14 @@ def render(
     *,
     gains: Mapping[str, Field] | None = None,
     bounds: BoundingBox | None = None,
+    seams: Seams | None = None,
+    previews: PreviewFile | None = None,
     read: Read = read_rgb,
     run: Run = serial,
     progress: Progress | None = None,
 ) -> RenderStats:
     """Render frames onto a canvas: `render_layers` of a single layer, see there and `Layer`."""
-    layer = Layer(frames, terrain, canvas, gains or {}, bounds)
+    layer = Layer(frames, terrain, canvas, gains or {}, bounds, seams, previews)
     return render_layers([layer], read=read, run=run, progress=progress)[0]
 
 
@@ -124,9 +153,10 @@ def render_layers(
 ) -> list[RenderStats]:
     """Render frames onto canvases, each picture read once for all of them.
 
-    Each map pixel is taken from the frame with the nearest nadir point that sees it (at most 75 degrees off
-    nadir; terrain and distortion honoured), from a weak frame only where no other sees, by
-    bicubic interpolation of the picture, averaged first where the map is coarser. No blending.
+    Each map pixel is taken from one frame that sees it (at most 75 degrees off nadir; terrain and distortion honoured):
+    the one with the nearest nadir point, or with `Layer.seams` the one that seam lines by cost give it to; from a weak
+    frame only where no other sees; by bicubic interpolation of the picture, averaged first where the map is coarser.
+    Only `Seams.blend` mixes two pictures, over a few pixels at each seam.
 
     Args:
         layers: what to draw.
@@ -151,6 +181,7 @@ def render_layers(
         jobs = [_Job(layer, folder, run) for layer, folder in zip(layers, staging, strict=True)]
         _draw(jobs, read, run, progress)
         for job in jobs:
+            job.mix()
             job.adopt()
         return [job.stats() for job in jobs]
     finally:
@@ -160,6 +191,8 @@ def render_layers(
 
 def _draw(jobs: Sequence["_Job"], read: Read, run: Run, progress: Progress | None) -> None:
     """Label and sample, and again for the pixels of pictures that turned out to be unreadable."""
+    for job in jobs:
+        job.make_previews(read)
     while True:
         for job in jobs:
             job.label()
@@ -202,6 +235,15 @@ def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
         yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read)
 
 
+def _by_frame(results: Iterable[Iterable[tuple[int, Window]]]) -> dict[int, list[Window]]:
+    """Windows by frame, frames and tiles in order."""
+    windows: dict[int, list[Window]] = defaultdict(list)
+    for result in results:
+        for i, window in result:
+            windows[i].append(window)
+    return {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
+
+
 def _tiles_within(canvas: Canvas, bounds: BoundingBox) -> set[Key]:
     r0, r1, c0, c1 = canvas.window(bounds)
     t = canvas.tile_px
@@ -224,6 +266,8 @@ class _Job:
         self.thumbnails: dict[str, Bytes] = {}
         self.pixels = np.zeros(len(self.frames), np.int64)
         self.windows: dict[int, list[Window]] = {}
+        self.near_seams: dict[int, list[Window]] = {}
+        self.seams, self.previews = layer.seams, layer.previews
         self.failed: dict[int, str] = {}
         reasons = rejections([f.camera for f in self.frames], self.ground, self.canvas.grid.gsd_m)
         for i, reason in reasons.items():
@@ -252,18 +296,64 @@ class _Job:
         again = np.array(sorted(self.failed), np.int32)
         self.failed = {}
 
-        def tasks() -> Iterator[LabelTask]:
+        def tasks(turn: tuple[int, int] | None) -> Iterator[LabelTask]:
             for key, ids in self.candidates.items():
-                good = ids[self.usable[ids]]
-                yield LabelTask(self.place, key, good, self.shots.take(good), self.local(key), again)
+                if turn is None or (key[0] % 2, key[1] % 2) == turn:
+                    good = ids[self.usable[ids]]
+                    seams = None if turn is None else self.seam_cells(key, good)
+                    yield LabelTask(self.place, key, good, self.shots.take(good), self.local(key), again, seams)
 
-        windows: dict[int, list[Window]] = defaultdict(list)
-        for result in self.run(label_pass, tasks()):
-            for i, window in result:
-                windows[i].append(window)
-        self.windows = {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
+        # Tiles of one turn do not touch; seams go on from the tiles of earlier turns, whoever works on them.
+        turns = [(0, 0), (0, 1), (1, 0), (1, 1)] if self.seams is not None and not len(again) else [None]
+        self.windows = _by_frame(result for turn in turns for result in self.run(label_pass, tasks(turn)))
         for i, own in self.windows.items():
             self.pixels[i] += sum(w.pixels for w in own)
+        first = self.seams is not None and self.seams.blend == "seam" and not len(again)
+        self.near_seams = _by_frame(self.run(feather_pass, self.feather_tasks())) if first else {}
+
+    def feather_tasks(self) -> Iterator[FeatherTask]:
+        width = active().mosaic.feather_px
+        yield from (FeatherTask(self.place, key, width) for key in self.place.store().existing())
+
+    def mix(self) -> None:
+        """Mix pictures at the seams, where wanted."""
+        if self.seams is not None and self.seams.blend == "seam":
+            for _ in self.run(mix_pass, self.feather_tasks()):
+                pass
+            shutil.rmtree(self.place.other_pictures().folder, ignore_errors=True)
+
+    def make_previews(self, read: Read) -> None:
+        """Previews of the usable frames that have none."""
+        if self.seams is None:
+            return
+        previews = self.seams.previews
+        index = np.unique(np.concatenate([np.empty(0, np.int32), *self.candidates.values()]))
+        rows = np.array([previews.row[self.frames[i].frame.image] for i in index], np.int32)
+        missing = np.nonzero(unwritten(previews.path, rows))[0]
+        pictures = [(self.frames[int(index[m])].frame.path, int(rows[m])) for m in missing]
+        n = _FRAMES_PER_TASK
+        tasks = (PreviewTask(previews.path, pictures[k : k + n], read) for k in range(0, len(pictures), n))
+        for _ in self.run(preview_pass, tasks):
+            pass
+
+    def seam_cells(self, key: Key, ids: Ints) -> SeamCells:
+        """What the seams of a tile are chosen by."""
+        assert self.seams is not None
+        images = [self.frames[int(i)].frame.image for i in ids]
+        rows = np.array([self.seams.previews.row[image] for image in images], np.int32)
+        tone = np.array([self.gains.get(image, _UNCHANGED).mean(0) for image in images], np.float32).reshape(-1, 6)
+        west, south, east, north = self.canvas.tile_bounds(key)
+        border = BORDER_PX * self.canvas.grid.gsd_m
+        terrain = crop(self.terrain, BoundingBox(west - border, south - border, east + border, north + border))
+        return SeamCells(self.seams.previews.path, rows, tone, self.cell_px, terrain)
+
+    @cached_property
+    def cell_px(self) -> int:
+        """Side of the cells in which seams are chosen."""
+        gsds = [float(f.camera.position[2] - z) / f.camera.lens.focal_px for f, z in zip(self.frames, self.ground)]
+        some = [(f.camera.lens.width, gsd) for f, gsd, good in zip(self.frames, gsds, self.usable) if good]
+        width, gsd = (float(v) for v in np.median(np.array(some), axis=0))
+        return cell_size_px(int(width), gsd, self.canvas.grid.gsd_m)
 
     def local(self, key: Key) -> Terrain:
         return crop(self.terrain, self.canvas.tile_bounds(key))
@@ -279,11 +369,12 @@ class _Job:
         field = self.gains.get(frame.frame.image, _UNCHANGED)
         picture_gsd = float(frame.camera.position[2] - self.ground[i]) / frame.camera.lens.focal_px
         factor = reduction(self.canvas.grid.gsd_m, picture_gsd)
-        return Shot(number, row, i, field, factor, self.windows[i])
+        to = None if self.previews is None else (self.previews.path, self.previews.row[frame.frame.image])
+        return Shot(number, row, i, field, factor, self.windows[i], self.near_seams.get(i, []), to)
 
     def layer_of(self, indices: list[int]) -> TaskLayer:
         """What a task has to know to draw some frames."""
-        keys = sorted({w.key for i in indices for w in self.windows[i]})
+        keys = sorted({w.key for i in indices for w in (*self.windows[i], *self.near_seams.get(i, ()))})
         return TaskLayer(self.place, self.shots.take(np.array(indices, int)), {key: self.local(key) for key in keys})
 
     def take(self, sampled: Sampled) -> None:

@@ -16,11 +16,12 @@ from orthoswarm.mosaic.render_arrays import STEP, TAN2_LIMIT, Shots, height_at, 
 Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]
 _BLOCK = 64
-_OUTSIDE, _PARTLY, _INSIDE = 0, 1, 2
+OUTSIDE, _PARTLY, _INSIDE = 0, 1, 2
 
 
 @kernel
-def _block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
+def block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
+    """Least and greatest height of a tile's rows r0 to r1 and columns c0 to c1."""
     low, high = lattice[r0 // STEP, c0 // STEP], lattice[r0 // STEP, c0 // STEP]
     for i in range(r0 // STEP, (r1 + STEP - 1) // STEP + 1):
         for j in range(c0 // STEP, (c1 + STEP - 1) // STEP + 1):
@@ -29,7 +30,7 @@ def _block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sight(position, rotation, lens, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
+def sight(position, rotation, lens, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     """Whether a camera sees a box of ground wholly, not at all, or perhaps; by its corners, since both are convex."""
     inside, behind, left, right, above, below = 0, 0, 0, 0, 0, 0
     for corner in range(8):
@@ -50,12 +51,12 @@ def _sight(position, rotation, lens, x0, x1, y0, y1, z0, z1):  # type: ignore[no
         if inside < corner + 1 and max(left, right, above, below) < corner + 1:
             return _PARTLY  # neither wholly in nor wholly beyond one border
     if behind == 8:
-        return _OUTSIDE
+        return OUTSIDE
     if behind > 0:
         return _PARTLY
     if inside == 8:
         return _INSIDE
-    return _OUTSIDE if max(left, right, above, below) == 8 else _PARTLY
+    return OUTSIDE if max(left, right, above, below) == 8 else _PARTLY
 
 
 @kernel
@@ -108,13 +109,13 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd):  # type:
     rows, columns = best.shape
     n = len(marks)
     least = np.empty(n)
-    low, high = _block_heights(lattice, 0, rows, 0, columns)
+    low, high = block_heights(lattice, 0, rows, 0, columns)
     flat = low == high
     for r0 in range(0, rows, _BLOCK):
         for c0 in range(0, columns, _BLOCK):
             r1, c1 = min(rows, r0 + _BLOCK), min(columns, c0 + _BLOCK)
             x0, x1, y0, y1 = c0 * gsd, c1 * gsd, r0 * gsd, r1 * gsd
-            z0, z1 = _block_heights(lattice, r0, r1, c0, c1)
+            z0, z1 = block_heights(lattice, r0, r1, c0, c1)
             for k in range(n):
                 dx = max(x0 - position[k, 0], 0.0, position[k, 0] - x1)
                 dy = max(y0 - position[k, 1], 0.0, position[k, 1] - y1)
@@ -126,8 +127,8 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd):  # type:
             for k in np.argsort(least, kind="mergesort"):
                 if least[k] > worst:
                     break
-                seen = _sight(position[k], rotation[k], lens[k], x0, x1, y0, y1, z0, z1)
-                if seen == _OUTSIDE:
+                seen = sight(position[k], rotation[k], lens[k], x0, x1, y0, y1, z0, z1)
+                if seen == OUTSIDE:
                     continue
                 far_x, far_y = (
                     max(x1 - position[k, 0], position[k, 0] - x0),

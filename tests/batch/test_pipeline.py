@@ -231,14 +231,18 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
         make(photos, out, Options(), progress=interrupt)
     make(photos, out, Options(gsd_m=1.0, until="realtime"), progress=lambda what, *_: seen.append(what))
     assert "drawing realtime" in seen
-    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif", "seamlines.gpkg"}
 
 
 def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / ".orthoimage.part4711.tif").write_bytes(b"half")
     make(flight[2] / "photos" / "a", tmp_path / "out", Options(until="realtime"))
-    assert {p.name for p in (tmp_path / "out").iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == set(PRODUCTS) - {
+        "coarse.tif",
+        "orthoimage.tif",
+        "seamlines.gpkg",
+    }
 
 
 def test_two_runs_do_not_write_to_one_folder(flight, tmp_path):
@@ -281,7 +285,7 @@ def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, t
     assert main([*command, "--workers", "1"]) == 1
     told = capsys.readouterr()
     assert "ZeroDivisionError: by a bug" in told.err and not told.out
-    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "coarse.tif"}
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "coarse.tif", "seamlines.gpkg"}
     report = json.loads((out / "report.json").read_text())
     assert any("ZeroDivisionError" in w for w in report["warnings"]) and report["refine"] == "none"
     rows = rows_of(out)
@@ -304,7 +308,11 @@ def test_without_a_map_the_orthoimage_is_the_coarse_one(flight, tmp_path):
 def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     folder = flight[2]
     report = make(folder / "photos" / "a", tmp_path / "r", Options(until="realtime", fov_min_deg=60, gsd_m=0.8))
-    assert {p.name for p in (tmp_path / "r").iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif"}
+    assert {p.name for p in (tmp_path / "r").iterdir()} == set(PRODUCTS) - {
+        "coarse.tif",
+        "orthoimage.tif",
+        "seamlines.gpkg",
+    }
     rows = rows_of(tmp_path / "r")
     assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"}
     assert all(r["fov_deg"] == pytest.approx(60) for r in rows.values() if "fov_deg" in r)
@@ -312,7 +320,7 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     with rasterio.open(tmp_path / "r" / "realtime.tif") as image:
         assert image.res == (0.8, 0.8)
     report = make(folder / "photos" / "a", tmp_path / "c", Options(basemap=folder / "map.tif", until="coarse"))
-    assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif"}
+    assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "seamlines.gpkg"}
     assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
     assert abs(report["vehicles"][0]["fov_deg"] - FOV) < 4
 

@@ -32,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
+    add("--blend", choices=("none", "seam"), default="seam", help="mix the pictures over a few pixels at seams, or not")
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
     add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
@@ -72,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
         dem=args.dem,
         split_legs=args.split == "legs",
         gains=not args.no_gains,
+        blend=args.blend,
         config=read_overrides(args.config) if args.config is not None else {},
     )
 

@@ -1,0 +1,247 @@
+"""For each cell of a tile the pictures that it may be taken from, what each costs there, and its grey level there.
+
+The cost of a picture grows with the squared tangent of its view angle (obliqueness), with the contrast that it lacks
+against the clearest picture on the same ground (haze), and with the sharpness that it lacks as a whole (blur).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
+from orthoswarm.mosaic.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
+from orthoswarm.mosaic.render_arrays import TAN2_LIMIT, Shots, height_at, project
+from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
+from orthoswarm.mosaic.seams.previews import GLARE_LEVEL
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+SLOTS = 5
+"""Candidates a cell: the cheapest ones."""
+BLOCK = 16
+"""Cells a side of the blocks at whose corners contrasts are compared."""
+_WEAK = 1e6
+"""Cost of a picture that is to be used only where no other sees."""
+_SPREAD_TAN2 = 0.5
+"""Pictures more oblique than the best by this (squared tangent) are no candidates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Candidates of a region of cells.
+
+    Attributes:
+        candidate: int32 (rows, columns, SLOTS), indices of the shots, cheapest first; -1 where there are fewer.
+        cost: float32, the same shape, in levels; infinite where there is none.
+        level: float32, the same shape, grey levels of the pictures, evened out by their fields.
+        texture: float32 (rows, columns), local contrast of the cheapest candidate, levels.
+    """
+
+    candidate: Ints
+    cost: Floats
+    level: Floats
+    texture: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A square of cells on the ground.
+
+    Attributes:
+        west: easting of its left edge. north: northing of its upper edge. gsd_m: ground pixel. cell_px: pixels a cell.
+        side: cells a side. lattice: float32, its heights, see render_arrays.heights.
+    """
+
+    west: float
+    north: float
+    gsd_m: float
+    cell_px: int
+    side: int
+    lattice: Floats
+
+
+def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArray[np.void]) -> Cells:
+    """The candidates of a region's cells.
+
+    Args:
+        region: the cells.
+        shots: N pictures that may see it.
+        tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
+        previews: (N,) of previews.RECORD; a picture without one is no candidate.
+    """
+    config = active().mosaic
+    position, rotation = shots.about(region.west, region.north)
+    height = float(np.median(position[:, 2] - float(np.median(region.lattice)))) if len(position) else 1.0
+    unit = region.cell_px * region.gsd_m / max(height, 1.0)  # of an area cost against the cost of a cell's side
+    sharpness = previews["sharpness"]
+    blur = np.log(np.maximum(np.median(sharpness), 1e-3) / np.maximum(sharpness, 1e-3)) - config.blur_ignored_log
+    penalty = unit * config.blur_cost * np.maximum(blur, 0.0) + _WEAK * shots.weak
+    usable = np.nonzero(previews["written"] > 0)[0]
+    local = previews["contrast"] * np.maximum(tone[:, :1, None], 0.1)
+    contrast = np.log(np.maximum(_smoothed(local), 0.5)).astype(np.float32)
+    shape = (region.side, region.side, SLOTS)
+    cells = Cells(
+        np.full(shape, -1, np.int32),
+        np.full(shape, np.inf, np.float32),
+        np.zeros(shape, np.float32),
+        np.zeros(shape[:2], np.float32),
+    )
+    arrays = (position, rotation, shots.lens, shots.size)
+    nodes = -(-region.side // BLOCK) + 1
+    haze = np.zeros((nodes, nodes, len(position)), np.float32)
+    _haze(
+        *arrays,
+        usable,
+        contrast,
+        region.lattice,
+        region.gsd_m,
+        region.cell_px,
+        np.float32(config.haze_ignored_log),
+        haze,
+    )
+    haze *= np.float32(unit * config.haze_cost)
+    _candidates(
+        *arrays, usable, penalty, haze, np.ascontiguousarray(previews["gray"]), tone, region.lattice, region.gsd_m,
+        region.cell_px, unit * config.obliqueness_cost, cells.candidate, cells.cost, cells.level,
+        np.ascontiguousarray(local, np.float32), cells.texture, unit * config.glare_cost,
+    )  # fmt: skip
+    return cells
+
+
+def _smoothed(contrast: Floats) -> Floats:
+    """Local contrasts (N, rows, columns) averaged over 5 x 5 blocks (rms): haze is larger than what it hides."""
+    import cv2
+
+    return np.array([np.sqrt(cv2.blur(c * c, (5, 5), borderType=cv2.BORDER_REPLICATE)) for c in contrast], np.float32)
+
+
+@kernel
+def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
+    """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
+    last = (lattice.shape[0] - 1) * 8 - 1
+    rows, columns = contrast.shape[1], contrast.shape[2]
+    for i in range(haze.shape[0]):
+        for j in range(haze.shape[1]):
+            r, c = min(i * BLOCK * cell, last), min(j * BLOCK * cell, last)
+            z = height_at(lattice, r, c)
+            best = np.float32(-1e9)
+            for k in usable:
+                u, v = project(position[k], rotation[k], lens[k], (c + 0.5) * gsd, (r + 0.5) * gsd, z)
+                x = min(max(int((u + 0.5) / size[k, 0] * columns), 0), columns - 1)
+                y = min(max(int((v + 0.5) / size[k, 1] * rows), 0), rows - 1)
+                haze[i, j, k] = contrast[k, y, x]
+                if u >= 0.0 and v >= 0.0 and u <= size[k, 0] - 1.0 and v <= size[k, 1] - 1.0:
+                    best = max(best, contrast[k, y, x])
+            for k in usable:
+                haze[i, j, k] = max(best - haze[i, j, k] - ignored, np.float32(0.0))
+
+
+@kernel
+def _gray(gray, tone, u, v, width, height):  # type: ignore[no-untyped-def]
+    """A picture's grey level at a pixel of the full picture, bilinear in its preview, evened out."""
+    rows, columns = gray.shape
+    x = min(max((u + 0.5) / width * columns - 0.5, 0.0), columns - 1.000001)
+    y = min(max((v + 0.5) / height * rows - 0.5, 0.0), rows - 1.000001)
+    j, i = int(x), int(y)
+    fx, fy = x - j, y - i
+    top = gray[i, j] * (1.0 - fx) + gray[i, j + 1] * fx
+    low = gray[i + 1, j] * (1.0 - fx) + gray[i + 1, j + 1] * fx
+    px, py = (2.0 * u + 1.0) / width - 1.0, (2.0 * v + 1.0 - height) / width
+    factor = tone[0] + px * (tone[1] + tone[3] * px + tone[4] * py) + py * (tone[2] + tone[5] * py)
+    return (top * (1.0 - fy) + low * fy) * factor
+
+
+@kernel
+def _candidates(  # type: ignore[no-untyped-def]
+    position,
+    rotation,
+    lens,
+    size,
+    usable,
+    penalty,
+    haze,
+    gray,
+    tone,
+    lattice,
+    gsd,
+    cell,
+    weight,
+    candidate,
+    cost,
+    level,
+    local,
+    texture,
+    glare,
+):
+    side = candidate.shape[0]
+    step = cell * gsd
+    least = np.empty(len(usable))
+    for b0 in range(0, side, BLOCK):
+        for b1 in range(0, side, BLOCK):
+            r1, c1 = min(side, b0 + BLOCK), min(side, b1 + BLOCK)
+            x0, x1, y0, y1 = b1 * step, c1 * step, b0 * step, r1 * step
+            z0, z1 = block_heights(lattice, b0 * cell, r1 * cell, b1 * cell, c1 * cell)
+            for n in range(len(usable)):
+                k = usable[n]
+                dx = max(x0 - position[k, 0], 0.0, position[k, 0] - x1)
+                dy = max(y0 - position[k, 1], 0.0, position[k, 1] - y1)
+                rise = max(position[k, 2] - z0, 1e-3)
+                least[n] = penalty[k] + weight * (dx * dx + dy * dy) / (rise * rise)
+            worst = np.float32(np.inf)
+            for n in np.argsort(least, kind="mergesort"):
+                k = usable[n]
+                if least[n] >= worst:
+                    break
+                if sight(position[k], rotation[k], lens[k], x0, x1, y0, y1, z0, z1) == OUTSIDE:
+                    continue
+                border = 1.0 + step * lens[k, 0] / max(position[k, 2] - z1, 1e-3)
+                worst = np.float32(0.0)
+                for r in range(b0, r1):
+                    y = (r + 0.5) * step
+                    fy = (r - b0 + 0.5) / BLOCK
+                    for c in range(b1, c1):
+                        x = (c + 0.5) * step
+                        fx = (c - b1 + 0.5) / BLOCK
+                        z = height_at(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
+                        dx, dy, rise = x - position[k, 0], y - position[k, 1], position[k, 2] - z
+                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * _SPREAD_TAN2))
+                        tan2 = (dx * dx + dy * dy) / (rise * rise) if rise > 0.0 else np.inf
+                        here = penalty[k] + weight * tan2
+                        if here < limit and tan2 <= TAN2_LIMIT:
+                            i, j = b0 // BLOCK, b1 // BLOCK
+                            here += (haze[i, j, k] * (1.0 - fx) + haze[i, j + 1, k] * fx) * (1.0 - fy) + (
+                                haze[i + 1, j, k] * (1.0 - fx) + haze[i + 1, j + 1, k] * fx
+                            ) * fy
+                            if here < limit:
+                                u, v = project(position[k], rotation[k], lens[k], x, y, z)
+                                inside = (
+                                    u >= lens[k, U_LOW] + border
+                                    and u <= lens[k, U_HIGH] - border
+                                    and v >= lens[k, V_LOW] + border
+                                    and v <= lens[k, V_HIGH] - border
+                                )
+                                if inside:
+                                    g = _gray(gray[k], tone[k], u, v, size[k, 0], size[k, 1])
+                                    if g >= GLARE_LEVEL:
+                                        here += glare
+                                if inside and here < limit:
+                                    s = SLOTS - 1
+                                    while s > 0 and cost[r, c, s - 1] > here:
+                                        cost[r, c, s] = cost[r, c, s - 1]
+                                        candidate[r, c, s] = candidate[r, c, s - 1]
+                                        level[r, c, s] = level[r, c, s - 1]
+                                        s -= 1
+                                    cost[r, c, s], candidate[r, c, s] = here, k
+                                    level[r, c, s] = g
+                                    if s == 0:
+                                        i = min(int((v + 0.5) / size[k, 1] * local.shape[1]), local.shape[1] - 1)
+                                        j = min(int((u + 0.5) / size[k, 0] * local.shape[2]), local.shape[2] - 1)
+                                        texture[r, c] = local[k, i, j]
+                                    limit = min(
+                                        cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * _SPREAD_TAN2)
+                                    )
+                        worst = max(worst, limit)
