@@ -55,6 +55,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
     row["sigma_m"] = placed.sigma_m
     if placed.weak:
         row["weak"] = True
+    if frame.damaged:
+        row["damaged"] = True
     row["camera"] = _camera_row(camera, grid)
     return row
 

@@ -46,6 +46,8 @@ class Frame:
             `camera` share one lens.
         fov_hint_rad: horizontal field of view from the picture's own tags, None if there is none.
         origin: which source gave which field, for `inspect` and the report.
+        damaged: True where parts of the picture were predicted from something that was lost: it serves for its
+            position only, and is drawn only where no other sees.
     """
 
     image: str
@@ -58,6 +60,7 @@ class Frame:
     camera: str = ""
     fov_hint_rad: float | None = None
     origin: dict[str, str] = field(default_factory=dict, compare=False)
+    damaged: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
+_WEAK = 1e6  # metres for micrometres: farther than any other
+
+
 @dataclass(frozen=True, slots=True)
 class Added:
     """What became of a frame.
@@ -65,13 +68,14 @@ class RealtimeMosaic:
         self._reals = np.empty((3, canvas.tile_px + RUN), np.float32)
         self._integers = np.empty((2, canvas.tile_px + RUN), np.uint32)
 
-    def add(self, picture: Bytes, camera: Camera, ground_z_m: float = 0.0) -> Added:
+    def add(self, picture: Bytes, camera: Camera, ground_z_m: float = 0.0, *, weak: bool = False) -> Added:
         """Draw one frame.
 
         Args:
             picture: uint8 (H, W, 4) RGBA with alpha 255, as read by read_rgba, or (H, W, 3) RGB (costs a copy).
             camera: where it was; its lens has the picture's size.
             ground_z_m: height of the ground plane, same datum as the camera.
+            weak: True to draw it only where no picture is yet, and to give way to any that comes.
 
         Raises:
             ValueError: if the picture has not the lens's size.
@@ -101,6 +105,7 @@ class RealtimeMosaic:
             radius=reach(camera, ground_z_m) / grid.gsd_m,
             matrix=ground_to_camera(camera, ground_z_m, grid.gsd_m),
             lens=_reduced_lens(camera, factor),
+            handicap=_WEAK if weak else 1.0,
         )
         counts = [self._draw(key, shot) for key in keys]
         return Added([key for key, count in zip(keys, counts) if count], sum(counts))
@@ -124,7 +129,7 @@ class RealtimeMosaic:
         part, gsd = (row, column, rows, columns), grid.gsd_m
         won = fuse(
             tile.packed, tile.plane, part, shot.picture, shot.planes, shot.centre, shot.radius, shot.matrix, shot.lens,
-            gsd, self._reals, self._integers,
+            gsd * shot.handicap, self._reals, self._integers,
         )  # fmt: skip
         if won:
             self.canvas.commit(key)
@@ -133,7 +138,10 @@ class RealtimeMosaic:
 
 @dataclass(frozen=True, slots=True)
 class _Shot:
-    """A picture ready for `fuse`; planes and centre in canvas pixels, matrix about the nadir point."""
+    """A picture ready for `fuse`; planes and centre in canvas pixels, matrix about the nadir point.
+
+    The handicap multiplies its pixels' distances from the nadir point, by which pictures compete.
+    """
 
     picture: NDArray[np.uint32]
     planes: Array
@@ -141,6 +149,7 @@ class _Shot:
     radius: float
     matrix: Array
     lens: Array
+    handicap: float
 
 
 def ground_to_camera(camera: Camera, ground_z_m: float, gsd_m: float) -> Array:
@@ -175,7 +184,8 @@ def mosaic(
     as by adding frame after frame (interpolated better), at little more than the cost of reading the pictures.
 
     Args:
-        frames: with the recorded poses and the assumed field of view; "weak" means nothing here.
+        frames: with the recorded poses and the assumed field of view; "weak" means nothing here, but damaged pictures
+            are drawn only where no other sees.
         canvas: made with plane "frame".
         ground_z_m: height of the ground plane.
         previews: see Layer.

@@ -258,7 +258,7 @@ class _Job:
         self.gains = dict(layer.gains)
         self.place = Place(staging, self.canvas.tile_px, self.canvas.grid)
         self.keys = None if layer.bounds is None else _tiles_within(self.canvas, layer.bounds)
-        self.shots = Shots.of([f.camera for f in self.frames], [f.weak for f in self.frames])
+        self.shots = Shots.of([f.camera for f in self.frames], [f.weak or f.frame.damaged for f in self.frames])
         position = np.nan_to_num(self.shots.position)
         self.ground = self.terrain.height(position[:, :2])
         self.usable = np.ones(len(self.frames), bool)

@@ -18,6 +18,7 @@ from telemetry.formats.video import bitstream, klv, sei
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 from telemetry.video.extraction import to_rgb
+from telemetry.video.packet_loss import LiveDamage
 from telemetry.video.picture_choice import Candidate, Picker
 from telemetry.video.video_file import NotAVideo, open_video, parked
 
@@ -35,7 +36,7 @@ class LivePicture:
         rgb: uint8 (rows, columns, 3).
         sample: its pose, None where the stream carries none. origin: where the pose is from.
         time_s: UTC epoch seconds of the exposure by the stream, else of its arrival.
-        damaged: True where the decoder had to conceal losses.
+        damaged: True where parts are predicted from something that was lost.
     """
 
     number: int
@@ -129,6 +130,7 @@ def _read(
     context = stream.codec_context
     context.flags |= int(Flags.copy_opaque) | int(Flags.output_corrupt)
     form = bitstream.StreamFormat.of(context.name, context.extradata)
+    damage = LiveDamage()
     wanted = [stream, *(s for s in container.streams if s.type == "data")]
     beside: deque[Sample] = deque(maxlen=_KEPT_SAMPLES)
     source = container.demux(*wanted)
@@ -150,32 +152,42 @@ def _read(
                         if p.sample is not None and p.sample.has_position
                     )
                     continue
-                packet.opaque = (
-                    None if form is None or not packet.size else sei.read(bitstream.sei_messages(bytes(packet), form))
-                )
+                if packet.size:
+                    index = damage.packet(is_key=packet.is_keyframe, is_marked=packet.is_corrupt)
+                    reading = None if form is None else sei.read(bitstream.sei_messages(bytes(packet), form))
+                    packet.opaque = index, reading
                 frames = packet.decode()
             except StopIteration:
                 return
             except (av.error.InvalidDataError, ValueError):
+                damage.failed()
                 continue
             except (av.error.FFmpegError, OSError) as error:
                 raise _Lost(str(getattr(error, "strerror", None) or error).lower()) from None
             for frame in frames:
-                yield from _offer(frame, beside, picker, next(numbers), now_s, clock)
+                index, reading = frame.opaque if isinstance(frame.opaque, tuple) else (None, None)
+                lost = damage.is_damaged(index, bool(frame.is_corrupt))
+                yield from _offer(frame, reading, lost, beside, picker, next(numbers), now_s, clock)
 
 
 def _offer(
-    frame: Any, beside: deque[Sample], picker: Picker | None, number: int, now_s: float, clock: Callable[[], float]
+    frame: Any,
+    reading: sei.Reading | None,
+    lost: bool,
+    beside: deque[Sample],
+    picker: Picker | None,
+    number: int,
+    now_s: float,
+    clock: Callable[[], float],
 ) -> Iterator[LivePicture]:
     seconds = float(frame.time) if frame.time is not None else now_s
-    reading = frame.opaque if isinstance(frame.opaque, sei.Reading) else None
     sample, origin = (reading.sample, " + ".join(reading.decoders)) if reading is not None else (None, "")
     if beside and (sample is None or not sample.has_position):
         held = _beside(beside, seconds)
         if held is not None:
             held = replace(held, time_s=None if sample is None else sample.time_s)
             sample, origin = (held if sample is None else held.merge(sample)), " + ".join(filter(None, ("KLV", origin)))
-    candidate = Candidate(number, frame, sample, seconds, origin)
+    candidate = Candidate(number, frame, sample, seconds, origin, damaged=lost)
     taken = [candidate] if picker is None else picker.push(candidate)
     for one in taken:
         stated = None if one.sample is None else one.sample.time_s
@@ -185,7 +197,7 @@ def _offer(
             one.sample,
             one.origin,
             clock() if stated is None else stated,
-            bool(one.frame.is_corrupt),
+            one.damaged,
         )
 
 

@@ -73,6 +73,7 @@ def _frame(
         camera=photo.camera,
         fov_hint_rad=photo.fov_hint_rad,
         origin=origin,
+        damaged=photo.damaged,
     )
 
 

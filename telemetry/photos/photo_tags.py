@@ -46,6 +46,7 @@ class PhotoTags:
         dewarp_k1: radial distortion that the tags state for a picture which still has it.
         yaw_is_stated: True where the source defines its yaw as the picture's, so that nothing is left to choose.
         origin: field -> where it came from.
+        damaged: True for a picture of a video that lost parts.
     """
 
     path: Path
@@ -68,6 +69,7 @@ class PhotoTags:
     dewarp_k1: float | None = None
     yaw_is_stated: bool = False
     origin: dict[str, str] = field(default_factory=dict)
+    damaged: bool = False
 
 
 def read_photo(path: Path) -> PhotoTags | None:

@@ -34,6 +34,7 @@ class Picture:
         sample: its pose, None where nothing is known. origin: where the pose is from.
         rgb: uint8 (rows, columns, 3). video_s: its time in the video.
         packet: index of its packet, None where the decoder did not tell.
+        damaged: whether parts of it are predicted from something that was lost.
     """
 
     number: int
@@ -42,6 +43,7 @@ class Picture:
     rgb: NDArray[np.uint8]
     video_s: float
     packet: int | None = None
+    damaged: bool = False
 
 
 @dataclass(slots=True)
@@ -159,9 +161,8 @@ def pictures(
         result.pictures += 1
         if progress is not None and number % 25 == 0:
             progress(number, total)
-        if frame.is_corrupt or (index is not None and damage.is_damaged(index)):
-            damaged[0] += 1
-            continue
+        lost = frame.is_corrupt or (index is not None and damage.is_damaged(index))
+        damaged[0] += lost
         pose = None if index is None or index >= total else poses.of(index)
         if placed_only and (pose is None or not pose.sample.has_position):
             result.without_pose += 1
@@ -170,7 +171,7 @@ def pictures(
         if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
             video_s = own
         sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
-        for taken in picker.push(Candidate(number, frame, sample, video_s, origin, index)):
+        for taken in picker.push(Candidate(number, frame, sample, video_s, origin, index, lost)):
             yield _picture(taken)
     for taken in picker.flush():
         yield _picture(taken)
@@ -180,7 +181,9 @@ def pictures(
 
 
 def _picture(taken: Candidate) -> Picture:
-    return Picture(taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s, taken.packet)
+    return Picture(
+        taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s, taken.packet, taken.damaged
+    )
 
 
 def to_rgb(frame: Any) -> NDArray[np.uint8]:
@@ -238,7 +241,8 @@ def extract(
     if taken is None:
         kept = []
         for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
-            kept.append(Kept(picture.number, picture.packet, picture.rgb.shape[1], picture.rgb.shape[0]))
+            rows, columns = picture.rgb.shape[:2]
+            kept.append(Kept(picture.number, picture.packet, columns, rows, picture.damaged))
             write_jpeg(folder / kept[-1].name, picture.rgb)
         taken = Taken(kept, result.pictures, result.without_pose, result.damaged)
         remember(folder, key, taken)
@@ -252,7 +256,11 @@ def extract(
         result.names[photo.path] = one.number
     if result.damaged:
         result.findings.append(
-            Finding("video-damaged", f"{plural(result.damaged, 'picture')} of {path.name} are damaged by losses")
+            Finding(
+                "video-damaged",
+                f"{plural(result.damaged, 'picture')} of {path.name} are damaged by losses; those of them that are "
+                "taken count for their positions only and are drawn where no other picture sees",
+            )
         )
     result.findings += poses.findings
     if result.without_pose:
@@ -304,6 +312,7 @@ class _LensKey:
 
 def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTags:
     photo = PhotoTags(path, kept.columns, kept.rows)
+    photo.damaged = kept.damaged
     photo.camera = lens.of(None if pose is None else pose.sample)
     if pose is None:
         return photo

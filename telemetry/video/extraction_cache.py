@@ -11,7 +11,7 @@ from typing import Any
 from telemetry.video.picture_poses import Poses
 
 _LIST = "pictures.json"
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +21,14 @@ class Kept:
     Attributes:
         number: of the picture in the video, in order of presentation.
         packet: index of its packet, None where the decoder did not tell.
-        columns: width in pixels; rows: height.
+        columns: width in pixels; rows: height. damaged: whether it lost parts.
     """
 
     number: int
     packet: int | None
     columns: int
     rows: int
+    damaged: bool = False
 
     @property
     def name(self) -> str:
@@ -41,7 +42,7 @@ class Taken:
 
     Attributes:
         pictures: those that were taken. seen: pictures decoded. without_pose: left out for lack of a position.
-        damaged: pictures that could not be decoded.
+        damaged: pictures that lost parts or could not be decoded.
     """
 
     pictures: Sequence[Kept]

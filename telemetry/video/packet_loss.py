@@ -2,8 +2,8 @@
 
 A picture predicted from a damaged one is damaged, too, although the decoder reports only the first: so damage runs in
 decoding order from the lost packet to the next recovery point, a key picture that arrived whole (H.264: IDR or recovery
-point SEI, H.265: IRAP). Losses show as gaps in the continuity counters of MPEG-TS (ISO/IEC 13818-1, 2.4.3.3; FFmpeg's
-own mark does not survive its H.265 parser), as decoding errors, and as pictures that the decoder had to conceal.
+point SEI, H.265: IRAP). Losses in files show as gaps in the continuity counters of MPEG-TS (ISO/IEC 13818-1, 2.4.3.3),
+as decoding errors, and as pictures that the decoder had to conceal; for live streams see `LiveDamage`.
 """
 
 from bisect import bisect_right
@@ -78,3 +78,36 @@ class Damage:
     def _section(self, index: int) -> int:
         """Number of recovery points up to a packet: damage does not run from one section into the next."""
         return bisect_right(self._recoveries, index)
+
+
+class LiveDamage:
+    """Follows damage through the packets of a live stream, of which there is no file to look for gaps in.
+
+    FFmpeg marks the data in which a continuity counter jumped, but its parsers put the mark on the picture that they
+    complete at that moment, the one before: both count as lost (measured on H.264 and H.265 in MPEG-TS, 2 of 300
+    transport packets lost: every smeared picture is found, one sound picture a loss is taken for damaged).
+    """
+
+    def __init__(self) -> None:
+        self._damage = Damage()
+        self._count = 0
+        self._was_marked = False
+
+    def packet(self, *, is_key: bool, is_marked: bool) -> int:
+        """Take note of the next packet; gives its index, by which its picture is asked for."""
+        index = self._count
+        self._damage.packet(index, is_key=is_key, is_lost=is_marked or self._was_marked)
+        self._was_marked, self._count = is_marked, index + 1
+        return index
+
+    def failed(self) -> None:
+        """Take note that the newest packet could not be decoded."""
+        self._damage.lost(max(0, self._count - 1))
+
+    def is_damaged(self, index: int | None, is_concealed: bool) -> bool:
+        """Whether a packet's picture is damaged; one that the decoder had to conceal damages those after it, too."""
+        if index is None:
+            return is_concealed
+        if is_concealed:
+            self._damage.lost(index)
+        return self._damage.is_damaged(index)

@@ -24,6 +24,7 @@ class Candidate:
     Attributes:
         number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
         origin: where the pose is from. packet: index of its packet, None where the decoder did not tell.
+        damaged: whether it lost parts.
     """
 
     number: int
@@ -32,13 +33,14 @@ class Candidate:
     video_s: float
     origin: str = ""
     packet: int | None = None
+    damaged: bool = False
 
 
 class Picker:
     """Takes pictures from a stream of them, at most one each spacing.
 
-    Among the pictures whose progress is near the spacing the sharpest is taken. Where pictures are further apart than
-    the spacing (a slow camera, a thinned video) all are taken.
+    Among the pictures whose progress is near the spacing the sharpest sound one is taken. Where pictures are further
+    apart than the spacing (a slow camera, a thinned video) all are taken.
 
     Args:
         every_m: spacing in metres; with neither this nor every_s 4 % of the height, else half a second.
@@ -77,7 +79,8 @@ class Picker:
     def _take(self) -> Candidate:
         best = self._waiting[0]
         if len(self._waiting) > 1:
-            best = max(self._waiting, key=lambda c: sharpness(c.frame))
+            sound = [c for c in self._waiting if not c.damaged]
+            best = max(sound or self._waiting, key=lambda c: sharpness(c.frame))
         self._waiting.clear()
         self._last = best
         return best

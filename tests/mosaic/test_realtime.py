@@ -269,3 +269,19 @@ def test_footprint_of_a_level_camera_is_its_corners():
 def test_default_gsd_is_the_median_ground_pixel_at_nadir():
     cameras = [scene.camera(height=h) for h in (90.0, 99.0, 180.0, -5.0)]
     assert default_gsd(cameras, 9.0) == pytest.approx(90.0 / 90.0)
+
+
+def test_a_weak_picture_is_drawn_where_no_other_sees_and_gives_way(canvas, tmp_path):
+    flight = scene.survey(3)
+    weak, *sound = range(len(flight.frames))
+    with Canvas.create(tmp_path / "sound", canvas.grid, tile_px=128) as other:
+        add_all(other, flight, sound)
+        expected = whole(other)
+    module, frame = RealtimeMosaic(canvas), flight.frames[weak]
+    module.add(flight.read(frame.frame.path), frame.camera, weak=True)
+    add_all(canvas, flight, sound)
+    image = whole(canvas)
+    covered = expected[..., 3] == 255
+    assert (image[covered] == expected[covered]).all(axis=-1).mean() > 0.9999
+    assert (image[..., 3] == 255).sum() > covered.sum()
+    assert module.add(flight.read(frame.frame.path), frame.camera, weak=True).won == 0

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from telemetry.video.extraction import decoded
+from telemetry.live.live_stream import open_stream
+from telemetry.video.extraction import decoded, extract
 from telemetry.video.packet_loss import Damage
 from telemetry.video.video_file import scan
 
@@ -60,6 +61,50 @@ def test_no_smeared_picture_passes_as_sound(tmp_path, codec):
             assert bad or not differs
     assert smeared > 20
     assert sound > 20
+
+
+def lossy(path, whole, seed, count=2):
+    """The same MPEG-TS file without some of its video's packets."""
+    data = np.frombuffer(whole.read_bytes(), np.uint8).reshape(-1, 188)
+    pid = ((data[:, 1] & 0x1F).astype(int) << 8) | data[:, 2]
+    lost = np.zeros(len(data), dtype=bool)
+    lost[np.random.default_rng(seed).choice(np.flatnonzero(pid == 0x100)[20:], count, replace=False)] = True
+    path.write_bytes(data[~lost].tobytes())
+    return path
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+def test_no_smeared_picture_of_a_live_stream_passes_as_sound(tmp_path, codec):
+    whole = moving_video(tmp_path / "whole.ts", codec)
+
+    def watch(path):
+        seen = open_stream(str(path), all_pictures=True, reconnect=False, clock=lambda: 0.0)
+        return [(p.rgb.astype(np.int16), p.damaged) for p in seen]
+
+    truth = watch(whole)
+    assert len(truth) == 80
+    assert not any(bad for _, bad in truth)
+    smeared = sound = 0
+    for seed in range(6):
+        for picture, bad in watch(lossy(tmp_path / "lossy.ts", whole, seed)):
+            differs = min(float(np.abs(picture - true).mean()) for true, _ in truth) > 1.0
+            smeared += differs
+            sound += not bad
+            assert bad or not differs
+    assert smeared > 20
+    assert sound > 200
+
+
+def test_damaged_pictures_of_a_file_are_kept_for_their_positions_with_a_mark(tmp_path):
+    whole = moving_video(tmp_path / "whole.ts", "libx264")
+    found = extract(lossy(tmp_path / "lossy.ts", whole, 0), "lossy.ts", tmp_path / "cache", every_s=0.1)
+    photos = found.photos["lossy"]
+    assert len(photos) >= 78
+    assert 20 <= sum(photo.damaged for photo in photos) <= 40
+    again = extract(tmp_path / "lossy.ts", "lossy.ts", tmp_path / "cache", every_s=0.1)  # from the cache
+    assert [p.damaged for p in again.photos["lossy"]] == [p.damaged for p in photos]
+    wide = extract(tmp_path / "lossy.ts", "lossy.ts", tmp_path / "wide", every_s=1.0)
+    assert sum(p.damaged for p in wide.photos["lossy"]) < 0.4 * len(wide.photos["lossy"])
 
 
 def test_damage_runs_from_a_loss_to_the_next_recovery_point():

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.daemon.intake.pose_relay import pose_values
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
@@ -13,6 +13,9 @@ from gcs_plugin.daemon.intake.watched_folder import FolderReader, PictureIntake
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from telemetry.live.live_poses import LinkPose
 from telemetry.samples.sample import Sample
+
+if TYPE_CHECKING:
+    from telemetry.live.live_stream import LivePicture
 
 _SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
 _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://", "http://", "https://")
@@ -122,16 +125,14 @@ class Source:
                 self._tell(f"the pictures of {self.vehicle}: {self._state}")
 
         for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
-            if picture.damaged:
-                continue
-            name = f"live-{picture.time_s:.3f}.jpg"
-            self._offer(name, picture.time_s, picture.sample, picture.origin, partial(encode_jpeg, picture.rgb))
+            self._offer(picture, partial(encode_jpeg, picture.rgb))
 
-    def _offer(self, name: str, time_s: float, sample: Sample | None, origin: str, data: Callable[[], bytes]) -> None:
-        """Take a picture with the pose that it carries, gaps filled from the vehicle's link."""
-        own = sample if sample is not None else Sample()
+    def _offer(self, picture: "LivePicture", data: Callable[[], bytes]) -> None:
+        """Take a picture with the pose that it carries, gaps filled from the vehicle's link and bus."""
+        name, time_s, origin = f"live-{picture.time_s:.3f}.jpg", picture.time_s, picture.origin
+        own = picture.sample if picture.sample is not None else Sample()
         given = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
-        origins = {name: origin for name, value in given.items() if value is not None}
+        origins = dict.fromkeys((key for key, value in given.items() if value is not None), origin)
         if not own.has_position or own.yaw_deg is None or own.height_m is None:
             linked = self._pose_at(self.vehicle, time_s)
             if linked is not None:
@@ -140,6 +141,8 @@ class Source:
         if values is None:
             self._without_pose += 1
             return
+        if picture.damaged:
+            values["damaged"] = True
         self._keep(PostedPose(self.vehicle, name, time_s, values, origins), data())
 
     def _keep(self, pose: PostedPose, data: bytes) -> None:

@@ -48,4 +48,6 @@ def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
             values[key] = math.degrees(value) if degrees else float(value)
     if frame.fov_hint_rad is not None:
         values["fov_deg"] = math.degrees(frame.fov_hint_rad)
+    if frame.damaged:
+        values["damaged"] = True
     return PostedPose(vehicle, name, frame.time_s, values, dict(frame.origin))

@@ -25,7 +25,8 @@ class PostedPose:
 
     Attributes:
         vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if it was not said.
-        values: lat_deg, lon_deg and what else is known, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE.
+        values: lat_deg, lon_deg and what else is known, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE;
+            `damaged`: True for a picture that lost parts.
         origin: where position, height, angles and time are from, as far as that is known.
     """
 
@@ -107,7 +108,10 @@ def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str,
         radians("roll_deg"), radians("flight_yaw_deg"), v.get("position_sigma_m"), bool(v.get("height_is_ground")),
     )  # fmt: skip
     hint, origin = radians("fov_deg"), v.get("origin", {})
-    return Frame(image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=hint, origin=origin)
+    damaged = bool(v.get("damaged"))
+    return Frame(
+        image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=hint, origin=origin, damaged=damaged
+    )  # fmt: skip
 
 
 def _text(document: Mapping[str, Any], key: str, default: str | None = None) -> str:

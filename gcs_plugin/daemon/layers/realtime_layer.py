@@ -278,7 +278,7 @@ class Drawer:
             picture = read_rgba(frame.path)
             mosaic = self._site.mosaic
             assert mosaic is not None
-            added = mosaic.add(picture, camera)
+            added = mosaic.add(picture, camera, weak=frame.damaged)
         except StorageError:  # the disk is full, or gone: later
             raise
         except OrthoSwarmError as error:

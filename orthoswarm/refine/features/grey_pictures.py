@@ -43,7 +43,7 @@ class Pictures:
         self.damaged: dict[int, str] = {}
 
     def gray(self, i: int) -> Gray:
-        """Picture i, uint8 (rows, columns); a grey card where it cannot be decoded (see `damaged`)."""
+        """Picture i, uint8 (rows, columns); a grey card where it cannot be decoded (see `damaged`) or lost parts."""
         cached = self._cache.get(i)
         if cached is not None:
             self._cache.move_to_end(i)
@@ -72,6 +72,8 @@ class Pictures:
         return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
 
     def _load(self, i: int) -> Gray:
+        if self._frames[i].damaged:  # what it shows may be of another moment: its record counts, its content does not
+            return np.full(self.size[::-1], 127, np.uint8)
         try:
             picture = self._read(self._frames[i])
         except PictureError as error:

@@ -328,3 +328,14 @@ def test_a_vehicle_over_a_hole_of_the_map_is_carried_once_its_neighbour_is_there
     assert np.hypot(*off) < 1.0
     assert any("neighbours carry it" in w for w in carried.warnings)
     assert not any("no part of this flight was found" in w for w in carried.warnings)
+
+
+def test_pictures_that_lost_parts_are_placed_by_their_neighbours_and_hold_nothing(scene):
+    vehicles, grid, basemap, truth = scene
+    marked = {v: [replace(f, damaged=i % 8 == 4) for i, f in enumerate(frames)] for v, frames in vehicles.items()}
+    for solution in refine_all(marked, basemap, grid).fine:
+        assert len(solution.placed) == len(vehicles[solution.vehicle])
+        damaged = np.array([p.frame.damaged for p in solution.placed])
+        assert [p.weak for p in solution.placed] == damaged.tolist()
+        assert np.median(errors(solution, truth, grid)[~damaged]) < 0.5
+        assert np.median(errors(solution, truth, grid)[damaged]) < 5.0
