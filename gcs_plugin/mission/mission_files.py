@@ -22,6 +22,7 @@ NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16,
 DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
 _FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
 _GROUND_SPEED = 1.0
+_HIGHEST_M = 20_000.0
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2
@@ -227,7 +228,7 @@ def _parse_waypoints(text: str, name: str) -> Mission:
     items = [MissionItem(int(r[3]), int(r[2]), (r[4], r[5], r[6], r[7]), r[8], r[9], r[10], r[11] != 0) for r in rows]
     home = (items[0].lat_deg, items[0].lon_deg, items[0].alt_m) if items else None
     for item in items:
-        _check_position(item.lat_deg, item.lon_deg, name, item.has_position)
+        _check_item(item, name)
     return Mission(tuple(items[1:]), home)
 
 
@@ -247,7 +248,7 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
         else:
             items.append(_read_item(entry))
     for item in items:
-        _check_position(item.lat_deg, item.lon_deg, "an item", item.has_position)
+        _check_item(item, "an item")
     fence = document.get("geoFence") or {}
     no_fly = [_ring(p["polygon"]) for p in fence.get("polygons") or [] if not p.get("inclusion", True)]
     no_fly += [_circle(c["circle"]) for c in fence.get("circles") or [] if not c.get("inclusion", True)]
@@ -278,6 +279,12 @@ def _read_item(entry: Mapping[str, Any]) -> MissionItem:
         alt,
         bool(entry.get("autoContinue", True)),
     )
+
+
+def _check_item(item: MissionItem, name: str) -> None:
+    _check_position(item.lat_deg, item.lon_deg, name, item.has_position)
+    if not abs(item.alt_m) < _HIGHEST_M:
+        raise InputError(f"{name} has the altitude {item.alt_m:g} m, where nothing flies; correct it")
 
 
 def _check_position(lat: float, lon: float, name: str, used: bool) -> None:

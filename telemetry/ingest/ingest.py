@@ -14,7 +14,7 @@ from pathlib import Path
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from telemetry.formats.table import geo_txt, pose_csv
-from telemetry.formats.table.pose_row import PoseTable, lookup
+from telemetry.formats.table.pose_row import PoseTable, lookup, names_of
 from telemetry.formats.video.sei import register
 from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
@@ -119,7 +119,7 @@ def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery
         text = f"{plural(table.useless, 'line')} of {path.name} hold no position that can be one; they are not used"
         findings.append(Finding("table-lines", text))
     pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
-    names = {p.name.lower() for p in pictures} | {p.relative_to(folder).as_posix().lower() for p in pictures}
+    names = {name for p in pictures for name in names_of(p.relative_to(folder).as_posix())}
     absent = [name for name in table if name not in names]
     if absent:
         text = f"{plural(len(absent), 'line')} of {path.name} name pictures that are not here, {absent[0]} first"

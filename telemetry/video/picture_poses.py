@@ -70,6 +70,8 @@ class Poses:
         self._interval = 1.0 / found.rate if found.rate else 1.0 / 30.0
         self._djmd = sorted(found.djmd_samples, key=lambda row: row[0])
         self._djmd_times = np.array([row[0] for row in self._djmd])
+        # Whole seconds: the largest difference is that of a moment at which the second had just begun.
+        self._djmd_clock = max((s.time_s - t for t, s in self._djmd if s.time_s is not None), default=None)
         self._times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
         self._trust_sei_times = True
         self._interpolated: list[tuple[str, list[Sample]]] = []
@@ -91,6 +93,8 @@ class Poses:
             parts.append((own, " + ".join(note.decoders)))
         with_packet = self._own_djmd(t)
         if with_packet is not None:
+            if self._djmd_clock is not None and t == t:
+                with_packet = replace(with_packet, time_s=float(t) + self._djmd_clock)
             parts.append((with_packet, "djmd"))
         for name, samples in self._interpolated:
             if samples[index].has_position or samples[index].yaw_deg is not None:

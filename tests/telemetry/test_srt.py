@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from telemetry.formats.video.djmd import parse_message, read_djmd
 from telemetry.formats.video.srt import parse_srt, read_srt
+from telemetry.video.picture_poses import Poses
+from telemetry.video.video_file import PictureNote, VideoScan
 
 
 def block(text: str, n: int = 1) -> str:
@@ -160,6 +162,19 @@ def test_djmd_of_an_avata_and_of_an_action_camera():
     sample = read_djmd(message({3: {4: {2: position}}}))
     assert sample.lat_deg == pytest.approx(47.5)
     assert sample.height_m is None
+
+
+def test_the_utc_of_an_action_camera_dates_its_pictures_between_the_seconds(tmp_path):
+    scan = VideoScan(tmp_path / "a.mp4", "h264", 64, 48, rate=10.0)
+    scan.pictures = [PictureNote(0.1 * i) for i in range(40)]
+    for i in range(40):
+        text = f"2024-05-06 10:11:{12 + (3 + i) // 10:02d}".encode()  # the video begins at 12.3 s
+        place = {1: {2: math.radians(47.5), 3: math.radians(8.25)}, 2: 512_300, 6: {1: text}}
+        scan.djmd_samples.append((0.1 * i, read_djmd(message({3: {4: {2: place}}}))))
+    poses = Poses(scan)
+    assert [poses.of(i).sample.time_s for i in (0, 5, 39)] == pytest.approx(
+        [1_714_990_272.3, 1_714_990_272.8, 1_714_990_276.2]
+    )
 
 
 @given(st.binary(max_size=300))

@@ -65,6 +65,12 @@ TABLES = {
         "a.JPG,443515.066,5261002.307,612.5,120.0,1.0,-2.0\n",
         (47.5, 8.25, 612.5, 120.0, -89.0, -2.0, None),
     ),
+    "metashape, omega phi kappa": (
+        "cameras.txt",
+        "# Cameras (1)\n# PhotoID, X, Y, Z, Omega, Phi, Kappa, r11, r12, r13, r21, r22, r23, r31, r32, r33\n"
+        "a\t8.25\t47.5\t612.5\t0.0\t0.0\t-31.0\t1\t0\t0\t0\t1\t0\t0\t0\t1\n",
+        (47.5, 8.25, 612.5, 31.0, -90.0, 0.0, None),
+    ),
     "exiftool": (
         "exif.csv",
         "SourceFile,DateTimeOriginal,GPSLatitude,GPSLongitude,GPSAltitude,GimbalYawDegree,GimbalPitchDegree,"

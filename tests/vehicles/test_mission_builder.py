@@ -166,3 +166,13 @@ def test_an_old_item_with_degrees_in_floats_is_understood():
 
 def test_commands_have_names():
     assert command_name(206) == "DO_SET_CAM_TRIGG_DIST" and command_name(31999) == "command 31999"
+
+
+@pytest.mark.parametrize("written", ["1e400", "-1e400", "50000"])
+def test_an_altitude_where_nothing_flies_is_one_clear_sentence(written, tmp_path):
+    text = """{"fileType": "Plan", "mission": {"items": [{"type": "SimpleItem", "command": 16, "frame": 3,
+        "params": [0, 0, 0, null, 47.0, 8.0, %s]}]}}"""
+    (tmp_path / "high.plan").write_text(text % written)
+    for autopilot in (AP, PX4):
+        with pytest.raises(InputError, match=r"an item has the altitude \S+ m, where nothing flies"):
+            read_mission(tmp_path / "high.plan", autopilot)

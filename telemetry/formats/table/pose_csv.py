@@ -5,6 +5,7 @@
 | this one | `lat_deg`, `lon_deg` | degrees | pitch -90 at nadir |
 | Metashape, reference | `X/Longitude` or `X/Easting` | degrees, or metres with `#CoordinateSystem` | pitch 0 at nadir |
 | Metashape and Pix4D, calibrated cameras | `Omega`, `Phi`, `Kappa` | as above; `.prj` beside | x, y, z axes |
+| | (Metashape: `PhotoID` without a suffix, commas in the header, tabs below) | | |
 | Mission Planner, location.txt | `latitude/Y` | degrees | the airframe's, camera fixed under it |
 | ExifTool -csv | `SourceFile` | degrees, also as text | the gimbal's |
 | WingtraHub and others | image, latitude, longitude | degrees | by value |
@@ -76,7 +77,7 @@ def read_pose_csv(path: Path) -> PoseTable | None:
         separator = _separator(line)
         header = [_column(cell) for cell in _cells(line, separator)]
         if "image" in header and ({"lat_deg", "lon_deg"} <= set(header) or {"x", "y"} <= set(header)):
-            return _read(path, at, separator, header, line)
+            return _read(path, at, _row_separator(head[at + 1 :], separator, header), header, line)
     columns = _pix4d_header(head[0]) if head else None
     if columns is not None:
         return _read(path, -1, _separator(head[0]), columns, "")
@@ -86,6 +87,13 @@ def read_pose_csv(path: Path) -> PoseTable | None:
 def _separator(line: str) -> str:
     best = max(",;\t", key=line.count)
     return best if line.count(best) >= 2 else " "
+
+
+def _row_separator(lines: Sequence[str], separator: str, header: Sequence[str]) -> str:
+    """What separates the cells of the rows: Metashape's OPK export has commas in its header and tabs below."""
+    row = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    own = _separator(row)
+    return own if len(_cells(row, separator)) < len(header) == len(_cells(row, own)) else separator
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -36,9 +36,15 @@ class PoseTable(dict[str, PoseRow]):
 
 
 def lookup(table: PoseTable, relative: str) -> PoseRow | None:
-    """The row of a picture by its path relative to the table's folder, else by its name alone."""
-    relative = relative.lower()
-    return table.get(relative) or table.get(relative.rsplit("/", 1)[-1])
+    """The row of a picture by its path relative to the table's folder, else by its name, with or without the suffix."""
+    return next((table[name] for name in names_of(relative) if name in table), None)
+
+
+def names_of(relative: str) -> tuple[str, str, str]:
+    """What a table may call a picture whose path relative to the table's folder is this: the path, name, stem."""
+    path = relative.lower()
+    name = path.rsplit("/", 1)[-1]
+    return path, name, name.rsplit(".", 1)[0]
 
 
 def read_text(path: Path) -> str:

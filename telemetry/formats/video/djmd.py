@@ -4,7 +4,7 @@ The field numbers differ a little between models; messages are read by the layou
 
     Mavic 3, Matrice 30, Mini 4 Pro   3-3-3 airframe, 3-3-4 position, 3-3-5 relative altitude, 3-4-3 gimbal
     Avata 2, Neo                      3-4-3 airframe, 3-4-4 position, 3-4-5 relative altitude
-    Action cameras                    3-4-2 position
+    Action cameras                    3-4-2 position, in it 6-1 UTC as text (YYYY-MM-DD hh:mm:ss)
 
 Airframe 1-3: roll, pitch, yaw; gimbal 1-3: pitch, roll, yaw; both int64 in 0.1 degrees. Position 1: unit flag
 (absent or 0: radians), latitude, longitude (double); 2: altitude in millimetres. Source: ExifTool's DJI tables.
@@ -14,6 +14,7 @@ import math
 import struct
 
 from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import parse_time
 
 Fields = dict[int, int | float | bytes]
 _MAX_FIELDS = 512
@@ -121,6 +122,9 @@ def read_djmd(data: bytes) -> Sample | None:
         sample.flight_roll_deg, sample.flight_pitch_deg, sample.flight_yaw_deg = (
             v or 0.0 for v in (sample.flight_roll_deg, sample.flight_pitch_deg, sample.flight_yaw_deg)
         )
+    written = _inner(place, 6).get(1) if position_at == 2 else None
+    parsed = parse_time(written.decode("ascii", "replace")) if isinstance(written, bytes) else None
+    sample.time_s = None if parsed is None else parsed[0]
     number = _inner(body, 1).get(1)
     sample.number = number if isinstance(number, int) else None
     return checked(sample)
