@@ -41,6 +41,7 @@ _REPEATED: Final = frozenset({
 _POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 _SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64
+_PART: Final = 50  # characters of a STATUSTEXT
 _PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]})
 
 
@@ -67,6 +68,7 @@ class Reception:
         self._rates, self._remembered, self._publish, self._wall = rates, dict(remembered), event, wall
         self._counters: dict[tuple[Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
+        self._parts: dict[int, tuple[int, list[str]]] = {}
         self.separation = SeparationWatch()
         self.handlers: dict[int, list[Handler]] = {}
         self.taps: list[Callable[[Packet, float], None]] = []
@@ -151,14 +153,29 @@ class Reception:
         if kind == _ACK:
             self._dialogues.send(vehicle.system, vehicle.streams.acknowledged(message, now))
         elif kind == _TEXT:
-            self._text(vehicle, route, message, now)
+            for text in self._joined(vehicle.system, message):
+                self._text(vehicle, route, text, int(message.severity), now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self._own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
         self._dialogues.feed(vehicle, message, now)
 
-    def _text(self, vehicle: Vehicle, route: Route, message: Message, now: float) -> None:
+    def _joined(self, system: int, message: Message) -> list[str]:
+        """The texts that end with a message: a long one comes in several of 50 characters, with one number.
+
+        One whose last part was lost is given as far as it is known when the next text comes.
+        """
+        number, text = int(message.id), str(message.text)
+        begun, parts = self._parts.pop(system, (number, []))
+        texts = [] if begun == number else ["".join(parts)]
+        whole = [*parts, text] if begun == number else [text]
+        if number and len(text) >= _PART:
+            self._parts[system] = number, whole
+        else:
+            texts.append("".join(whole))
+        return [text.strip("\x00\t ") for text in texts]
+
+    def _text(self, vehicle: Vehicle, route: Route, text: str, severity: int, now: float) -> None:
         """Pass a text on once, though it comes on two links."""
-        text = str(message.text).strip("\x00\t ")
         last = self._said.get((vehicle.system, text))
         self._said[vehicle.system, text] = now, route
         if last is not None and last[1] is not route and now - last[0] < _SAME_TEXT_S:
@@ -166,7 +183,7 @@ class Reception:
         if len(self._said) > 1000:
             self._said.clear()
         vehicle.says(text, now)
-        self._event("text", vehicle, f"says: {text}", severity=int(message.severity))
+        self._event("text", vehicle, f"says: {text}", severity=severity)
 
     def _found(self, packet: Packet, now: float) -> Vehicle | None:
         if packet.kind != _HEARTBEAT or not is_autopilot(packet.message):

@@ -80,6 +80,7 @@ class SimVehicle:
     _photos_sent: int = field(default=0, init=False)
     _told: tuple[bool, int] = field(default=(False, 0), init=False)
     _why_at: float = field(default=0.0, init=False)
+    _long_texts: int = field(default=0, init=False)
     _tx_room: float = field(default=_TX_BUFFER, init=False)
     _tx_at: float = field(default=0.0, init=False)
 
@@ -291,7 +292,18 @@ class SimVehicle:
 
     def _texts(self) -> list[Message]:
         texts, self.flight.texts = self.flight.texts, []
-        return [dialect.MAVLink_statustext_message(_severity(text), text.encode()[:50]) for text in texts]
+        return [part for text in texts for part in self._text_parts(text)]
+
+    def _text_parts(self, text: str) -> list[Message]:
+        """A text in messages of 50 characters; several have a number in common."""
+        data, severity = text.encode(), _severity(text)
+        if len(data) <= 50:
+            return [dialect.MAVLink_statustext_message(severity, data)]
+        self._long_texts = self._long_texts % 0xFFFF + 1
+        starts = enumerate(range(0, len(data) + 1, 50))
+        return [
+            dialect.MAVLink_statustext_message(severity, data[at : at + 50], self._long_texts, n) for n, at in starts
+        ]
 
     def _change(self) -> list[Message]:
         """ArduPilot sends a heartbeat at once when it arms, disarms or changes its mode."""

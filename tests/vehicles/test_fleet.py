@@ -316,6 +316,30 @@ def test_pictures_are_counted_once_though_reported_twice(make_world):
     assert world.kinds(1) == ["started", "complete"]
 
 
+def test_a_long_text_is_said_as_one(make_world):
+    world = make_world(SimVehicle(1, PX4))
+    world.meet()
+    long = "RTL: start return at 575 m (75 m above destination)"
+    exact = "x" * 100
+    for text in (long, exact, "short"):
+        world.vehicles[1].flight.texts.append(text)
+        world.wait(0.1)
+    said = [event.text for event in world.events if event.kind == "text"]
+    assert said == [f"vehicle 1 says: {text}" for text in (long, exact, "short")]
+
+
+def test_a_long_text_whose_end_is_lost_is_said_as_far_as_it_is_known(make_world):
+    world = make_world(SimVehicle(1, PX4))
+    world.meet()
+    packer = dialect.MAVLink(None, 1, 1)
+    for text, number, part in (("a" * 50, 7, 0), ("next", 0, 0)):
+        raw = dialect.MAVLink_statustext_message(6, text.encode(), number, part).pack(packer)
+        world.link.down.put((0, raw), world.clock.now)
+        world.wait(0.1)
+    said = [event.text for event in world.events if event.kind == "text"]
+    assert said == [f"vehicle 1 says: {'a' * 50}", "vehicle 1 says: next"]
+
+
 # --- real sockets ---
 
 

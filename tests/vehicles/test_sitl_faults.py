@@ -6,16 +6,21 @@ completing, and never call it complete. Each test prints its figures (`-rP`).
 
 import math
 import struct
+import threading
 import time
 
 import pytest
 
+from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL
 from gcs_plugin.mission.mission_files import MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
-from tests.vehicles.test_fleet_scenarios import REAL, Real, Site
+from tests.kit.daemon_kit import start, stop
+from tests.vehicles.test_fleet_scenarios import ADDRESSES, REAL, Real, Site
+from tests.vehicles.test_twin_camera import small_area
 
 pytestmark = pytest.mark.sitl
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
@@ -170,4 +175,87 @@ def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(ad
         print(f"upload {uploaded:.1f} s, {100 * share:.0f} % of packets missed, lost {len(lost)} times")
         assert not lost
     finally:
+        place.close()
+
+
+@pytest.mark.parametrize("address", REAL)
+def test_a_daemon_that_is_killed_in_flight_follows_the_mission_to_its_end_when_it_is_back(address, tmp_path):
+    if not ADDRESSES:
+        pytest.skip("ORTHOSWARM_SITL names no autopilot")
+    served = start(tmp_path / "w", "--link", address)
+    try:
+        name = begin(served)
+        served.until("/api/vehicles", lambda rows: row_of(rows, name)["mission"]["item"] >= 4)
+        served.kill()
+        killed = time.monotonic()
+        served = start(tmp_path / "w", "--link", address)
+        back = time.monotonic() - killed
+        served.until("/api/vehicles", lambda rows: row_of(rows, name)["mission"]["phase"] == "active")
+        known = time.monotonic() - killed
+        served.until("/api/completions", lambda rows: len(rows) == 1, 300.0)
+        assert row_of(served.get("/api/vehicles").json(), name)["mission"]["phase"] == "complete"
+        served.until("/api/vehicles", lambda rows: not row_of(rows, name)["armed"], 300.0)
+        assert len(served.get("/api/completions").json()) == 1
+        print(f"answers {back:.1f} s after the kill, shows the mission after {known:.1f} s, one completion")
+    finally:
+        stop(served)
+
+
+def row_of(rows, name):
+    nothing = {"mission": {"item": 0, "phase": ""}, "armed": True}
+    return next((row for row in rows if row["id"] == name and "mission" in row), nothing)
+
+
+def begin(served):
+    """Plan, upload and start a mission of a minute; gives the vehicle."""
+    rows = served.until("/api/vehicles", lambda rows: [r for r in rows if r.get("lat_deg") and r["gps_fix"] >= 3])
+    row = next(r for r in rows if r.get("lat_deg"))
+    here = row["lat_deg"], row["lon_deg"]
+    body = {
+        "area": small_area(*here), "vehicles": 1, "altitude_m": 40, "fov_min_deg": 75, "speed_m_s": 8,
+        "autopilot": row["autopilot"], "starts": [here],
+    }  # fmt: skip
+    plan = served.command("/api/plans", body).json()
+    upload = {"plan": plan["id"], "mission": plan["vehicles"][0]["id"]}
+    assert served.command(f"/api/missions/{row['id']}/upload", upload).status_code == 200
+
+    def started(_):
+        time.sleep(1.0)
+        answer = served.command(f"/api/missions/{row['id']}/start", {"override": ["battery"]})
+        return answer.json()["outcome"] == "done"
+
+    served.until("/healthz", started, limit_s=120.0)
+    return row["id"]
+
+
+@pytest.mark.parametrize("address", [a for a in REAL if a.startswith("tcp:")])
+def test_a_second_station_that_asks_for_everything_disturbs_nothing(address):
+    host, port = address.removeprefix("tcp:").split(":")
+    place = Real(address)
+    site = Site(place)  # ArduPilot opens its further links after the first
+    stop_second = threading.Event()
+    second = Fleet([f"tcp:{host}:{int(port) + 2}"], own=Address(252, 190))
+    thread = threading.Thread(target=second.run, args=(stop_second,))
+    thread.start()
+    try:
+        assert place.until(lambda: site.system in second.vehicles, 30.0)
+        to = site.vehicle.address
+        asked = [
+            dialect.MAVLink_param_request_list_message(to.system, to.component),
+            dialect.MAVLink_request_data_stream_message(to.system, to.component, 0, 4, 1),
+        ]
+        heard = []
+        second.subscribe(lambda vehicle, message, utc: heard.append(message), "PARAM_VALUE")
+        reading = second.call(lambda: (second._dialogues.send(to.system, asked), second.download(to.system))[1])
+        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(RTL))))
+        assert upload.ok, upload
+        assert site.finish(site.fleet.start(site.system)).ok
+        assert place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)
+        assert site.kinds() == ["started", "complete"]
+        assert reading.result(30.0).outcome is not None
+        print(f"the second station has heard {len(heard)} parameters; {upload.text}")
+    finally:
+        stop_second.set()
+        thread.join()
+        second.close()
         place.close()
