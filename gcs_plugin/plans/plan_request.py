@@ -43,7 +43,8 @@ class PlanRequest:
         method: how lines are laid. autopilot: whose dialect. end: what follows the last line.
         starts: takeoff points (latitude, longitude) in degrees; none: where each vehicle's first line begins.
         speed_m_s: ground speed, None for the default. run_in_m: straight flight before a leg's first picture.
-        endurance_min: longest flight, None without a limit. swap_min: time to change a battery.
+        endurance_min: longest flight, None without a limit. endurances_min: of each vehicle, where they differ.
+            swap_min: time to change a battery.
         side_overlap, forward_overlap: shares of a picture. aspect: a picture's width over its height.
         clearance_m: distance to no-fly zones, None for the default. separation_m: between vehicles.
         height_step_m: between the heights of ways out and home. ceiling_m: the highest of them, None for four steps
@@ -66,6 +67,7 @@ class PlanRequest:
     speed_m_s: float | None = None
     run_in_m: float = 0.0
     endurance_min: float | None = None
+    endurances_min: Sequence[float] = ()
     swap_min: float = 2.0
     side_overlap: float = 0.4
     forward_overlap: float = 0.8
@@ -97,6 +99,7 @@ class PlanRequest:
             end=self.end,
             starts=list(self.starts),
             endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
+            endurances_s=[60.0 * minutes for minutes in self.endurances_min],
             clearance_m=self.clearance_m,
             separation=Separation(self.separation_m, step, layers, swap_s=60.0 * self.swap_min),
             most_items=MOST_ITEMS[self.autopilot],
@@ -156,7 +159,7 @@ def _gap_plan(
     request: PlanRequest, foot: Footprint, options: Options, progress: Callable[[str], None]
 ) -> tuple[Plan, Area]:
     """A plan over the gaps of a coverage, and the ground that it aims at."""
-    if request.endurance_min is None:
+    if request.endurance_min is None and not request.endurances_min:
         raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")
     no_fly = _no_fly_rings(request.no_fly)
     target = gap_area(read_gaps(request.area), no_fly, foot, request.fly_not_arrived)

@@ -228,7 +228,7 @@ def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Opt
             "cannot be shared more evenly"
         )
     several = [f"v{number}" for number, row in enumerate(slots, start=1) if len(row) > 1]
-    if several and not np.isfinite(options.endurance_s):
+    if several and not options.endurances_s and not np.isfinite(options.endurance_s):
         result.append(
             f"one mission holds at most {options.most_items} items, so {', '.join(several)} must fly several sorties"
         )

@@ -40,6 +40,7 @@ class Options:
         starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
             begins), one for all, or several that vehicles are given in turn.
         endurance_s: longest flight on one battery; infinite without a limit.
+        endurances_s: longest flight of each vehicle, where they differ; then `endurance_s` is not used.
         clearance_m: distance that paths keep from no-fly zones; None keeps a metre, less where pictures are so small
             that a metre would leave gaps.
         separation: how far apart vehicles stay.
@@ -51,6 +52,7 @@ class Options:
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     endurance_s: float = float("inf")
+    endurances_s: Sequence[float] = ()
     clearance_m: float | None = None
     separation: Separation = field(default_factory=Separation)
     most_items: int = 650
@@ -66,7 +68,7 @@ class Options:
         if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
             raise InputError(f"the speed is {speed:g} m/s; give a number from {_SLOWEST_M_S:g} to {_FASTEST_M_S:g}")
         positive = {
-            "endurance": (self.endurance_s / 60.0, "min"),
+            "endurance": (min((self.endurance_s, *self.endurances_s)) / 60.0, "min"),
             "clearance": (1.0 if self.clearance_m is None else self.clearance_m, "m"),
             "separation": (self.separation.distance_m, "m"),
             "height step": (self.separation.height_m, "m"),
@@ -131,6 +133,8 @@ class Crew:
             if router.inside(places).any():
                 raise InputError("a start lies in a no-fly zone; move it out")
             self.starts = places[np.arange(vehicles) % len(places)]
+        given = options.endurances_s or [options.endurance_s]
+        self._endurances_s = np.array([given[k % len(given)] for k in range(vehicles)], np.float64)
         self._limits = self._flight_limits()
 
     def _flight_limits(self) -> Limits:
@@ -140,7 +144,7 @@ class Crew:
         if self._returns:
             fixed += (self._altitude_m + above) / motion.descent_m_s + above / motion.climb_m_s
         most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)))
-        return Limits(self._options.endurance_s, fixed, apart.swap_s, most_legs)
+        return Limits(self._endurances_s, fixed, apart.swap_s, most_legs)
 
     def share(self, legs: Array, reorder: bool) -> Work:
         """Share a row of legs.
@@ -168,14 +172,14 @@ class Crew:
         row = cut(legs, router, motion, self.vehicles, self._least_leg_m)
         pieces = share(row, self.vehicles, self.starts, self._returns, router, motion, self._limits)
         if pieces is None:
-            raise self._too_short(row, self.starts)
+            raise self._too_short(row, self.starts, float(self._endurances_s.min()))
         homes, work, lengths, times = [], [], [], []
         for vehicle, (begin, end) in enumerate(pieces):
             mine = row.legs(begin, end)
             home = mine[0, 0] if self.starts is None else self.starts[vehicle]
             if reorder and self.starts is not None and self._returns:
                 mine = shorten(mine, router, home)
-            flown = self._sorties(mine, home)
+            flown = self._sorties(mine, home, float(self._endurances_s[vehicle]))
             flights = [self._flight(f, home, 0.0, 0.0) for f in flown]
             homes.append(home)
             work.append(flown)
@@ -199,33 +203,34 @@ class Crew:
     def _least_leg_m(self) -> float:
         return 4.0 * self._foot.trigger_m
 
-    def _sorties(self, legs: Array, home: Array) -> list[Array]:
+    def _sorties(self, legs: Array, home: Array, endurance_s: float) -> list[Array]:
         """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
-        options, limits, least = self._options, self._limits, self._least_leg_m
+        options, least, within_s = self._options, self._least_leg_m, endurance_s
+        limits = replace(self._limits, endurance_s=within_s)
         top = options.separation.layers * options.separation.height_m
         for attempt in range(12):
             step = least
-            if np.isfinite(limits.endurance_s):
-                step = min(max(limits.endurance_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
+            if np.isfinite(within_s):
+                step = min(max(within_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
             total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
             row = cut(legs, self._router, options.motion, 1, step, max(step, total / 2000.0))
             found = sorties(row, home, self._returns, self._router, options.motion, limits)
             if found is None:
-                raise self._too_short(row, home[None])
+                raise self._too_short(row, home[None], endurance_s)
             result = [row.legs(a, b) for a, b in found]
             flights = [self._flight(f, home, top, top) for f in result]
             longest, most = max(f.time_s(options.motion) for f in flights), max(f.items for f in flights)
-            if longest <= options.endurance_s and most <= options.most_items:
+            if longest <= endurance_s and most <= options.most_items:
                 return result
             # The cut knows turns and detours only roughly: cut again a little shorter, and by more where that does not
             # move the cut.
             fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
             hair = 0.995 - 0.005 * (1.6**attempt - 1.0)
-            shorter = hair * limits.endurance_s * min(1.0, options.endurance_s / longest)
-            limits = replace(limits, endurance_s=shorter, most_legs=max(1, fewer))
-        raise self._too_short(row, home[None])
+            within_s = hair * within_s * min(1.0, endurance_s / longest)
+            limits = replace(limits, endurance_s=within_s, most_legs=max(1, fewer))
+        raise self._too_short(row, home[None], endurance_s)
 
-    def _too_short(self, row: Row, starts: Array | None) -> InputError:
+    def _too_short(self, row: Row, starts: Array | None, endurance_s: float) -> InputError:
         """What to say when a part of the row is out of reach: how long the flight to the farthest would be."""
         top = self._options.separation.layers * self._options.separation.height_m
         places = row.parts[:1, 0] if starts is None else starts
@@ -234,6 +239,6 @@ class Crew:
         home = row.parts[part, 0] if starts is None else places[start]
         needed = self._flight(row.parts[part][None], home, top, top).time_s(self._options.motion)
         return InputError(
-            f"the endurance of {self._options.endurance_s / 60:.1f} min is too short: the farthest line needs about "
+            f"the endurance of {endurance_s / 60:.1f} min is too short: the farthest line needs about "
             f"{math.ceil(1.05 * needed / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"
         )

@@ -6,7 +6,7 @@ hardly longer than that, pieces even and legs whole.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,29 +83,29 @@ class Limits:
     """What a single flight may cost.
 
     Attributes:
-        endurance_s: longest flight; infinite without a limit.
+        endurance_s: longest flight, one for all vehicles or float64 (vehicles,); infinite without a limit.
         fixed_s: climb and descent, in every flight.
         swap_s: time on the ground between flights.
         most_legs: legs that one mission can hold.
     """
 
-    endurance_s: float = np.inf
+    endurance_s: float | Array = np.inf
     fixed_s: float = 0.0
     swap_s: float = 0.0
     most_legs: int = 1_000_000
 
 
 @kernel
-def _cut_evenly(parts, leg, when, out, home, own, single, back, limits, cap, shortest):  # type: ignore[no-untyped-def]
+def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limits, cap, shortest):  # type: ignore[no-untyped-def]
     """Cuts (vehicles + 1,) of the row, [0] is -1 where no cut keeps within the limits; and the longest piece's time.
 
     when[k]: seconds at which part k begins and ends; out[j, p] and home[j, q]: seconds from vehicle j's start to part
-    p, and from part q back; limits: endurance, fixed time, time between flights, most legs. With `own`, the start is
-    where the piece begins and `back` the seconds per metre of the way home. With `single`, a piece is one flight.
-    No piece takes longer than `cap`. With `shortest` the longest piece is as short as can be; else the sum of the sixth
-    powers of times over `cap`, and of a price per cut within a leg, is least.
+    p, and from part q back; endurance[j]: its longest flight; limits: fixed time, time between flights, most legs.
+    With `own`, the start is where the piece begins and `back` the seconds per metre of the way home. With `single`, a
+    piece is one flight. No piece takes longer than `cap`. With `shortest` the longest piece is as short as can be;
+    else the sum of the sixth powers of times over `cap`, and of a price per cut within a leg, is least.
     """
-    limit, fixed, swap, most = limits
+    fixed, swap, most = limits
     vehicles, n = out.shape[0], len(leg)
     cost = np.full((vehicles + 1, n + 1), np.inf)
     prior = np.full((vehicles + 1, n + 1), -1, np.int64)
@@ -130,7 +130,7 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, limits, cap, sho
                     way = back * np.hypot(away[0], away[1])
                 else:
                     way = out[j, p] + home[j, q - 1]
-                legs, room, flights = leg[q - 1] - leg[p] + 1, limit - fixed - way, 1.0
+                legs, room, flights = leg[q - 1] - leg[p] + 1, endurance[j] - fixed - way, 1.0
                 if single:
                     if work > room or legs > most:
                         continue
@@ -169,7 +169,8 @@ def _evenly(
         own,
         single,
         1.0 / motion.speed_m_s if returns else 0.0,
-        np.array([limits.endurance_s, limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
+        np.array(np.broadcast_to(np.asarray(limits.endurance_s, np.float64), len(out))),
+        np.array([limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
     # A cap that is met keeps the search narrow, so try small ones first.
     share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
@@ -215,7 +216,8 @@ def share(
         ways = out[kind][:, cuts[:-1]] + home[kind][:, cuts[1:] - 1]
         who, piece = linear_sum_assignment(ways)
         order[piece] = who
-    cuts = _evenly(row, out[kind][order], home[kind][order], motion, limits, own=False, returns=returns, single=False)
+    ordered = replace(limits, endurance_s=np.broadcast_to(limits.endurance_s, vehicles)[order])
+    cuts = _evenly(row, out[kind][order], home[kind][order], motion, ordered, own=False, returns=returns, single=False)
     if cuts is None:
         return None
     result = [(0, 0)] * vehicles
@@ -235,7 +237,7 @@ def sorties(
         returns: each flight goes back to the start.
         router: measures the ways out and home.
         motion: gives times.
-        limits: of each flight.
+        limits: of each flight; one endurance.
     """
     out = router.distances(start, row.parts[:, 0]) / motion.speed_m_s
     home = router.distances(start, row.parts[:, 1]) / motion.speed_m_s * returns
