@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.coverage.picture_views import PictureViews
+from gcs_plugin.daemon.coverage.planned_area import area_source
 from gcs_plugin.daemon.exports import Exports
+from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
 from gcs_plugin.daemon.intake.pose_relay import linked_pose
@@ -94,6 +98,13 @@ class Daemon:
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
             fov_rad=fov, on_area=self._area_changed, anchor=self._anchor, on_rejected=self._rejected,
+            on_drawn=lambda placed, quality: self.coverage.add(placed, quality),
+        )  # fmt: skip
+        self.coverage = LiveCoverage(
+            self.journal, self.events, PictureViews(self.journal, self.store, folder / "solutions", fov),
+            source=lambda: area_source(self.console.plan(), self.plans.folder),
+            epsg=lambda: None if self.drawer.area is None else self.drawer.area.epsg,
+            vehicles=lambda: [] if self.links is None else self.links.latest,
         )  # fmt: skip
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
@@ -130,6 +141,7 @@ class Daemon:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
+        self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         self.sources = [
             Source(
                 v.id,
@@ -160,6 +172,7 @@ class Daemon:
         threading.Thread(target=self.workers.warm_up, daemon=True).start()
         self._watch_what_came_before()
         self.leg_watch.start()
+        self.coverage.start()
         if self.links is not None:
             self.links.start()
         if self.settings.tak:
@@ -185,6 +198,7 @@ class Daemon:
         self.background.close()
         self.jobs.close()
         self.drawer.close()
+        self.coverage.close()
         for layer in self.layers.values():
             layer.close()
         self.journal.remember("clean", True)
@@ -320,6 +334,7 @@ class Daemon:
     def _published(self, layer: str, job: Job) -> None:
         version = self.layers[layer].version
         self.events.publish("layer", layer=layer, version=version, vehicle=job.vehicle, sortie=job.sortie)
+        self.coverage.look()
 
     # -- refinement -----------------------------------------------------------------------------------------------
 

@@ -53,6 +53,14 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
         [({"cause": cause}, count) for cause, count in daemon.refused.counts.items()],
     )  # fmt: skip
     single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
+    covered = daemon.coverage.document
+    shares = {name: covered[f"{name}_share"] for name in ("seen", "poor", "missed", "planned")}
+    metric(
+        "coverage_share", "gauge", "Share of the planned area by state.",
+        [({"state": name}, share) for name, share in shares.items() if share is not None],
+    )  # fmt: skip
+    single("coverage_gaps", "gauge", "Gaps in the planned area.", len(covered["gaps"]))
+    single("coverage_seconds", "gauge", "Time that finding the gaps took last.", daemon.coverage.seconds)
     single("problems", "gauge", "Things that are wrong at present.", len(daemon.problems()))
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
     single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())

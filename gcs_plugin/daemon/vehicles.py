@@ -77,6 +77,7 @@ class VehicleLinks:
     Attributes:
         fleet: its vehicles and links.
         traffic: other aircraft that vehicles have heard of.
+        latest: the rows of `rows` when they were last watched, at most half a second ago.
         cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
     """
 
@@ -98,6 +99,7 @@ class VehicleLinks:
         self._kept: dict[int, _Kept] = {}
         self._poses = Poses() if poses is None else poses
         self._stop = threading.Event()
+        self.latest: list[dict[str, Any]] = []
         self.cancel_takeoff: Callable[[str], float | None] = lambda _: None
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
@@ -413,7 +415,8 @@ class VehicleLinks:
 
         At 96 vehicles complete rows would be most of what the stations' links carry.
         """
-        for row in self.rows():
+        self.latest = self.rows()
+        for row in self.latest:
             sent = self._kept[row["system"]].sent
             now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}

@@ -22,6 +22,7 @@ _NUMBERS: Final = (
     "clearance_m",
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6
+_NO_FLY_FILE: Final = "no-fly.geojson"
 _CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS}
 
 
@@ -56,20 +57,41 @@ class Plans:
         if not isinstance(zones, dict | None):
             raise InputError("no_fly is no GeoJSON; send the polygons of the no-fly zones, or nothing")
         has_zones = zones is not None and bool(zones.get("coordinates") or zones.get("features"))
-        name = f"plan-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**6:06d}"
-        path = self.folder / name
+        return self._make("area.geojson", area, zones if has_zones else None, values)
+
+    def make_gaps(
+        self, gaps: Mapping[str, Any], no_fly: Mapping[str, Any] | None, values: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Plan a flight over gaps; gives its figures with the plan's `id`.
+
+        Args:
+            gaps: GeoJSON as `orthoswarm coverage` writes it. no_fly: GeoJSON of zones, None if there are none.
+            values: further fields of the PlanRequest.
+
+        Raises:
+            InputError: there is nothing to fly, or a value is of no use.
+        """
+        return self._make("gaps.geojson", gaps, no_fly, values)
+
+    def _make(
+        self, name: str, area: Mapping[str, Any], zones: Mapping[str, Any] | None, values: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Plan in a new folder, into which area and no-fly zones are written first."""
+        plan = f"plan-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**6:06d}"
+        path = self.folder / plan
         path.mkdir(parents=True)
         try:
-            (path / "area.geojson").write_text(json.dumps(area), encoding="utf-8")
-            if has_zones:
-                (path / "no-fly.geojson").write_text(json.dumps(zones), encoding="utf-8")
-                values["no_fly"] = (path / "no-fly.geojson",)
+            (path / name).write_text(json.dumps(area), encoding="utf-8")
+            no_fly = []
+            if zones is not None:
+                no_fly = [path / _NO_FLY_FILE]
+                no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
-                figures = pool.run(plan_into, PlanRequest(area=path / "area.geojson", **values))
+                figures: dict[str, Any] = pool.run(plan_into, PlanRequest(area=path / name, no_fly=no_fly, **values))
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
             raise
-        return figures | {"id": name}
+        return figures | {"id": plan}
 
     def all(self) -> list[dict[str, Any]]:
         """The figures of all plans, oldest first."""

@@ -18,6 +18,7 @@ from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.commands import CommandRoutes
+from gcs_plugin.web.coverage_routes import CoverageRoutes
 from gcs_plugin.web.event_stream import stream_events
 from gcs_plugin.web.guard import Guard
 from gcs_plugin.web.standstill import Standstill
@@ -296,6 +297,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/places", routes.places)
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
+    CoverageRoutes(daemon).install(app)
     app.add_api_websocket_route("/api/events", routes.events)
     if STATIC.is_dir():
         app.mount("/static", StaticFiles(directory=STATIC), name="static")

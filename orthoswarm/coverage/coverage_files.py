@@ -65,17 +65,20 @@ def gap_row(gap: CoverageGap, grid: LocalGrid) -> dict[str, Any]:
     }
 
 
+def gap_feature(gap: CoverageGap, grid: LocalGrid) -> dict[str, Any]:
+    """A gap as a GeoJSON feature."""
+    geometry = {"type": "Polygon", "coordinates": _rings(gap, grid)}
+    return {"type": "Feature", "properties": gap_row(gap, grid), "geometry": geometry}
+
+
 def write_gaps(folder: Path, gaps: Gaps, grid: LocalGrid) -> None:
     """Write gaps.geojson, gaps.gpkg and gaps.kml.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    rows = [(gap_row(gap, grid), _rings(gap, grid)) for gap in gaps.gaps]
-    features = [
-        {"type": "Feature", "properties": row, "geometry": {"type": "Polygon", "coordinates": rings}}
-        for row, rings in rows
-    ]
+    features = [gap_feature(gap, grid) for gap in gaps.gaps]
+    rows = [(f["properties"], f["geometry"]["coordinates"]) for f in features]
     write_json(folder / "gaps.geojson", {"type": "FeatureCollection", "features": features})
     write_text(folder / "gaps.kml", [_kml(rows)])
     _write_gpkg(folder / "gaps.gpkg", gaps.gaps, [row for row, _ in rows], grid.epsg)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from orthoswarm.coverage.view import Flaw
 from orthoswarm.raster.picture_quality import PictureQuality
 
-_NEIGHBOURS = 15
+NEIGHBOURS = 15
+"""Pictures before and after, with which one is compared."""
 _BLURRED, _FAINT = 0.5, 0.25
 _FLAT_SHARE, _SATURATED_SHARE, _LEAST_CONTRAST = 0.10, 0.5, 4.0
 
@@ -38,5 +39,5 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
 
 
 def _running_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    n = _NEIGHBOURS
+    n = NEIGHBOURS
     return np.array([np.median(values[max(0, i - n) : i + n + 1]) for i in range(len(values))])

@@ -30,9 +30,11 @@ from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.raster.picture_file import read_rgba
+from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
 
 _IN_MEMORY: Final = 2000
 _AT_ONCE: Final = 16
@@ -65,6 +67,7 @@ class Drawer:
         on_area: Callable[[Area], None] = lambda _: None,
         anchor: Callable[[], Anchor | None] = lambda: None,
         on_rejected: Callable[[Frame, str, bool], None] = lambda frame, reason, misplaced: None,
+        on_drawn: Callable[[PlacedFrame, PictureQuality | None], None] = lambda placed, quality: None,
     ) -> None:
         """Take up where the last daemon stopped; `start` begins to draw.
 
@@ -79,9 +82,10 @@ class Drawer:
             on_area: called in the drawing thread when the area changes.
             anchor: gives where the map is to lie, None to go by the pictures.
             on_rejected: called with each frame that cannot be on the map, why, and whether that is for its place.
+            on_drawn: called with each frame that is on the map as recorded, and what its pixels say (None: too small).
         """
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
-        self._on_rejected = on_rejected
+        self._on_rejected, self._on_drawn = on_rejected, on_drawn
         self._begun = 0
         self._queue = DrawQueue(_IN_MEMORY)
         self._waiting: set[int] = set()
@@ -287,7 +291,10 @@ class Drawer:
             return self._report(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
             return self._report(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
-        return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture)), camera)
+        quality = _quality(picture)
+        if added.reason is None:
+            self._on_drawn(PlacedFrame(frame, camera, "realtime", sigma), quality)
+        return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture), quality), camera)
 
     def _report(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
@@ -312,10 +319,18 @@ def _warm_up(folder: Path) -> None:
         camera = Camera(np.array([16.0, 16.0, 30.0]), rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0), lens)
         with Canvas.create(path, GroundGrid(32631, 0.0, 64.0, 1.0, 64, 64), tile_px=64) as canvas:
             RealtimeMosaic(canvas).add(np.full((24, 32, 4), 255, np.uint8), camera)
+        picture_quality(np.zeros((24, 32, 4), np.uint8))
     except OrthoSwarmError as error:  # a full disk is told when there is something to draw
         _log.warning("%s", error)
     finally:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def _quality(picture: Bytes) -> PictureQuality | None:
+    try:
+        return picture_quality(picture)
+    except ValueError:  # too small to be judged
+        return None
 
 
 def _thumbnail(picture: Bytes) -> bytes:

@@ -13,11 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError
+from orthoswarm.raster.picture_quality import PictureQuality
 
 Result = TypeVar("Result")
 
@@ -43,6 +44,8 @@ CREATE TABLE IF NOT EXISTS coarse (
     vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, path TEXT NOT NULL, detail TEXT NOT NULL,
     PRIMARY KEY (vehicle, sortie));
 CREATE TABLE IF NOT EXISTS thumbnails (seq INTEGER PRIMARY KEY, rgb BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS qualities (
+    seq INTEGER PRIMARY KEY, sharpness REAL, contrast REAL, flat_share REAL, saturated_share REAL);
 CREATE TABLE IF NOT EXISTS completions (
     id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
 """
@@ -254,12 +257,14 @@ class Drawn:
     Attributes:
         seq: its number. reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
         thumbnail: bytes of uint8 (12, 16, 3), by which gains are evened out; None for a picture that was not read.
+        quality: its sharpness and damage, None for a picture that was not read or is too small.
     """
 
     seq: int
     reason: str | None
     sigma_m: float | None
     thumbnail: bytes | None = None
+    quality: PictureQuality | None = None
 
 
 _LATE: Final = """
@@ -283,6 +288,7 @@ def frames_drawn(results: Iterable[Drawn]) -> Change:
     done = list(results)
     rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
     thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
+    qualities = [(d.seq, *astuple(d.quality)) for d in done if d.quality is not None]
 
     def change(db: sqlite3.Connection) -> None:
         db.executemany(
@@ -291,5 +297,6 @@ def frames_drawn(results: Iterable[Drawn]) -> Change:
             rows,
         )
         db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
+        db.executemany("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities)
 
     return change

@@ -19,6 +19,8 @@ import { loadPlan, planPanel } from "/static/plan/panel.js";
 import { exportPanel } from "/static/work/exports.js";
 import { findPanel, loadFinds } from "/static/work/finds.js";
 import { jobPanel } from "/static/work/jobs.js";
+import { gapFlightDialog } from "/static/coverage/flight.js";
+import { coveragePanel } from "/static/coverage/panel.js";
 import { area } from "/static/plan/area.js";
 import { state, subscribe } from "/static/core/store.js";
 
@@ -42,8 +44,8 @@ export async function withMap(panels) {
   const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
   byId("stage").append(...swipeParts(), make("div", { class: "under" }, button(t("map.all"), showAll), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
-  document.body.append(preflightDialog());
+  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());
   subscribe("finds-changed", "finds of others", () => loadFinds());

@@ -1,0 +1,370 @@
+"""Coverage of the planned area in flight: one thread keeps it up to date with pictures, solutions and vehicles.
+
+Pictures count with their recorded poses as soon as they are on the map, and with their placed ones once their leg was
+placed. Everything is rebuilt from the journal and the solution files at a start; which legs are over is in the journal.
+"""
+
+import logging
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.daemon.coverage.battery_use import BatteryUse
+from gcs_plugin.daemon.coverage.cells_picture import cells_png, picture_corners
+from gcs_plugin.daemon.coverage.flawed_pictures import FlawedPictures
+from gcs_plugin.daemon.coverage.flown_legs import FlownLegs, flies
+from gcs_plugin.daemon.coverage.picture_views import Measured, PictureViews
+from gcs_plugin.daemon.coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.coverage.coverage_files import gap_feature
+from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares
+from orthoswarm.coverage.gaps import below_legs, find_gaps
+from orthoswarm.coverage.missing_pictures import MissingPicture, missing_pictures
+from orthoswarm.coverage.view import View
+from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.raster.picture_quality import PictureQuality
+
+Rows = list[dict[str, Any]]
+
+_LOOK_S: Final = 0.5
+_LEAST_PAUSE: Final = 3.0
+"""Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
+_MOST_CELLS: Final = 16_000_000
+_FACT: Final = "coverage"
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class _Followed:
+    """An area under way.
+
+    Attributes:
+        source: where it comes from. covered: the area and its plan. legs: which of its legs are over.
+        cover: by pictures as they are placed now. recorded: by recorded poses alone.
+        flaws: of the pictures, by comparison with their neighbours.
+        stored: state of `legs` in the journal. over: legs by which the due cells were found last.
+    """
+
+    source: AreaSource
+    covered: CoveredArea
+    legs: FlownLegs
+    cover: CoverageGrid
+    recorded: CoverageGrid
+    flaws: FlawedPictures = field(default_factory=FlawedPictures)
+    stored: dict[str, Any] = field(default_factory=dict)
+    over: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+
+
+@dataclass(frozen=True, slots=True)
+class _Result:
+    """What was found last: the API's document, gaps as GeoJSON, and the picture of the cells."""
+
+    document: dict[str, Any]
+    gaps: dict[str, Any]
+    png: bytes
+    solved: dict[str, float]
+
+
+_NOTHING: Final = _Result(
+    {
+        "state": "no area", "version": 0, "plan": None, "seen_share": None, "poor_share": None, "missed_share": None,
+        "planned_share": None, "gaps": [], "missing_pictures": [], "offers": [], "warnings": [],
+    },
+    {"type": "FeatureCollection", "features": []}, b"", {},
+)  # fmt: skip
+
+
+class LiveCoverage:
+    """Keeps the coverage up to date.
+
+    Args:
+        journal: of the workspace. events: told when the coverage has changed. views: of the workspace's pictures.
+        source: gives where the area comes from, None while there is none. epsg: gives the map's grid, None before it.
+        vehicles: gives the rows of the vehicles on the links, empty without links.
+
+    Attributes:
+        seconds: time that finding the gaps took last. battery: how long the vehicles can still fly.
+    """
+
+    def __init__(
+        self,
+        journal: Journal,
+        events: Events,
+        views: PictureViews,
+        source: Callable[[], AreaSource | None],
+        epsg: Callable[[], int | None],
+        vehicles: Callable[[], Rows],
+    ) -> None:
+        self._journal, self._events, self._views = journal, events, views
+        self._source, self._epsg, self._vehicles = source, epsg, vehicles
+        self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
+        self._bell, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="coverage", daemon=True)
+        self._followed: _Followed | None = None
+        self._result = _NOTHING
+        self._version = 0
+        self._rest_until = 0.0
+        self._refused: AreaSource | None = None
+        self._due: NDArray[np.bool_] | bool = False
+        self.seconds = 0.0
+        self.battery = BatteryUse()
+
+    def start(self) -> None:
+        """Begin, with what the workspace holds."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop."""
+        self._stop.set()
+        self._bell.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def add(self, placed: PlacedFrame, quality: PictureQuality | None) -> None:
+        """A picture is on the real-time layer as recorded, with what its pixels say; any thread."""
+        self._fresh.append((View.of_frame(placed), quality))
+        self._bell.set()
+
+    def look(self) -> None:
+        """Pictures were placed, or the plan has changed; any thread."""
+        self._bell.set()
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Shares, gaps and what is known about them, as JSON values."""
+        return self._result.document
+
+    @property
+    def gaps(self) -> dict[str, Any]:
+        """The gaps as GeoJSON, as `orthoswarm coverage` writes them."""
+        return self._result.gaps
+
+    @property
+    def png(self) -> bytes:
+        """The states of the cells as a PNG; empty while there is no area."""
+        return self._result.png
+
+    @property
+    def no_fly(self) -> dict[str, Any] | None:
+        """The area's no-fly zones as GeoJSON, None if there are none."""
+        here = self._followed
+        if here is None or here.covered.area.no_fly.is_empty:
+            return None
+        return zone_features(here.covered.area)
+
+    @property
+    def solved_fov_deg(self) -> dict[str, float]:
+        """Vehicle -> smallest horizontal field of view of its placed pictures, degrees."""
+        return self._result.solved
+
+    # -- the thread -----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        changed = True
+        while not self._stop.is_set():
+            try:
+                changed = self._take() or changed
+                if changed and time.monotonic() >= self._rest_until:
+                    self._find()
+                    changed = False
+            except (OrthoSwarmError, sqlite3.Error) as error:  # a full disk, a torn file: tried again
+                _log.warning("coverage: %s", error)
+            self._bell.wait(_LOOK_S)
+            self._bell.clear()
+
+    def _take(self) -> bool:
+        """Take in what is new; whether anything has changed."""
+        source = self._source()
+        if source is None or source == self._refused:
+            self._fresh.clear()
+            gone, self._followed, self._result = self._followed is not None, None, _NOTHING
+            return gone
+        epsg = self._epsg()
+        here = self._followed
+        changed = False
+        if here is None or here.source != source or (epsg is not None and here.cover.cells.grid.epsg != epsg):
+            here = self._followed = self._begin(source, epsg)
+            if here is None:
+                return True
+            changed = True
+        fresh = [self._fresh.popleft() for _ in range(len(self._fresh))]
+        changed |= self._put_recorded(here, fresh)
+        placed, dropped = self._views.placed_anew(here.cover.cells.grid.epsg)
+        if placed or dropped:
+            here.cover.put(_with_flaws(placed, here.flaws), dropped)
+            changed = True
+        return self._follow(here) or changed
+
+    def _begin(self, source: AreaSource, epsg: int | None) -> _Followed | None:
+        """Begin with an area: put in all pictures of the workspace."""
+        try:
+            covered = read_covered_area(source, None if epsg is None else LocalGrid(epsg))
+            area = covered.area
+            west, south, east, north = area.ground.bounds
+            cell = max(1.0, np.ceil(10.0 * np.sqrt((east - west) * (north - south) / _MOST_CELLS)) / 10.0)
+            cells = Cells.of_area(area.grid.epsg, area.ground, area.no_fly, float(cell))
+        except InputError as error:
+            self._refused = source
+            _log.warning("no coverage: %s", error)
+            return None
+        flight = covered.flight
+        legs = FlownLegs(covered.legs, *((0.0, 0.0) if flight is None else (0.25 * flight.width_m, flight.height_m)))
+        here = _Followed(source, covered, legs, CoverageGrid(cells), CoverageGrid(cells))
+        stored = self._journal.fact(_FACT) or {}
+        if stored.get("plan") == covered.plan and covered.plan is not None:
+            here.legs.resume(stored)
+            here.stored = here.legs.state()
+        self._views.forget()
+        for pictures in self._views.recorded(area.grid):
+            self._put_recorded(here, pictures)
+            if self._stop.is_set():
+                break
+        row = self._journal.one("SELECT MAX(arrived) AS last FROM frames WHERE drawn = 1")
+        if row is not None and row["last"] is not None:
+            here.legs.picture_came(row["last"])
+        return here
+
+    def _put_recorded(self, here: _Followed, pictures: Measured) -> bool:
+        if not pictures:
+            return False
+        here.flaws.add(pictures)
+        doubtful = here.flaws.judged()
+        views = _with_flaws((view for view, _ in pictures), here.flaws)
+        before = [v for v in here.cover.views if (v.vehicle, v.image) in doubtful]
+        here.cover.put(_with_flaws(before, here.flaws))
+        placed = {(v.vehicle, v.image) for v in here.cover.views if v.placed}
+        here.cover.put(v for v in views if (v.vehicle, v.image) not in placed)
+        here.recorded.put(views)
+        for view in sorted(views, key=lambda v: v.time_s or 0.0):
+            here.legs.pass_by(view.vehicle, float(view.position[0]), float(view.position[1]))
+        here.legs.picture_came(time.time())
+        return True
+
+    def _follow(self, here: _Followed) -> bool:
+        """Follow the vehicles; whether other cells are due than before."""
+        rows = self._vehicles()
+        grid = here.covered.area.grid
+        for row in rows:
+            self.battery.look(row, flies(row), time.monotonic())
+            if row.get("lat_deg") is not None and row["armed"]:
+                east, north = grid.to_grid(row["lat_deg"], row["lon_deg"])
+                here.legs.pass_by(str(row["id"]), float(east), float(north))
+        here.legs.look(rows)
+        state = here.legs.state()
+        if here.covered.plan is not None and state != here.stored:
+            self._journal.remember(_FACT, {"plan": here.covered.plan, **state})
+            here.stored = state
+        due = self._due_cells(here, rows)
+        changed = not np.array_equal(due, self._due)
+        self._due = due
+        return changed
+
+    def _due_cells(self, here: _Followed, rows: Rows) -> "NDArray[np.bool_] | bool":
+        """Cells whose flight is over: below legs that are over, and below no leg that is still to be flown."""
+        if here.legs.all_over(rows, time.time()):
+            return True
+        over, flight = here.legs.over, here.covered.flight
+        if flight is None or not over.any():
+            return False
+        if not np.array_equal(over, here.over) or isinstance(self._due, bool):
+            here.over = over
+            cells = here.cover.cells
+            due = below_legs(cells, flight, flight.legs[over])
+            return due & ~below_legs(cells, flight, flight.legs[~over])
+        return self._due
+
+    # -- what is found --------------------------------------------------------------------------------------------
+
+    def _find(self) -> None:
+        here = self._followed
+        began, cpu = time.monotonic(), time.thread_time()
+        self._version += 1
+        if here is None:
+            self._result = _NOTHING
+        else:
+            self._result = self._found(here)
+        self.seconds = time.monotonic() - began
+        self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
+        told = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
+        document = self._result.document
+        self._events.publish("coverage", gaps=len(document["gaps"]), **{key: document[key] for key in told})
+
+    def _found(self, here: _Followed) -> _Result:
+        cover, grid = here.cover, here.covered.area.grid
+        missing = missing_pictures(cover.views)
+        gaps = find_gaps(cover, missing, here.covered.flight, due=self._due)
+        features = [gap_feature(gap, grid) for gap in gaps.gaps]
+        states = cover.states(self._due)
+        placed = [v for v in cover.views if v.placed]
+        document = {
+            "state": self._state(cover), "version": self._version, "time": iso_time(time.time()),
+            "plan": here.covered.plan, **_shares(cover.shares(self._due)),
+            "recorded": _shares(here.recorded.shares(self._due)),
+            "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
+            "area_m2": cover.cells.area_m2, "cell_m": cover.cells.grid.gsd_m,
+            "offers": _offers(here.legs),
+            "legs": {"planned": len(here.legs.flown), "over": int(here.legs.over.sum())},
+            "corners": picture_corners(cover.cells.grid, states),
+            "gaps": [f["properties"] | {"polygon": f["geometry"]} for f in features],
+            "small_gaps": {"count": gaps.small, "area_m2": round(gaps.small_m2, 1)},
+            "missing_pictures": _missing_rows(missing), "warnings": _warnings(cover),
+        }  # fmt: skip
+        solved: dict[str, float] = {}
+        for view in placed:
+            fov = float(np.degrees(view.fov_rad))
+            solved[view.vehicle] = min(fov, solved.get(view.vehicle, fov))
+        return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), solved)
+
+    def _state(self, cover: CoverageGrid) -> str:
+        if self._due is True:
+            return "complete"
+        return "in flight" if cover.views else "planned"
+
+
+def _with_flaws(views: Iterable[View], flaws: FlawedPictures) -> list[View]:
+    return [replace(v, flaws=flaws.of((v.vehicle, v.image))) for v in views]
+
+
+def _shares(shares: Shares) -> dict[str, float]:
+    return {
+        "seen_share": shares.seen, "poor_share": shares.poor, "missed_share": shares.missed,
+        "planned_share": shares.planned,
+    }  # fmt: skip
+
+
+def _offers(legs: FlownLegs) -> list[dict[str, Any]]:
+    """Legs that vehicles have left behind, to be flown by others: a row a vehicle."""
+    rows = []
+    for vehicle, left in legs.remaining().items():
+        if left:
+            length_m = float(np.hypot(*(legs.legs.ends[left, 1] - legs.legs.ends[left, 0]).T).sum())
+            rows.append({"vehicle": vehicle, "legs": len(left), "length_m": round(length_m, 1)})
+    return rows
+
+
+def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
+    return [
+        {"vehicle": m.view.vehicle, "image": m.view.image, "after": m.after, "cause": str(m.cause),
+         "confidence": round(m.confidence, 2)}
+        for m in missing
+    ]  # fmt: skip
+
+
+def _warnings(cover: CoverageGrid) -> list[str]:
+    found = []
+    if cover.views and not (cover.best[cover.cells.wanted] != 255).any():
+        found.append("no picture sees any of the area: check that the area and the flight belong together")
+    if cover.cells.grid.gsd_m > 1.0:
+        found.append(f"the area is large: its cells are {cover.cells.grid.gsd_m:g} m wide; plan it in parts for 1 m")
+    return found

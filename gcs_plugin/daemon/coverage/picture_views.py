@@ -1,0 +1,98 @@
+"""Views of a workspace's pictures: recorded poses as they are drawn, placed ones from the solution files."""
+
+import math
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from gcs_plugin.daemon.jobs.solution_file import SolutionFileError, read_solution
+from gcs_plugin.daemon.layers.journal_frames import frame_of_row
+from gcs_plugin.daemon.store.journal import Journal, unpacked
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.coverage.view import View
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
+from orthoswarm.raster.picture_quality import PictureQuality
+
+Key = tuple[str, str]
+Measured = Sequence[tuple[View, PictureQuality | None]]
+"""Views with what the pixels of their pictures say."""
+_AT_ONCE: Final = 500
+
+
+class PictureViews:
+    """Reads views from a workspace.
+
+    Args:
+        journal, store: of the workspace. solutions: folder of the solution files. fov_rad: theta-hat.
+    """
+
+    def __init__(self, journal: Journal, store: PictureStore, solutions: Path, fov_rad: float | None) -> None:
+        self._journal, self._store, self._folder, self._fov_rad = journal, store, solutions, fov_rad
+        self._read: dict[tuple[str, str, int], str] = {}
+
+    def recorded(self, grid: LocalGrid) -> Iterator[Measured]:
+        """Views of all pictures on the real-time layer as recorded, in parts, in the order in which they came."""
+        last = 0
+        while True:
+            rows = self._journal.rows(
+                "SELECT frames.*, sharpness, contrast, flat_share, saturated_share FROM frames"
+                " LEFT JOIN qualities USING (seq) WHERE drawn = 1 AND reason IS NULL AND seq > ? ORDER BY seq LIMIT ?",
+                (last, _AT_ONCE),
+            )
+            if not rows:
+                return
+            last = int(rows[-1]["seq"])
+            part = []
+            for row in rows:
+                placed = recorded_cameras([frame_of_row(row, self._store)], grid, self._fov_rad).placed
+                part += [(View.of_frame(found), _quality(row)) for found in placed]
+            yield part
+
+    def placed_anew(self, epsg: int) -> tuple[list[View], list[Key]]:
+        """Views that were placed since the last call, and pictures that a refinement could not place.
+
+        A refined sortie hides what was placed of it in flight. Files that are being replaced are read at the next call.
+
+        Args:
+            epsg: the grid of the map.
+        """
+        rows: dict[tuple[str, int], tuple[str, Any]] = {}
+        for table in ("coarse", "solutions"):
+            for row in self._journal.rows(f"SELECT vehicle, sortie, path FROM {table}"):
+                rows[row["vehicle"], int(row["sortie"])] = (table, row["path"])
+        views: list[View] = []
+        dropped: list[Key] = []
+        for (vehicle, sortie), (table, path) in rows.items():
+            if self._read.get((str(epsg), vehicle, sortie)) == path:
+                continue
+            try:
+                found = read_solution(self._folder / path)
+            except SolutionFileError:
+                continue
+            self._read[str(epsg), vehicle, sortie] = path
+            solution, ground = found.solution, found.terrain
+            half = 0.5 * math.radians(solution.fov_deg)
+            # d(f)/f of f = (W/2) / tan(half): d(half) / (sin(half) cos(half))
+            focal = math.radians(solution.fov_sigma_deg) / math.sin(2.0 * half)
+            focal = focal if math.isfinite(focal) else 0.0
+            name = unpacked(vehicle)
+            views += [
+                replace(View.of_frame(p, focal_sigma=focal, ground=ground), vehicle=name, placed=True)
+                for p in solution.placed
+            ]
+            if table == "solutions":
+                dropped += [(name, image) for image in solution.dropped]
+        return views, dropped
+
+    def forget(self) -> None:
+        """Have `placed_anew` give everything again."""
+        self._read.clear()
+
+
+def _quality(row: sqlite3.Row) -> PictureQuality | None:
+    if row["sharpness"] is None:
+        return None
+    return PictureQuality(row["sharpness"], row["contrast"], row["flat_share"], row["saturated_share"])

@@ -1,0 +1,124 @@
+"""Flights over what was missed: planned here from the gaps of the coverage, uploaded and started by the operator."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.vehicles import VehicleLinks
+from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.fleet.preflight import RESERVE
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+_NARROWER: Final = 0.995
+"""The solved field of view is taken a little narrower."""
+_LONGEST_MIN: Final = 600.0
+
+
+class GapFlights:
+    """Plans flights over gaps. Nothing is uploaded or started here.
+
+    Args:
+        coverage: whose gaps. plans: of the workspace. links: the vehicles, None without links.
+    """
+
+    def __init__(self, coverage: LiveCoverage, plans: Plans, links: VehicleLinks | None) -> None:
+        self._coverage, self._plans, self._links = coverage, plans, links
+
+    def vehicles(self) -> list[dict[str, Any]]:
+        """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: to be asked), `busy` (why not now).
+
+        Minutes are those until the reserve, by what the vehicle's flight so far has cost.
+        """
+        rows = []
+        for row in [] if self._links is None else self._links.rows():
+            seconds = self._coverage.battery.seconds(str(row["id"]), RESERVE)
+            rows.append({
+                "id": row["id"], "battery": row["battery"],
+                "minutes": None if seconds is None else round(seconds / 60.0, 1), "busy": _busy(row),
+                "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"],
+            })  # fmt: skip
+        return rows
+
+    def plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Plan a flight over the gaps, with the lens as it was solved.
+
+        Args:
+            body: `vehicles` {id: minutes that it can fly, or null for what its battery says}; `altitude_m`, that of the
+                plan before unless given; `fly_not_arrived`: gaps, too, whose pictures were taken and have not arrived.
+
+        Returns:
+            The plan's figures with its `id`, and `names`: the plan's vehicle -> the daemon's.
+
+        Raises:
+            InputError: a value is of no use, a battery is not known, or there is no gap.
+            OrthoSwarmError: a vehicle is still flying.
+        """
+        known = {row["id"]: row for row in self.vehicles()}
+        chosen = _minutes(body.get("vehicles"), known)
+        fov_deg, altitude_m, notes = self._camera(list(chosen), body)
+        ordered = sorted(chosen, key=lambda vehicle: -chosen[vehicle])
+        values = {
+            "vehicles": len(ordered), "altitude_m": altitude_m, "fov_min_deg": fov_deg, "gaps": True,
+            "endurances_min": [chosen[vehicle] for vehicle in ordered],
+            "starts": [(known[v]["lat_deg"], known[v]["lon_deg"]) for v in ordered],
+            "fly_not_arrived": body.get("fly_not_arrived") is True,
+        }  # fmt: skip
+        made = self._plans.make_gaps(self._coverage.gaps, self._coverage.no_fly, values)
+        names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))
+        made["warnings"] = [*notes, *made["warnings"]]
+        return made | {"names": {row["id"]: names[row["id"]] for row in made["vehicles"]}}
+
+    def _camera(self, vehicles: list[str], body: Mapping[str, Any]) -> tuple[float, float, list[str]]:
+        """Field of view in degrees, altitude in metres, and notes about them."""
+        plan = self._coverage.document["plan"]
+        figures = {} if plan is None else json.loads((self._plans.folder / plan / "plan.json").read_text("utf-8"))
+        altitude = body.get("altitude_m", figures.get("altitude_m"))
+        if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
+            raise InputError("altitude_m is missing or no height; send metres above takeoff, for example 80")
+        solved = self._coverage.solved_fov_deg
+        unknown = [vehicle for vehicle in vehicles if vehicle not in solved]
+        found = [_NARROWER * solved[vehicle] for vehicle in vehicles if vehicle in solved]
+        notes = []
+        if unknown:
+            if not figures:
+                raise InputError(f"the lens of {', '.join(unknown)} is not known yet; wait until its legs are placed")
+            width, height = float(figures["footprint_m"][0]), float(figures["altitude_m"])
+            found.append(math.degrees(2.0 * math.atan(0.5 * width / height)))
+            notes.append(f"no picture of {', '.join(unknown)} is placed: the field of view of the plan is assumed")
+        return min(found), float(altitude), notes
+
+
+def _busy(row: Mapping[str, Any]) -> str:
+    """Why a vehicle cannot be given another flight now, empty if it can."""
+    if row["state"] == "lost":
+        return "its link is lost"
+    if row["armed"]:
+        return "it is still flying; bring it home first"
+    return "" if row["lat_deg"] is not None else "it has no position"
+
+
+def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Vehicle -> minutes that it can fly.
+
+    Raises:
+        InputError: no vehicle, an unknown one, or one whose battery is not known.
+        OrthoSwarmError: a vehicle is still flying, or lost.
+    """
+    if not isinstance(wanted, dict) or not wanted:
+        raise InputError('vehicles is missing; send for example {"v1": null, "v2": 12}')
+    chosen = {}
+    for vehicle, given in wanted.items():
+        row = known.get(vehicle)
+        if row is None:
+            raise InputError(f"{vehicle} is not on the links; see /api/coverage/vehicles")
+        if row["busy"]:
+            raise OrthoSwarmError(f"{vehicle} gets no other flight: {row['busy']}")
+        minutes = row["minutes"] if given is None else given
+        if minutes is None:
+            raise InputError(f"how long {vehicle} can fly is not known; send its minutes, it is not guessed")
+        if isinstance(minutes, bool) or not isinstance(minutes, int | float) or not 0.0 < minutes <= _LONGEST_MIN:
+            raise InputError(f"{vehicle} cannot fly for {minutes} minutes; send a number from 1 to {_LONGEST_MIN:g}")
+        chosen[str(vehicle)] = float(minutes)
+    return chosen

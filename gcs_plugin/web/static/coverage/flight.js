@@ -1,0 +1,90 @@
+// "Fly the gaps": who flies and for how long, the plan, and one confirmation that uploads it and opens the check before
+// the start. Nothing is uploaded before it is confirmed.
+
+import { get, post } from "/static/core/api.js";
+import { button, make, setHidden, setText } from "/static/core/dom.js";
+import { state } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
+import { command } from "/static/fly/commands.js";
+import { openPreflight } from "/static/fly/preflight.js";
+import { colourOf } from "/static/map/colours.js";
+import { show } from "/static/map/map.js";
+
+const nameOf = (id) => state.vehicles.get(id)?.name || id;
+const title = make("h2", { id: "gap-flight-title" }, t("gapflight.title"));
+const list = make("ul", { class: "gap-vehicles" });
+const status = make("p", { role: "status" });
+const warnings = make("ul", { class: "warnings" });
+const summary = make("ul", {});
+const planButton = button(t("gapflight.plan"), () => makePlan());
+const go = button(t("gapflight.confirm"), () => confirm(), { class: "primary" });
+const dialog = make("dialog", { class: "preflight", "aria-labelledby": "gap-flight-title" }, title, make("p", { class: "quiet" }, t("gapflight.about")), list, status, summary, warnings,
+  make("div", { class: "row wrap" }, planButton, button(t("confirm.no"), () => dialog.close()), go));
+export const gapFlightDialog = () => dialog;
+
+let rows = [];
+let plan = null;
+
+function setPlan(made) {
+  plan = made;
+  go.disabled = !plan;
+  setHidden(summary, !plan);
+  summary.replaceChildren(...(plan?.vehicles ?? []).map((row) => make("li", {}, t("gapflight.part", { name: nameOf(plan.names[row.id]), length: units.distance(row.length_m), time: units.clock(row.time_s), photos: row.photos, sorties: row.sorties }))));
+  warnings.replaceChildren(...(plan?.warnings ?? []).map((text) => make("li", {}, text)));
+}
+
+export async function openGapFlight() {
+  setPlan(null);
+  list.replaceChildren();
+  setText(status, "");
+  dialog.showModal();
+  try {
+    const vehicles = await get("/api/coverage/vehicles");
+    rows = vehicles.map((row) => {
+      const on = make("input", { type: "checkbox", checked: !row.busy, disabled: Boolean(row.busy), onchange: () => setPlan(null) });
+      const minutes = make("input", { type: "number", min: 1, max: 600, step: "any", value: row.minutes ?? "", inputmode: "decimal", "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
+      const words = row.busy || t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : `${Math.round(100 * row.battery)} %` });
+      list.append(make("li", {}, make("label", { class: "check" }, on, make("b", {}, nameOf(row.id))), make("small", {}, words), row.busy ? null : minutes));
+      return { id: row.id, on, minutes };
+    });
+    setText(status, vehicles.length ? "" : t("gapflight.nobody"));
+  } catch (error) {
+    setText(status, t("gapflight.failed", { why: error.message }));
+  }
+}
+
+async function makePlan() {
+  setPlan(null);
+  const chosen = rows.filter((row) => row.on.checked);
+  const asked = chosen.find((row) => !(Number(row.minutes.value) > 0));
+  if (asked) { setText(status, t("gapflight.unknown", { name: nameOf(asked.id) })); asked.minutes.focus(); return; }
+  planButton.disabled = true;
+  setText(status, t("plan.making"));
+  try {
+    const made = await post("/api/coverage/flight", { vehicles: Object.fromEntries(chosen.map((row) => [row.id, Number(row.minutes.value)])) }, 120_000);
+    setPlan(made);
+    setText(status, "");
+    const features = (await get(`/api/plans/${made.id}/map`)).features ?? [];
+    show("plan", features.filter((feature) => feature.geometry?.type === "LineString").map((feature) => ({ ...feature, properties: { ...feature.properties, colour: colourOf(made.names[feature.properties.vehicle]) } })));
+  } catch (error) {
+    setText(status, t("gapflight.failed", { why: error.message }));
+  } finally {
+    planButton.disabled = false;
+  }
+}
+
+async function confirm() {
+  const chosen = plan;
+  go.disabled = true;
+  setText(status, t("gapflight.uploading"));
+  const ended = await Promise.all(chosen.vehicles.map((row) => command(chosen.names[row.id], "upload", { plan: chosen.id, mission: row.id })));
+  const wrong = ended.filter((entry) => entry.outcome !== "done");
+  if (wrong.length) {
+    setText(status, t("gapflight.refused", { list: wrong.map((entry) => `${entry.name}: ${entry.reason}`).join("; ") }));
+    go.disabled = false;
+    return;
+  }
+  dialog.close();
+  openPreflight(chosen, chosen.names);
+}

@@ -1,0 +1,66 @@
+// How much of the area was seen, what was missed and why; a press on a gap goes there.
+
+import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
+import { state, subscribe } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
+import { openGapFlight } from "/static/coverage/flight.js";
+import { showCoverage } from "/static/coverage/layer.js";
+import { boundsOf, fit } from "/static/map/map.js";
+
+const MOST = 30;
+const percent = (share) => `${(100 * (share ?? 0)).toFixed(share > 0.999 && share < 1 ? 2 : 1)} %`;
+const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
+
+function zoom(gap) {
+  const bounds = boundsOf(gap.polygon?.coordinates?.[0] ?? []);
+  if (bounds) fit(bounds);
+}
+
+// Missing pictures of a vehicle with one cause as one line.
+function missingRows(rows) {
+  const groups = new Map();
+  for (const row of rows) {
+    const key = `${row.vehicle}/${row.cause}`;
+    if (!groups.has(key)) groups.set(key, { ...row, n: 0 });
+    groups.get(key).n += 1;
+  }
+  return [...groups];
+}
+
+export function coveragePanel() {
+  const shares = make("p", {});
+  const recorded = make("p", { class: "quiet" });
+  const gapsTitle = make("p", {});
+  const list = make("ul", { class: "gaps" });
+  const more = make("p", { class: "quiet" });
+  const missing = make("ul", { class: "quiet" });
+  const offers = make("ul", { class: "warnings" });
+  const fly = button(t("coverage.fly"), openGapFlight);
+  const shown = make("input", { type: "checkbox", checked: true, onchange: () => showCoverage(shown.checked) });
+  const toggle = make("label", { class: "check" }, shown, make("span", {}, t("coverage.show")));
+  const drawGaps = keyedList(list, () => { const row = make("li", {}, button("", () => zoom(row.gap))); return row; }, (row, gap) => {
+    row.gap = gap;
+    const cause = [gap.cause, gap.detail && `(${gap.detail})`, gap.vehicle && nameOf(gap.vehicle)].filter(Boolean).join(" ");
+    setText(row.firstChild, `${t("coverage.gap", { size: units.area(gap.area_m2), cause })}, ${t("coverage.sure", { sure: percent(gap.confidence) })}`);
+    setAttribute(row, "data-poor", gap.detail ? "true" : "false");
+  });
+  const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.image })));
+  const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, recorded, toggle, offers, gapsTitle, list, more, fly, missing);
+  subscribe("coverage vehicles", "coverage", () => {
+    const now = state.coverage;
+    const known = now?.seen_share != null;
+    for (const part of [recorded, toggle, offers, gapsTitle, list, more, fly, missing]) setHidden(part, !known);
+    if (!known) { setText(shares, t("coverage.none")); return; }
+    setText(shares, `${t(`coverage.state.${now.state}`)} ${t("coverage.shares", { seen: percent(now.seen_share), poor: percent(now.poor_share), missed: percent(now.missed_share), planned: percent(now.planned_share) })}`);
+    setText(recorded, t("coverage.recorded", { seen: percent(now.recorded.seen_share), placed: now.pictures.placed, left: now.pictures.recorded }));
+    setText(gapsTitle, now.gaps.length ? t("coverage.gaps", { n: now.gaps.length, size: units.area(now.gaps.reduce((sum, gap) => sum + gap.area_m2, 0)) }) : t("coverage.nogaps"));
+    drawGaps(now.gaps.slice(0, MOST).map((gap) => [`${gap.lat_deg},${gap.lon_deg},${gap.cause}`, gap]));
+    setHidden(more, now.gaps.length <= MOST);
+    setText(more, t("coverage.more", { n: now.gaps.length - MOST }));
+    fly.disabled = !now.gaps.length;
+    offers.replaceChildren(...(now.offers ?? []).map((row) => make("li", {}, t("coverage.offer", { name: nameOf(row.vehicle), legs: row.legs, length: units.distance(row.length_m) }))));
+    drawMissing(missingRows(now.missing_pictures));
+  });
+  return box;
+}
