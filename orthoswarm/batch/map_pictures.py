@@ -23,7 +23,6 @@ from orthoswarm.mosaic.radiometry import estimate_fields
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
 from orthoswarm.raster.height_model import read_dem
-from orthoswarm.refine.registration.map_offset import measure_map_offset
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
@@ -50,9 +49,6 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
         state.leave_out(reasons, state.recorded.placed)
         state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
     on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
-    state.map_offset = measure_map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
-    if state.map_offset is not None:
-        state.warnings += state.map_offset.warning()
     with_map = state.basemap is not None and run.options.until == "fine"
     if with_map and not on_map:
         state.warnings.append("no vehicle was found on the basemap; the orthoimage lies where the receivers say")

@@ -26,6 +26,8 @@ from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers
 from orthoswarm.config import override
+from orthoswarm.control.control_observations import check_control
+from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
@@ -68,13 +70,18 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
         with context.clock.stage("load") as stage:
             state = _load(context, load)
             stage.items = len(state.ingest.frames) + len(state.ingest.rejected)
-        if space.begin(run_key(state.ingest.frames, options, options.basemap, options.dem)):
+        files = options.basemap, options.dem, options.control, options.checkpoints
+        if space.begin(run_key(state.ingest.frames, options, *files)):
             state.warnings.append("this run was interrupted before and was continued")
         placed = _realtime(context, state)
         refinement = None
         if options.until != "realtime":
             refinement = refinement_stage.refine(context, state)
             if state.fault is None:
+                if refinement is not None:
+                    refinement = refinement_stage.onto_ground(state, refinement)
+                elif state.control_points:
+                    state.warnings.append("the control points were not used: the pictures could not be refined")
                 placed = map_pictures.refined_pictures(context, state, refinement)
             else:
                 state.leave_out(state.undrawn, state.recorded.placed)
@@ -109,7 +116,20 @@ def _load(run: RunContext, load: Load) -> RunState:
         warnings += partial_cover(basemap, recorded.placed)
     dem = None if run.options.dem is None else _height_model(run, run.options.dem, grid, recorded)
     rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-    return RunState(ingest, grid, recorded, gsd, basemap, dem, warnings, rejected)
+    control = _control_points(run, grid, recorded, basemap)
+    return RunState(ingest, grid, recorded, gsd, basemap, dem, warnings, rejected, control_points=control)
+
+
+def _control_points(run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None) -> list[Checkpoint]:
+    """The points of --control; useless ones, and a file of --checkpoints that cannot be read, are refused now."""
+    options = run.options
+    if options.checkpoints is not None:
+        read_checkpoints(options.checkpoints, options.pixel_scale)
+    if options.control is None:
+        return []
+    points = read_checkpoints(options.control, options.pixel_scale)
+    check_control(points, recorded.placed, grid, basemap is not None)
+    return points
 
 
 def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:

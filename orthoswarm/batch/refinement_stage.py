@@ -9,6 +9,7 @@ from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.batch.run_state import RunContext, RunState
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
+from orthoswarm.control.ground_control import place_on_control
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import local_origin
@@ -16,6 +17,7 @@ from orthoswarm.model.placement import PlacedFrame, Refinement, Solution
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos
 from orthoswarm.raster.map_check import UnreadableMapError
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
+from orthoswarm.refine.registration.map_offset import measure_map_offset
 
 
 def refine(run: RunContext, state: RunState) -> Refinement | None:
@@ -53,6 +55,18 @@ def refine(run: RunContext, state: RunState) -> Refinement | None:
     run.clock.stages += stages
     map_unreadable = state.basemap is None and run.options.basemap is not None
     run.space.remember("refinement", (refinement, stages, map_unreadable))
+    return refinement
+
+
+def onto_ground(state: RunState, refinement: Refinement) -> Refinement:
+    """The map compared with the receivers; then all frames moved onto the control points, where there are some."""
+    state.map_offset = measure_map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
+    if state.control_points:
+        gsd = None if state.basemap is None else state.basemap.native_gsd_m
+        refinement, state.control = place_on_control(refinement, state.control_points, state.grid, gsd)
+        state.warnings += state.control.warnings
+    if state.map_offset is not None and (state.control is None or state.control.on_map is None):
+        state.warnings += state.map_offset.warning()  # control points on the map answer it
     return refinement
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, SEAMLINES, RunContext, RunState
+from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Refinement
@@ -24,6 +25,7 @@ def write_products(
         stated, z = from_takeoff(placed, level, state.terrain)
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z)
         report = _report(run, state, placed, refinement, z)
+        _add_checkpoints(run, report, z)
         left_out = list(state.rejected.values())
         try:
             write_page(run.out, report, stated, left_out, state.basemap)
@@ -35,6 +37,18 @@ def write_products(
     report["stages"].append(stage_row(stage))
     write_json(run.out / "report.json", report)
     return report
+
+
+def _add_checkpoints(run: RunContext, report: dict[str, Any], ground_z_m: float) -> None:
+    """The errors at surveyed points, where the run was given some; from the placements that were just written."""
+    report["checkpoints"] = None
+    table = run.options.checkpoints
+    if table is None:
+        return
+    try:
+        report["checkpoints"] = evaluate_checkpoints(run.out, table, run.options.pixel_scale, ground_z_m).figures()
+    except InputError as error:
+        report["warnings"].append(f"the checkpoints could not be measured: {error}")
 
 
 def _made(run: RunContext, faulty: bool) -> set[str]:
@@ -70,6 +84,7 @@ def _report(
         "covered_share": state.drawn[1],
         "basemap": str(run.options.basemap) if state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
+        "control": None if state.control is None else state.control.document(),
         "until": run.options.until,
         "config": {stage: dict(values) for stage, values in run.options.config.items()},
         "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],

@@ -13,6 +13,8 @@ from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers
 from orthoswarm.config import Overrides
+from orthoswarm.control.ground_control import GroundControl
+from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -53,6 +55,8 @@ class Options:
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
         dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
         gains: even out brightness between pictures. blend: mix the two pictures at each seam, see Seams.
+        control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
+            as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         config: thresholds of the refiner in the place of their defaults.
     """
 
@@ -65,6 +69,9 @@ class Options:
     split_legs: bool = False
     gains: bool = True
     blend: Blend = "seam"
+    control: Path | None = None
+    checkpoints: Path | None = None
+    pixel_scale: float = 1.0
     config: Overrides = field(default_factory=dict)
 
 
@@ -98,6 +105,7 @@ class RunState:
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
         previews: small copies of the pictures, for the seams.
         undrawn: image -> why the real-time picture does not show it.
+        control_points: surveyed points to place the map on. control: what they did, None before or without them.
         map_offset: the map against the receivers, None where nothing lies on a map.
         fault: what went wrong inside the refiner, None if nothing did.
     """
@@ -118,6 +126,8 @@ class RunState:
     drawn: tuple[float, float] = (0.0, 1.0)
     previews: PreviewFile | None = None
     undrawn: Mapping[str, str] = field(default_factory=dict)
+    control_points: list[Checkpoint] = field(default_factory=list)
+    control: GroundControl | None = None
     map_offset: MapOffset | None = None
     fault: str | None = None
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from orthoswarm.config.bundle import BundleConfig
+from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.features import FeaturesConfig
 from orthoswarm.config.flight import FlightConfig
 from orthoswarm.config.initial import InitialConfig
@@ -35,6 +36,7 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
 
 
 _DEFAULT = Config()

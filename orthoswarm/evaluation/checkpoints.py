@@ -41,6 +41,18 @@ class Mark:
     column: float
     row: float
 
+    def check_inside(self, width: int, height: int) -> None:
+        """Refuse a mark outside its photo.
+
+        Raises:
+            InputError: it lies more than a pixel outside.
+        """
+        if not (-1.0 <= self.column <= width and -1.0 <= self.row <= height):
+            raise InputError(
+                f"{self.image} has {width} x {height} pixels, a point is marked at {self.column:.0f}, {self.row:.0f}; "
+                "if the points were measured in larger copies, say how much smaller these are (--pixel-scale 0.2)"
+            )
+
 
 @dataclass(slots=True)
 class Checkpoint:
@@ -119,27 +131,30 @@ class CheckpointAccuracy:
         }
 
 
-def evaluate_checkpoints(out: Path, table: Path, pixel_scale: float = 1.0) -> CheckpointAccuracy:
+def evaluate_checkpoints(
+    out: Path, table: Path, pixel_scale: float = 1.0, ground_z_m: float | None = None
+) -> CheckpointAccuracy:
     """Errors of a product at surveyed points.
 
     Args:
         out: output folder of `mosaic` (or the workspace of a daemon), or a file in it.
         table: the points, see the module.
         pixel_scale: pixels of the mapped photos to one of the photos in which the points were measured.
+        ground_z_m: level of the homographies, None to read it from report.json.
 
     Raises:
         InputError: if the table cannot be read, or no point of it can be measured.
     """
     folder = out if out.is_dir() else out.parent
     points = read_checkpoints(table, pixel_scale)
-    views = _Views.read(folder) if any(p.marks for p in points) else None
+    views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
     grid = LocalGrid(views.epsg if views else _epsg(points))
     names, errors, sigmas, unused, how = [], [], [], [], set()
     for point in points:
         rays = views.rays(point.marks) if views else []
         if rays:
             assert views is not None
-            found = _intersection(rays, views.ground_z_m)
+            found = intersection(rays, views.ground_z_m)
             how.add("photos")
         elif point.on_map is not None:
             found = _placed(grid, point.on_map)
@@ -298,11 +313,12 @@ class _Views:
     ground_z_m: float
 
     @classmethod
-    def read(cls, folder: Path) -> "_Views":
+    def read(cls, folder: Path, ground_z_m: float | None) -> "_Views":
         """Raises InputError if the folder has no placed frames."""
         try:
             text = (folder / "frames.jsonl").read_text("utf-8")
-            report = json.loads((folder / "report.json").read_text("utf-8"))
+            if ground_z_m is None:
+                ground_z_m = float(json.loads((folder / "report.json").read_text("utf-8")).get("ground_z_m") or 0.0)
             rows = [json.loads(line) for line in text.splitlines() if line.strip()]
         except (OSError, ValueError) as error:
             raise InputError(
@@ -312,7 +328,7 @@ class _Views:
         placed = {r["image"].replace("\\", "/"): r for r in rows if r.get("homography") and r.get("camera")}
         if not placed:
             raise InputError(f"{folder} has no placed photos")
-        return cls(placed, int(next(iter(placed.values()))["epsg"]), float(report.get("ground_z_m") or 0.0))
+        return cls(placed, int(next(iter(placed.values()))["epsg"]), ground_z_m)
 
     def rays(self, marks: Sequence[Mark]) -> list[tuple[Array, Array]]:
         """Camera position (3,) and unit direction (3,) of each mark whose photo was mapped."""
@@ -320,23 +336,12 @@ class _Views:
         return [self._ray(row, mark) for row, mark in found if row is not None]
 
     def _row(self, image: str) -> dict[str, Any] | None:
-        """The photo of a name; a name without folders may stand for one photo only."""
-        name = image.replace("\\", "/")
-        if name in self.rows:
-            return self.rows[name]
-        tail = "/" + name.rsplit("/", 1)[-1].lower()
-        hits = [row for known, row in self.rows.items() if ("/" + known).lower().endswith(tail)]
-        if len(hits) > 1:
-            raise InputError(f"{len(hits)} photos are called {image}; write them with their folders")
-        return hits[0] if hits else None
+        name = photo_named(self.rows, image)
+        return None if name is None else self.rows[name]
 
     def _ray(self, row: Mapping[str, Any], mark: Mark) -> tuple[Array, Array]:
         width, height = int(row["width"]), int(row["height"])
-        if not (-1.0 <= mark.column <= width and -1.0 <= mark.row <= height):
-            raise InputError(
-                f"{mark.image} has {width} x {height} pixels, a point is marked at {mark.column:.0f}, {mark.row:.0f}; "
-                "if the points were measured in larger copies, say how much smaller these are (--pixel-scale 0.2)"
-            )
+        mark.check_inside(width, height)
         focal = focal_px(math.radians(float(row["fov_deg"])), width)
         lens = Lens(width, height, focal, float(row.get("k1", 0.0)), float(row.get("k2", 0.0)))
         centre = np.array(lens.principal_point)
@@ -350,7 +355,26 @@ class _Views:
         return position, away / np.linalg.norm(away)
 
 
-def _intersection(rays: Sequence[tuple[Array, Array]], ground_z_m: float) -> Array:
+def photo_named(known: Mapping[str, Any], image: str) -> str | None:
+    """The photo of a name, None if there is none; a name without folders may stand for one photo only.
+
+    Args:
+        known: photos by their names in the products. image: as a table of points writes it.
+
+    Raises:
+        InputError: several photos have that name.
+    """
+    name = image.replace("\\", "/")
+    if name in known:
+        return name
+    tail = "/" + name.rsplit("/", 1)[-1].lower()
+    hits = [other for other in known if ("/" + other).lower().endswith(tail)]
+    if len(hits) > 1:
+        raise InputError(f"{len(hits)} photos are called {image}; write them with their folders")
+    return hits[0] if hits else None
+
+
+def intersection(rays: Sequence[tuple[Array, Array]], ground_z_m: float, height_sigma_m: float = _RELIEF_M) -> Array:
     """East and north (2,) of the point nearest to all rays; its height is held by the ground where they do not hold it.
 
     Every ray counts by its distance over the camera's range, so that a metre at 50 m height and two at 100 m are alike.
@@ -361,6 +385,6 @@ def _intersection(rays: Sequence[tuple[Array, Array]], ground_z_m: float) -> Arr
         across = (np.eye(3) - np.outer(direction, direction)) * (1000.0 / distance) ** 2  # a pixel: about 1/1000
         normal += across
         right += across @ position
-    normal[2, 2] += 1.0 / _RELIEF_M**2
-    right[2] += ground_z_m / _RELIEF_M**2
+    normal[2, 2] += 1.0 / height_sigma_m**2
+    right[2] += ground_z_m / height_sigma_m**2
     return np.asarray(np.linalg.solve(normal, right)[:2])

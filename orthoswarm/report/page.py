@@ -95,7 +95,7 @@ def write_page(
         least = max(float(report["gsd_m"]), basemap.native_gsd_m if basemap else 0.0)
         ortho = product_picture(best, view_grid(report["epsg"], product_bounds(best), 2000, least))
         there = None if basemap is None else MapView.read(basemap, ortho.grid)
-        if basemap is not None and there is not None:
+        if basemap is not None and there is not None and not report.get("control"):  # which moved it off the map
             shifts = _shifts(best, ortho, there, basemap, least)
             values["edges"] = _edge_crops(best, ortho, there, basemap)
         values |= _pictures(out, ortho, report, placed, there, shifts)
@@ -259,6 +259,8 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
             "kind": "rough",
             "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m.",
         }
+    if report.get("control"):
+        return _control_verdict(report["control"], usual)
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
@@ -277,6 +279,19 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     return {"kind": "good" if fine >= 0.9 * len(placed) else "rough", "text": text + "."}
 
 
+def _control_verdict(control: Mapping[str, Any], usual: float) -> dict[str, str]:
+    """The same for a map that surveyed points placed."""
+    count, shift = control["points"], control["shift_m"]
+    points = "one surveyed point" if count == 1 else f"{count} surveyed points"
+    text = (
+        f"Placed on {points}, which moved it by {math.hypot(shift['east'], shift['north']):.2f} m "
+        f"({shift['east']:+.2f} east, {shift['north']:+.2f} north); expected error {usual:.2f} m (one sigma)"
+    )
+    if count > 1:
+        text += f"; {control['residual_rms_m']:.2f} m (rms) are left at the points"
+    return {"kind": "rough" if control["left_out"] or count < 3 else "good", "text": text + "."}
+
+
 def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Moved | None) -> list[tuple[str, str]]:
     frames = report["frames"]
     gsd = float(report["gsd_m"])
@@ -289,6 +304,9 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     facts.append((f"{area:,.1f} ha" if area < 1000 else f"{area / 100:,.1f} km²", "mapped"))
     if shifts is not None and len(shifts.at):
         facts.append((f"{np.median(shifts.size_m):.2f} m", "from the map (median)"))
+    checked = report.get("checkpoints")
+    if checked is not None:
+        facts.append((f"{checked['rmse_h_m']:.2f} m", f"RMSE horizontal at {checked['checkpoints']} checkpoints"))
     return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]
 
 

@@ -27,6 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
     add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
     add(
+        "--control", type=Path, metavar="FILE",
+        help="surveyed points that move the map onto the ground: ODM's gcp_list.txt, or a CSV (docs/usage.md)",
+    )  # fmt: skip
+    add("--checkpoints", type=Path, metavar="FILE", help="surveyed points at which the map is measured, same formats")
+    add(
+        "--pixel-scale", type=float, default=1.0, metavar="S",
+        help="for points marked in larger copies of the photos: pixels of these to one of those, for example 0.2",
+    )  # fmt: skip
+    add(
         "--every-m", type=float, metavar="M", help="of a video one picture every M metres (default: 4 %% of the height)"
     )
     add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
@@ -74,6 +83,9 @@ def run(args: argparse.Namespace) -> int:
         split_legs=args.split == "legs",
         gains=not args.no_gains,
         blend=args.blend,
+        control=args.control,
+        checkpoints=args.checkpoints,
+        pixel_scale=args.pixel_scale,
         config=read_overrides(args.config) if args.config is not None else {},
     )
 
@@ -124,7 +136,15 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")
     if args.workers is not None and args.workers < 1:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
-    for flag, path in (("--basemap", args.basemap), ("--dem", args.dem)):
+    if not args.pixel_scale > 0.0:
+        raise InputError("--pixel-scale must be greater than 0; leave it out for points marked in these photos")
+    files = (
+        ("--basemap", args.basemap),
+        ("--dem", args.dem),
+        ("--control", args.control),
+        ("--checkpoints", args.checkpoints),
+    )
+    for flag, path in files:
         if path is not None and not path.exists():
             raise InputError(f"{flag} {path} does not exist; check the path")
 

@@ -73,7 +73,8 @@ class MapOffset:
         return [
             f"the basemap lies {self.distance:.1f} m ({self.east:+.1f} east, {self.north:+.1f} north) from where the "
             f"receivers say, which are good to {self.sigma:.1f} m (one sigma, {_count(self.vehicles)}): {probably}; "
-            "the orthoimage follows the basemap, so compare it with a surveyed point (evaluate --checkpoints)"
+            "the orthoimage follows the basemap, so compare it with surveyed "
+            "points (evaluate --checkpoints FILE), or give a few of them to place it on (mosaic --control FILE)"
         ]
 
 

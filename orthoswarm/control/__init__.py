@@ -1,0 +1,1 @@
+"""Ground control: surveyed points that move a refined block onto the ground."""

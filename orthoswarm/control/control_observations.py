@@ -1,0 +1,133 @@
+"""Where a refined block puts surveyed points: by the photos that show them, or by their place on the basemap.
+
+Photos that lie on the basemap and photos that lie where receivers say are two frames of reference, each with an error
+of its own against the ground. A point that photos of both show is one observation of each.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.evaluation.checkpoints import Checkpoint, intersection, photo_named
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Terrain
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ControlObservation:
+    """A surveyed point in one frame of reference.
+
+    Attributes:
+        name: of the point.
+        placed: float64 (2,), east and north where the block has it. surveyed: float64 (2,), where it is; same grid.
+        sigma_m: of the difference, an axis: survey, pointing, and the block's bends at that place.
+    """
+
+    name: str
+    placed: Array
+    surveyed: Array
+    sigma_m: float
+
+
+def check_control(
+    points: Sequence[Checkpoint], recorded: Sequence[PlacedFrame], grid: LocalGrid, has_map: bool
+) -> None:
+    """Refuse control points that can be of no use, before the work begins.
+
+    Raises:
+        InputError: no point is seen in a photo or on the basemap, or one lies far from all photos.
+    """
+    images = {p.frame.image: p for p in recorded}
+    seen = [p for p in points if (has_map and p.on_map is not None) or _photos(p, images)]
+    if not seen:
+        raise InputError(
+            f"none of the {len(points)} control points is seen in a photo with a position; check the "
+            "names of the images"
+        )
+    nadirs = np.array([p.camera.nadir for p in recorded])
+    for point in seen:
+        away = float(np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min())
+        if away > active().control.farthest_m:
+            raise InputError(
+                f"control point {point.name} lies {away / 1000:,.0f} km from the nearest photo; check its coordinates "
+                "and their coordinate system"
+            )
+
+
+def in_photos(
+    points: Sequence[Checkpoint], placed: Sequence[PlacedFrame], terrain: Terrain, grid: LocalGrid, on_map: bool
+) -> list[ControlObservation]:
+    """Points by the rays of the photos that show them.
+
+    Args:
+        points: surveyed points. placed: photos of one frame of reference. terrain: ground below them.
+        grid: the area's. on_map: whether that frame is the basemap.
+    """
+    config = active().control
+    images = {p.frame.image: p for p in placed}
+    out = []
+    for point in points:
+        photos = _photos(point, images)
+        if not photos:
+            continue
+        rays = [_ray(p, pixel) for p, pixel in photos]
+        level = float(np.median([terrain.height(p.camera.nadir) for p, _ in photos]))
+        found = intersection(rays, level, config.height_sigma_m)
+        found = intersection(rays, float(terrain.height(found)), config.height_sigma_m)
+        gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
+        pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
+        bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else config.receivers_local_sigma_m
+        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent]))
+        out.append(ControlObservation(point.name, found, _in_grid(point.surveyed, grid), sigma))
+    return out
+
+
+def on_basemap(points: Iterable[Checkpoint], grid: LocalGrid, map_gsd_m: float) -> list[ControlObservation]:
+    """Points by their place on the basemap, measured there to a pixel."""
+    return [
+        ControlObservation(
+            point.name, _in_grid(point.on_map, grid), _in_grid(point.surveyed, grid),
+            float(np.hypot(_survey_sigma(point), map_gsd_m)),
+        )
+        for point in points
+        if point.on_map is not None
+    ]  # fmt: skip
+
+
+def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[PlacedFrame, Array]]:
+    """The photos that show a point, and its pixel (2,) in each.
+
+    Raises:
+        InputError: a pixel lies outside its photo, or a name belongs to several photos.
+    """
+    out = []
+    for mark in point.marks:
+        name = photo_named(images, mark.image)
+        if name is None:
+            continue
+        frame = images[name].frame
+        mark.check_inside(frame.width, frame.height)
+        out.append((images[name], np.array([mark.column, mark.row])))
+    return out
+
+
+def _ray(placed: PlacedFrame, pixel: Array) -> tuple[Array, Array]:
+    """Camera position (3,) and unit direction (3,) of a pixel."""
+    camera = placed.camera
+    below = float(camera.position[2]) - 1.0
+    away = np.array([*camera.to_ground(pixel, below), below]) - camera.position
+    return camera.position, away / np.linalg.norm(away)
+
+
+def _survey_sigma(point: Checkpoint) -> float:
+    return point.sigma_m or active().control.survey_sigma_m
+
+
+def _in_grid(lon_lat: Array, grid: LocalGrid) -> Array:
+    return grid.to_grid(lon_lat[1], lon_lat[0])

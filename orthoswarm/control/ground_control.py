@@ -1,0 +1,179 @@
+"""Moving a refined block onto surveyed points, photos and terrain together.
+
+The control points do not enter the bundle adjustment: against the basemap a block is exact to centimetres, and what
+separates the map from the ground is one shift (and a little turn and scale) for all vehicles, so this is what the
+points are asked for. Bends within the block stay; they are part of the stated sigma.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.control.control_observations import in_photos, on_basemap
+from orthoswarm.control.similarity import ControlFit, Similarity, fit_similarity
+from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GroundControl:
+    """What control points did.
+
+    Attributes:
+        on_map: the fit of the photos that lie on the basemap; by_receivers: of the others. None where no control point
+            concerns them.
+        warnings: findings in plain words.
+    """
+
+    on_map: ControlFit | None
+    by_receivers: ControlFit | None
+    warnings: list[str]
+
+    def document(self) -> dict[str, Any] | None:
+        """As JSON values, of the larger part of the photos that were moved; None if none were."""
+        fit = self.on_map or self.by_receivers
+        if fit is None:
+            return None
+        similarity = fit.similarity
+        rms = float(np.sqrt((fit.residual**2).sum(axis=1).mean()))
+        return {
+            "points": len(fit.used),
+            "shift_m": {"east": float(similarity.values[0]), "north": float(similarity.values[1])},
+            "turn_deg": float(np.degrees(similarity.turn_rad)),
+            "scale": similarity.scale,
+            "sigma_m": float(similarity.sigma_m(similarity.middle)),
+            "residual_rms_m": rms,
+            "residuals": [
+                {"name": o.name, "east_m": float(r[0]), "north_m": float(r[1]), "sigma_m": o.sigma_m}
+                for o, r in zip(fit.used, fit.residual, strict=True)
+            ],
+            "left_out": [o.name for o in fit.left_out],
+        }
+
+
+def place_on_control(
+    refinement: Refinement, points: Sequence[Checkpoint], grid: LocalGrid, map_gsd_m: float | None
+) -> tuple[Refinement, GroundControl]:
+    """Move the fine cameras and their terrain onto control points.
+
+    Args:
+        refinement: as the refiner left it; it stays as it is. points: surveyed points. grid: the area's.
+        map_gsd_m: the basemap's pixel, None without a basemap.
+
+    Returns:
+        The moved refinement, and what the points did.
+
+    Raises:
+        InputError: a point's pixel lies outside its photo.
+    """
+    config = active().control
+    placed = [p for s in refinement.fine for p in s.placed]
+    terrain = refinement.terrain or Terrain.flat()
+    fits: dict[bool, ControlFit] = {}
+    for on_map in (True, False):
+        own = [p for p in placed if (p.stage == "fine") == on_map]
+        if not own:
+            continue
+        observations = in_photos(points, own, terrain, grid, on_map)
+        if on_map and map_gsd_m is not None:
+            observations += on_basemap(points, grid, map_gsd_m)
+        if observations:
+            nadirs = np.array([p.camera.nadir for p in own])
+            border = config.map_border_m if on_map else config.receivers_border_m
+            fits[on_map] = fit_similarity(observations, nadirs, border)
+    result = GroundControl(fits.get(True), fits.get(False), _warnings(fits, placed))
+    if not fits:
+        return refinement, result
+    level = float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
+    base = _smallest_sigma(placed)
+
+    def moved(p: PlacedFrame) -> PlacedFrame:
+        fit = fits.get(p.stage == "fine")
+        return p if fit is None else _moved(p, fit, level, base)
+
+    main = fits.get(True) or fits[False]
+    scale = main.similarity.scale
+    fine = [
+        replace(s, placed=[moved(p) for p in s.placed], ground_z_m=level + scale * (s.ground_z_m - level))
+        for s in refinement.fine
+    ]
+    ground = None if refinement.terrain is None else _moved_terrain(refinement.terrain, main.similarity, level)
+    return replace(refinement, fine=fine, terrain=ground), result
+
+
+def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
+    """Of the photos that lie where receivers say: the error that all of them have in common, metres."""
+    values = [p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)]
+    return min(values, default=0.0)
+
+
+def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: float) -> PlacedFrame:
+    """A photo after a similarity; heights over the ground's level are scaled, too, so that no pixel's ray is bent."""
+    similarity, camera = fit.similarity, placed.camera
+    height = level_m + similarity.scale * (camera.position[2] - level_m)
+    position = np.array([*similarity.moved(camera.nadir), height])
+    turn = similarity.turn_rad
+    about_up = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    own = placed.sigma_m
+    if placed.stage != "fine":  # the receivers' common error has given way to that of the control points
+        own = float(np.hypot(np.sqrt(max(own**2 - base_sigma_m**2, 0.0)), active().control.receivers_local_sigma_m))
+    sigma = float(np.hypot(own, similarity.sigma_m(camera.nadir)))
+    return replace(
+        placed, camera=replace(camera, position=position, rotation=about_up @ camera.rotation), sigma_m=sigma
+    )
+
+
+def _moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
+    """The ground after a similarity, on nodes as far apart as before."""
+    rows, columns = terrain.z.shape
+    step = terrain.step_m
+    if rows <= 2 and columns <= 2 and terrain.bare is None and float(np.ptp(terrain.z)) == 0.0:
+        return terrain  # a level plane
+    west, south = terrain.west, terrain.south
+    east, north = west + (columns - 1) * step, south + (rows - 1) * step
+    corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
+    low = np.floor(corners.min(axis=0) / step) * step
+    count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
+    e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
+    before = similarity.back(np.stack([e, n], axis=-1))
+
+    def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
+        heights = replace(terrain, z=z, bare=None).height(before)
+        return np.asarray(level_m + similarity.scale * (heights - level_m), np.float32)
+
+    bare = None if terrain.bare is None else moved(terrain.bare)
+    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
+
+
+def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> list[str]:
+    if not fits:
+        return [
+            "no control point is seen in a photo that was mapped (or has its place on the basemap): they were not used"
+        ]
+    said = []
+    for fit in fits.values():
+        for o in fit.left_out:
+            away = fit.similarity.moved(o.placed) - o.surveyed
+            said.append(
+                f"control point {o.name} was left out: the others put it {np.hypot(*away):.1f} m ({away[0]:+.1f} east, "
+                f"{away[1]:+.1f} north) from its survey; check its coordinates and where it was marked"
+            )
+        if fit.contradiction:
+            names = ", ".join(o.name for o in fit.used)
+            worst = float(np.hypot(*fit.residual.T).max())
+            said.append(
+                f"the control points {names} contradict each other (up to {worst:.1f} m are left): check their "
+                "coordinates and marks, or add points, so that the wrong one can be found"
+            )
+    for on_map, where in ((True, "on the basemap"), (False, "where the receivers say")):
+        others = sum((p.stage == "fine") == on_map for p in placed)
+        if others and on_map not in fits:
+            said.append(f"no control point is seen in the {others} photos that lie {where}: they stay there")
+    return said
