@@ -2,8 +2,8 @@
 
 MAVSDK's high-level `mission` plugin does not suit ArduPilot (no home item, RTL refused), and `is_mission_finished` is
 never true for a mission that ends with LAND; so missions go through `mission_raw`, are read back and compared, and the
-end of a mission is told by the same detector as in the default backend, fed through `mavlink_direct`. MAVSDK decodes
-every message to JSON: for a few vehicles, not for a hundred.
+end of a mission is told by the same detector as in the default backend, fed through `mavlink_direct`, which hands every
+message over as JSON. It does not hand over raw packets: no telemetry log, no signing, no telling apart of links.
 """
 
 import json
