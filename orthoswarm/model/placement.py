@@ -42,14 +42,15 @@ class Leg:
 
     Attributes:
         vehicle: id. first: index of its first frame among the vehicle's frames; last: of its last, inclusive.
-        state: matched to the map, carried by others, or failed.
+        state: matched to the map by evidence of its own; carried by legs that were, of its vehicle or of neighbours;
+            failed: it lies where the receiver says.
         confidence: 0 to 1. sigma_m: own error estimate in metres.
     """
 
     vehicle: str
     first: int
     last: int
-    state: LegState = "carried"
+    state: LegState = "failed"
     confidence: float = 0.0
     sigma_m: float = float("nan")
 

@@ -14,7 +14,7 @@ import numpy as np
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Refinement, Solution, Stage
+from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
@@ -211,7 +211,7 @@ def _solution(
     timings = {"relative": vehicle.cpu_s, "patches": sum(f.cpu_s for f in fits.values())}
     timings["cameras"] = process_time() - began
     return Solution(
-        vehicle.vehicle, placed, dropped, _legs(vehicle, fits, sigmas, had_map, shift is not None),
+        vehicle.vehicle, placed, dropped, _legs(vehicle, fits, sigmas, shift is not None),
         float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)), float(np.degrees(vehicle.fov_sigma_rad)),
         None, 0.0, (0.0, 0.0), state, warnings, timings,
     )  # fmt: skip
@@ -239,17 +239,15 @@ def _carried(
     return None, RECEIVER_SIGMA_M
 
 
-def _legs(
-    vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, had_map: bool, carried: bool
-) -> list[Leg]:
+def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, carried: bool) -> list[Leg]:
     out = []
     for k in range(len(vehicle.lines)):
         members = np.flatnonzero(vehicle.leg == k)
         fit = fits.get(k)
         found = fit is not None and fit.homography is not None
-        how = "matched" if found else "failed" if had_map and not carried else "carried"
+        how: LegState = "matched" if found else "carried" if carried else "failed"
         confidence = fit.share if fit is not None and found else 0.0
         out.append(
-            Leg(vehicle.vehicle, int(members[0]), int(members[-1]), how, confidence, float(np.median(sigma[members])))  # type: ignore[arg-type]
+            Leg(vehicle.vehicle, int(members[0]), int(members[-1]), how, confidence, float(np.median(sigma[members])))
         )
     return out

@@ -219,7 +219,7 @@ def test_without_a_map_it_stays_where_the_receiver_says(flight):
     scene, _, frames, _ = flight
     (fine,) = refine_batch(scene.grid, frames, None).fine
     assert {p.stage for p in fine.placed} == {"coarse"}
-    assert {leg.state for leg in fine.legs} == {"carried"}
+    assert {leg.state for leg in fine.legs} == {"failed"}
 
 
 class NoMap:

@@ -170,20 +170,30 @@ def full_resolution(cameras: CameraBlock, flight: Flight) -> CameraBlock:
 def leg_states(state: VehicleState) -> list[Leg]:
     """How the map held each leg.
 
-    Matched with enough agreeing ties of its own, else carried (by others, or without a map by the receiver); failed
-    where there is a map and the vehicle was not found on it.
+    Matched: tie points of its own agree with its place more often than by chance. Where that holds for no leg alone
+    (few photos a leg) but for all tie points of the vehicle together, the legs whose ties agree are matched. Carried:
+    legs without such ties beside matched ones, of the vehicle itself or of neighbours. Failed: all others, as the
+    vehicle lies where its receiver says.
     """
     flight = state.flight
+    limit = active().registration.leg_by_chance
+    residual = flight.adjustment.tie_residual
+    leg_of_tie = flight.leg[state.matches.camera]
+    agrees = np.ones(len(leg_of_tie), bool)
+    if len(residual) == len(leg_of_tie):
+        agrees = np.hypot(*residual.T) < LEG_AGREES_M
+    count = int(flight.leg.max()) + 1 if len(flight.leg) else 0
+    ties = [int((leg_of_tie == k).sum()) for k in range(count)]
+    agree = [int((agrees & (leg_of_tie == k)).sum()) for k in range(count)]
+    matched = [state.on_map and agreement_probability(a, n, LEG_AGREES_M, NEAR_M) <= limit for a, n in zip(agree, ties)]
+    if state.on_map and not any(matched):
+        matched = [2 * a > n for a, n in zip(agree, ties)] if sum(agree) else [True] * count
+    other: LegState = "carried" if lies_on_map(state) else "failed"
     out = []
-    for k in range(int(flight.leg.max()) + 1 if len(flight.leg) else 0):
+    for k in range(count):
         members = np.flatnonzero(flight.leg == k)
-        mine = flight.leg[state.matches.camera] == k
-        residual = flight.adjustment.tie_residual
-        agree = mine & (np.hypot(*residual.T) < LEG_AGREES_M) if len(residual) == len(mine) else mine
-        share = float(agree.sum()) / max(int(mine.sum()), 1)
-        by_chance = agreement_probability(int(agree.sum()), int(mine.sum()), LEG_AGREES_M, NEAR_M)
-        matched = state.on_map and by_chance <= active().registration.leg_by_chance
-        how: LegState = "matched" if matched else ("failed" if state.had_map and not lies_on_map(state) else "carried")
+        how: LegState = "matched" if matched[k] else other
+        share = agree[k] / max(ties[k], 1) if matched[k] else 0.0
         sigma = float(np.median(state.sigma_m[members]))
-        out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share if matched else 0.0, sigma))
+        out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share, sigma))
     return out

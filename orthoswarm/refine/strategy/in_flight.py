@@ -62,7 +62,7 @@ def place_in_flight(
         options: see Options.
 
     Returns:
-        A solution of stage coarse without state; its legs say how the map holds them (carried where there is none).
+        A solution of stage coarse without state; its legs say how the map holds them (failed where there is none).
 
     Raises:
         OrthoSwarmError: the pictures do not hold together (yet); the sentence says why.
@@ -122,7 +122,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         share = ONE_WAY_SIGMA if one_way else MANY_WAYS_SIGMA
         state = _shifted(state, fit.correction)
         state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(fit)), state.coarse_sigma_m)
-    legs = _legs(state, fit, basemap is not None)
+    legs = _legs(state, fit)
     return replace(to_solution(state, origin, None, coarse=True), legs=legs)
 
 
@@ -176,19 +176,24 @@ def _scatter(fit: CoarseFit) -> float:
     return float(np.median(off))
 
 
-def _legs(state: VehicleState, fit: CoarseFit | None, had_map: bool) -> list[Leg]:
-    """Legs with a window of their own on the map are matched, the others carried; all failed where none was found."""
-    out = []
+def _legs(state: VehicleState, fit: CoarseFit | None) -> list[Leg]:
+    """Legs most of whose windows agree on a place on the map are matched, the others carried by those.
+
+    Where no leg has so many by itself, those with any are matched. Where there is no place on a map, all failed.
+    """
     leg = state.flight.leg
-    for k in range(int(leg.max()) + 1 if len(leg) else 0):
-        members = np.flatnonzero(leg == k)
-        first, last = int(members[0]), int(members[-1])
-        sigma = float(np.median(state.coarse_sigma_m[members]))
-        if fit is None:
-            how: LegState = "failed" if had_map else "carried"
-            out.append(Leg(state.vehicle, first, last, how, 0.0, sigma))
-            continue
-        mine = [ok for m, ok in zip(fit.matches, fit.inlier, strict=True) if m.first <= last and m.last >= first]
-        share = sum(map(bool, mine)) / len(mine) if mine else 0.0
-        out.append(Leg(state.vehicle, first, last, "matched" if share > 0.5 else "carried", share, sigma))
+    legs = [np.flatnonzero(leg == k) for k in range(int(leg.max()) + 1 if len(leg) else 0)]
+    share = [0.0 if fit is None else _agreeing_windows(fit, int(own[0]), int(own[-1])) for own in legs]
+    least = 0.5 if max(share, default=0.0) > 0.5 else 0.0
+    out = []
+    for own, part in zip(legs, share, strict=True):
+        how: LegState = "failed" if fit is None else "matched" if part > least else "carried"
+        sigma = float(np.median(state.coarse_sigma_m[own]))
+        out.append(Leg(state.vehicle, int(own[0]), int(own[-1]), how, part, sigma))
     return out
+
+
+def _agreeing_windows(fit: CoarseFit, first: int, last: int) -> float:
+    """Share of the windows with pictures of a leg that agree with the registration; 0 where it has none."""
+    mine = [ok for m, ok in zip(fit.matches, fit.inlier, strict=True) if m.first <= last and m.last >= first]
+    return sum(map(bool, mine)) / len(mine) if mine else 0.0

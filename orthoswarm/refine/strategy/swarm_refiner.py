@@ -68,7 +68,7 @@ class SwarmRefiner:
         if kinds.fit:
             solution = self._refined(hint_lone_photos(kinds.fit), neighbours, basemap)
         else:
-            solution = _as_recorded(frames[0].vehicle, kinds.still, basemap is not None)
+            solution = _as_recorded(frames[0].vehicle, kinds.still)
         odd = place_by_neighbours(kinds.odd, kinds.fit, solution.placed)
         return replace(
             solution,
@@ -153,15 +153,15 @@ class SwarmRefiner:
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
         fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
-        left = [_left(units[k], why, grid, basemap is not None) for k, why in lost.items()]
+        left = [_left(units[k], why, grid) for k, why in lost.items()]
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
-def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame], had_map: bool) -> Solution:
+def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
     """A vehicle that stays where its receiver says: nothing was flown, so nothing tells the scale of its pictures."""
     fov = float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan")
     sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
-    legs = [Leg(vehicle, 0, len(placed) - 1, "failed" if had_map else "carried", 0.0, sigma)] if placed else []
+    legs = [Leg(vehicle, 0, len(placed) - 1, "failed", 0.0, sigma)] if placed else []
     return Solution(vehicle, list(placed), {}, legs, fov, float("nan"), None)
 
 
@@ -171,11 +171,11 @@ def states_of(solution: Solution) -> list[VehicleState]:
     return [] if state is None else list(state) if isinstance(state, list) else [state]
 
 
-def _left(frames: Sequence[Frame], why: str, grid: LocalGrid, had_map: bool) -> Solution:
+def _left(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
     """A vehicle that could not be refined, as it was recorded; the others are worth having all the same."""
     placed = recorded_cameras(frames, grid).placed
     said = f"it could not be refined ({why}); it stays where its receiver says"
-    return replace(_as_recorded(frames[0].vehicle, placed, had_map), warnings=[said])
+    return replace(_as_recorded(frames[0].vehicle, placed), warnings=[said])
 
 
 def lay_lost_beside(
