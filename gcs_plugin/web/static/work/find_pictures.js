@@ -1,4 +1,4 @@
-// The pictures that show a find, best first, with the place marked in each.
+// The pictures that show a find, best first, with the place marked in each. The box is not modal: commands stay in reach.
 
 import { get, withToken } from "/static/core/api.js";
 import { button, make, setText } from "/static/core/dom.js";
@@ -11,12 +11,14 @@ const MOST = 12;
 export function picturesDialog() {
   const title = make("h2", { id: "find-pictures" });
   const list = make("ul", { class: "pictures" });
-  const box = make("dialog", { class: "find-pictures", "aria-labelledby": "find-pictures" }, make("div", { class: "row" }, title, button("×", () => box.close(), { class: "close", "aria-label": t("finds.pictures.close") })), list);
+  const close = button("×", () => box.close(), { class: "close", "aria-label": t("finds.pictures.close") });
+  const box = make("dialog", { class: "find-pictures", "aria-labelledby": "find-pictures", onkeydown: (event) => { if (event.key === "Escape") box.close(); } }, make("div", { class: "row" }, title, close), list);
   const say = (words) => list.replaceChildren(make("li", { class: "quiet" }, words));
   async function show(find) {
     setText(title, t("finds.pictures.of", { note: text(find.note) || t("finds.unnamed") }));
     say("…");
-    if (!box.open) box.showModal();
+    if (!box.open) box.show();
+    close.focus();
     try {
       const rows = (await get(`/api/finds/${encodeURIComponent(find.id)}/pictures`)).filter((row) => row.seq != null);
       if (rows.length) list.replaceChildren(...rows.slice(0, MOST).map(figure));

@@ -1,0 +1,41 @@
+"""A find shows the pictures that have it, and commands stay in reach meanwhile."""
+
+import base64
+
+from tests.kit.page_kit import DESK, PHONE, ok_for_all, opened, send, standing, vehicle
+from tests.page.test_commands import confirm
+
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+)
+
+
+def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
+    find = {
+        "id": 1,
+        "lat_deg": 47.3977,
+        "lon_deg": 8.5456,
+        "sigma_m": 0.4,
+        "note": "Roof",
+        "time": "2026-05-28T20:26:40Z",
+    }
+    shown = [{"seq": 5, "vehicle": "v1", "image": "a.jpg", "column": 0.5, "row": 0.25, "stage": "fine"}]
+    for size in (DESK, PHONE):
+        with standing(vehicle(1, name="Falcon")) as station:
+            station.gets |= {"/api/finds": [find], "/api/finds/1/pictures": shown}
+            with opened(browser, station.url, size) as page:
+                ok_for_all(station)
+                page.route("**/api/frames/5/picture*", lambda route: route.fulfill(body=PNG, content_type="image/png"))
+                page.click("#tab-map")
+                page.click(".finds >> text=Pictures")
+                page.wait_for_selector(".pictures figcaption:has-text('a.jpg of Falcon')")
+                page.wait_for_function("() => document.querySelector('.pictures i').style.left === '50%'")
+                near = {"type": "vehicle_event", "kind": "near", "vehicle": "v1", "pair": ["v1", "v2"], "text": "near"}
+                send(page, near)
+                page.click(".alarms >> text=Seen")  # fails if the pictures lie over the alarms
+                page.click(".command[data-verb=rtl]")
+                confirm(page)
+                page.wait_for_selector("[data-outcome=done]")
+                page.focus(".find-pictures button")
+                page.keyboard.press("Escape")
+                page.wait_for_selector(".find-pictures", state="hidden")
