@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
+from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.coverage.picture_views import PictureViews
 from gcs_plugin.daemon.coverage.planned_area import area_source
@@ -100,11 +102,12 @@ class Daemon:
             fov_rad=fov, on_area=self._area_changed, anchor=self._anchor, on_rejected=self._rejected,
             on_drawn=lambda placed, quality: self.coverage.add(placed, quality),
         )  # fmt: skip
+        self.exposures = ExposureJournal(self.journal, lambda s: "" if self.links is None else self.links.name_of(s))
         self.coverage = LiveCoverage(
             self.journal, self.events, PictureViews(self.journal, self.store, folder / "solutions", fov),
             source=lambda: area_source(self.console.plan(), self.plans.folder),
             epsg=lambda: None if self.drawer.area is None else self.drawer.area.epsg,
-            vehicles=lambda: [] if self.links is None else self.links.latest,
+            vehicles=lambda: [] if self.links is None else self.links.latest, exposures=self.exposures,
         )  # fmt: skip
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
@@ -140,6 +143,7 @@ class Daemon:
         if settings.links:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
+            self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         self.sources = [

@@ -1,6 +1,7 @@
 """`orthoswarm coverage`: shares, causes and files, through the command line."""
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -149,3 +150,25 @@ def test_no_map_or_no_polygon(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     out = flown.write(tmp_path / "map")
     assert main(["coverage", str(out), "--area", str(line), "--out", str(tmp_path / "c")]) == 2
     assert "polygon" in capsys.readouterr().err
+
+
+def test_camera_events_of_a_log_say_that_pictures_have_not_arrived(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The files' numbers go on, so without the log the hole looks as if the camera had not been triggered."""
+    whole = FlownArea(vehicles=1, spacing_m=66.0)
+    flown = FlownArea(vehicles=1, spacing_m=66.0, dropped=_hole(), skip_numbers=False)
+    grid = whole.grid
+    rows = ["% GPST latitude(deg) longitude(deg) height(m) Q ns sdn sde"]
+    log = tmp_path / "exposures.pos"
+    for placed in whole.placed():
+        lat, lon = grid.to_geographic(placed.camera.position[:2])
+        when = datetime.fromtimestamp(placed.frame.time_s, UTC).strftime("%Y/%m/%d %H:%M:%S.%f")[:-3]
+        rows.append(f"{when} {lat:.9f} {lon:.9f} 80.0 1 12 0.01 0.01")
+    log.write_text("\n".join(rows).replace("% GPST", "% UTC") + "\n")
+    out = _run(
+        capsys, flown.write(tmp_path / "map"), "--area", flown.area(tmp_path / "a.geojson"), "--out", tmp_path / "c",
+        "--log", log,
+    )  # fmt: skip
+    assert {m["cause"] for m in out["missing_pictures"]} == {"pictures not arrived"}
+    assert len(out["missing_pictures"]) == len(_hole()) and out["gaps"][0]["cause"] == "pictures not arrived"

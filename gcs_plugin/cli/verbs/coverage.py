@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from orthoswarm.coverage.camera_events import CameraEvent
     from orthoswarm.coverage.coverage_grid import CoverageGrid
     from orthoswarm.coverage.gaps import Gaps
     from orthoswarm.coverage.map_folder import MapFolder
     from orthoswarm.coverage.missing_pictures import MissingPicture
+    from orthoswarm.model.geo import LocalGrid
     from orthoswarm.model.placement import Terrain
     from orthoswarm.planning.area.area import Area
 
@@ -34,6 +36,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--dem", type=Path, metavar="FILE", help="height model of the ground (default: level ground)")
     add("--cell", type=float, default=1.0, metavar="M", help="side of a cell, at most 1 m for areas that are flown")
     add("--pictures", action="store_true", help="decode the pictures to find blurred and damaged ones")
+    log_help = "flight log (.tlog, .BIN, .ulg) whose camera events tell what was triggered; again for each vehicle"
+    add("--log", action="append", default=[], metavar="[VEHICLE=]FILE", help=log_help)
     add("--json", action="store_true", help="one JSON document on stdout")
 
 
@@ -41,10 +45,10 @@ def run(args: argparse.Namespace) -> int:
     """Compute, write, print."""
     from gcs_plugin.plans.area_files import read_shapes
     from gcs_plugin.plans.planned_flight import read_planned_flight
+    from orthoswarm.coverage.camera_events import missing_by_events
     from orthoswarm.coverage.coverage_files import draw_cells, write_cells, write_gaps
     from orthoswarm.coverage.gaps import find_gaps
     from orthoswarm.coverage.map_folder import read_map
-    from orthoswarm.coverage.missing_pictures import missing_pictures
     from orthoswarm.export.product_files import write_json
     from orthoswarm.model.errors import InputError
     from orthoswarm.model.geo import LocalGrid
@@ -62,9 +66,10 @@ def run(args: argparse.Namespace) -> int:
         flown = _judged(flown)
     cover = _cover(args, flown, area)
     plan = None if args.plan is None else read_planned_flight(args.plan, area.grid)
-    missing = missing_pictures(flown.views, flown.rejected)
+    found = missing_by_events(flown.views, _events(args.log, flown, area.grid), flown.rejected)
+    missing = found.pictures
     gaps = find_gaps(cover, missing, plan)
-    warnings = [*flown.warnings]
+    warnings = [*flown.warnings, *found.warnings]
     if not (cover.best[cover.cells.wanted] != 255).any():
         warnings.append("no picture sees any of the area: check that the area and the flight belong together")
     figures = _figures(cover, gaps, missing, area.grid, warnings)
@@ -81,6 +86,34 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(figures, args.out)
     return 0
+
+
+def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[CameraEvent]":
+    """The camera events of logs, each for the vehicle that it is given for, or for the only one of the map."""
+    import numpy as np
+
+    from orthoswarm.coverage.camera_events import CameraEvent
+    from orthoswarm.model.errors import InputError
+    from telemetry.formats.log.flight_logs import read_log
+
+    vehicles = sorted({v.vehicle for v in flown.views})
+    events = []
+    for text in logs:
+        named, _, path = text.rpartition("=") if not Path(text).exists() else ("", "", text)
+        if named and named not in vehicles:
+            raise InputError(f"the map has no vehicle {named}; give --log one of: {', '.join(vehicles)}")
+        if not named and len(vehicles) > 1:
+            raise InputError(f"say whose log {path} is, for example --log {vehicles[0]}={path}")
+        for log in read_log(Path(path)):
+            for number, event in enumerate(log.events):
+                if event.time_s is None:
+                    continue
+                place, lat, lon = None, event.sample.lat_deg, event.sample.lon_deg
+                if lat is not None and lon is not None:
+                    place = np.array([*grid.to_grid(lat, lon), 0.0])
+                counted = number if event.number is None else event.number
+                events.append(CameraEvent(named or vehicles[0], counted, event.time_s, place))
+    return events
 
 
 def _judged(flown: "MapFolder") -> "MapFolder":

@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 
 from gcs_plugin.daemon.coverage.battery_use import BatteryUse
 from gcs_plugin.daemon.coverage.cells_picture import cells_png, picture_corners
+from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.coverage.flawed_pictures import FlawedPictures
 from gcs_plugin.daemon.coverage.flown_legs import FlownLegs, flies
 from gcs_plugin.daemon.coverage.picture_views import Measured, PictureViews
 from gcs_plugin.daemon.coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
+from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares
 from orthoswarm.coverage.gaps import below_legs, find_gaps
-from orthoswarm.coverage.missing_pictures import MissingPicture, missing_pictures
+from orthoswarm.coverage.missing_pictures import MissingPicture
 from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -41,6 +43,7 @@ _LOOK_S: Final = 0.5
 _LEAST_PAUSE: Final = 3.0
 """Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
 _MOST_CELLS: Final = 16_000_000
+_ON_THE_WAY_S: Final = 15.0
 _FACT: Final = "coverage"
 _log = logging.getLogger(__name__)
 
@@ -92,6 +95,7 @@ class LiveCoverage:
         journal: of the workspace. events: told when the coverage has changed. views: of the workspace's pictures.
         source: gives where the area comes from, None while there is none. epsg: gives the map's grid, None before it.
         vehicles: gives the rows of the vehicles on the links, empty without links.
+        exposures: what vehicles said about their cameras.
 
     Attributes:
         seconds: time that finding the gaps took last. battery: how long the vehicles can still fly.
@@ -105,9 +109,11 @@ class LiveCoverage:
         source: Callable[[], AreaSource | None],
         epsg: Callable[[], int | None],
         vehicles: Callable[[], Rows],
+        exposures: ExposureJournal,
     ) -> None:
         self._journal, self._events, self._views = journal, events, views
         self._source, self._epsg, self._vehicles = source, epsg, vehicles
+        self._exposures = exposures
         self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
         self._bell, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="coverage", daemon=True)
@@ -192,7 +198,7 @@ class LiveCoverage:
             return gone
         epsg = self._epsg()
         here = self._followed
-        changed = False
+        changed = self._exposures.write()
         if here is None or here.source != source or (epsg is not None and here.cover.cells.grid.epsg != epsg):
             here = self._followed = self._begin(source, epsg)
             if here is None:
@@ -302,7 +308,7 @@ class LiveCoverage:
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid
-        missing = missing_pictures(cover.views)
+        missing, doubts = self._missing(here)
         gaps = find_gaps(cover, missing, here.covered.flight, due=self._due)
         features = [gap_feature(gap, grid) for gap in gaps.gaps]
         states = cover.states(self._due)
@@ -318,13 +324,23 @@ class LiveCoverage:
             "corners": picture_corners(cover.cells.grid, states),
             "gaps": [f["properties"] | {"polygon": f["geometry"]} for f in features],
             "small_gaps": {"count": gaps.small, "area_m2": round(gaps.small_m2, 1)},
-            "missing_pictures": _missing_rows(missing), "warnings": _warnings(cover),
+            "missing_pictures": _missing_rows(missing), "warnings": [*_warnings(cover), *doubts],
         }  # fmt: skip
         solved: dict[str, float] = {}
         for view in placed:
             fov = float(np.degrees(view.fov_rad))
             solved[view.vehicle] = min(fov, solved.get(view.vehicle, fov))
         return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), solved)
+
+    def _missing(self, here: _Followed) -> tuple[list[MissingPicture], list[str]]:
+        """Pictures that are missing, and doubts about the camera events."""
+        grid = here.covered.area.grid
+        events = self._exposures.events(grid)
+        if self._due is not True:  # pictures of the newest ones are still on their way
+            last = max((event.time_s for event in events), default=0.0) - _ON_THE_WAY_S
+            events = [event for event in events if event.time_s <= last]
+        found = missing_by_events(here.cover.views, events, self._views.rejected())
+        return found.pictures, found.warnings
 
     def _state(self, cover: CoverageGrid) -> str:
         if self._due is True:

@@ -11,6 +11,7 @@ from gcs_plugin.daemon.jobs.solution_file import SolutionFileError, read_solutio
 from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.store.journal import Journal, unpacked
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.coverage.missing_pictures import Exposure
 from orthoswarm.coverage.view import View
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
@@ -86,6 +87,11 @@ class PictureViews:
             if table == "solutions":
                 dropped += [(name, image) for image in solution.dropped]
         return views, dropped
+
+    def rejected(self) -> list[Exposure]:
+        """Pictures that came and could not be used."""
+        rows = self._journal.rows("SELECT vehicle, image, time FROM frames WHERE reason IS NOT NULL AND time NOT NULL")
+        return [Exposure(unpacked(r["vehicle"]), float(r["time"]), unpacked(r["image"])) for r in rows]
 
     def forget(self) -> None:
         """Have `placed_anew` give everything again."""

@@ -46,6 +46,9 @@ CREATE TABLE IF NOT EXISTS coarse (
 CREATE TABLE IF NOT EXISTS thumbnails (seq INTEGER PRIMARY KEY, rgb BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS qualities (
     seq INTEGER PRIMARY KEY, sharpness REAL, contrast REAL, flat_share REAL, saturated_share REAL);
+CREATE TABLE IF NOT EXISTS exposures (
+    vehicle TEXT NOT NULL, number INTEGER NOT NULL, time REAL NOT NULL, lat REAL, lon REAL,
+    PRIMARY KEY (vehicle, number, time));
 CREATE TABLE IF NOT EXISTS completions (
     id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
 """

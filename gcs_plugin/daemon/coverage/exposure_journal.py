@@ -1,0 +1,78 @@
+"""The exposures that vehicles report on their links, kept in the journal."""
+
+import sqlite3
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from orthoswarm.coverage.camera_events import CameraEvent
+from orthoswarm.model.geo import LocalGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+
+MESSAGES: Final = ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK")
+_AFTER_2001_S: Final = 1e9
+Row = tuple[str, int, float, float | None, float | None]
+
+
+class ExposureJournal:
+    """Takes camera events in, in the links' thread, and hands them out in the coverage's.
+
+    Args:
+        journal: of the workspace. name_of: gives a vehicle's id for its MAVLink system id.
+    """
+
+    def __init__(self, journal: Journal, name_of: "Callable[[int], str]") -> None:
+        self._journal, self._name_of = journal, name_of
+        self._fresh: deque[Row] = deque()
+        self._kinds: dict[int, str] = {}
+        self._last: dict[int, tuple[int, float]] = {}
+
+    def message(self, vehicle: "Vehicle", message: Any, utc_s: float) -> None:
+        """Take a message of MESSAGES; of a vehicle that sends both kinds, only the one that came first counts."""
+        kind, system = message.get_type(), vehicle.system
+        if self._kinds.setdefault(system, kind) != kind:
+            return
+        if kind == "CAMERA_FEEDBACK":
+            number, time_s, lat, lon = message.img_idx, message.time_usec * 1e-6, message.lat, message.lng
+        elif message.capture_result == 0:
+            return  # the camera failed to take it
+        else:
+            number, time_s, lat, lon = message.image_index, message.time_utc * 1e-6, message.lat, message.lon
+        if self._last.get(system) == (number, time_s):
+            return  # said twice
+        self._last[system] = number, time_s
+        place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
+        self._fresh.append((packed(self._name_of(system)), int(number), _utc(time_s, utc_s), *place))
+
+    def write(self) -> bool:
+        """Write what has come since the last call; whether there was anything."""
+        rows = [self._fresh.popleft() for _ in range(len(self._fresh))]
+
+        def change(db: sqlite3.Connection) -> None:
+            db.executemany("INSERT OR IGNORE INTO exposures VALUES (?, ?, ?, ?, ?)", rows)
+
+        if rows:
+            self._journal.write(change)
+        return bool(rows)
+
+    def events(self, grid: LocalGrid) -> list[CameraEvent]:
+        """All events in a grid; their heights are not used."""
+        rows = self._journal.rows("SELECT vehicle, number, time, lat, lon FROM exposures ORDER BY vehicle, time")
+        found = []
+        for row in rows:
+            place = None
+            if row["lat"] is not None:
+                place = np.array([*grid.to_grid(row["lat"], row["lon"]), 0.0])
+            found.append(CameraEvent(unpacked(row["vehicle"]), int(row["number"]), float(row["time"]), place))
+        return found
+
+
+def _utc(time_s: float, received_s: float) -> float:
+    """When it was taken: as the message says, or when that came where its clock has no date."""
+    return time_s if time_s > _AFTER_2001_S else received_s

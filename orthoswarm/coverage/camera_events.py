@@ -1,0 +1,111 @@
+"""Camera events against pictures.
+
+An exposure without a picture has not arrived (it is on the card, or its link is dead); a hole in a leg without an
+exposure was not triggered.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.coverage.missing_pictures import Cause, Exposure, MissingPicture, missing_pictures
+from orthoswarm.coverage.view import View
+
+Array = NDArray[np.float64]
+_MATCH_SHARE = 0.45
+"""An event belongs to a picture within this share of the usual time between events."""
+_LEAST_MATCHED = 0.5
+"""Share of a vehicle's pictures that must have an event: else its clocks disagree, and the events say nothing."""
+_SURE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEvent:
+    """An exposure as a vehicle reported it.
+
+    Attributes:
+        vehicle: whose. number: as counted by the vehicle. time_s: UTC epoch seconds.
+        position: float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it
+            from another level than maps do); None where the event has none.
+    """
+
+    vehicle: str
+    number: int
+    time_s: float
+    position: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What is missing.
+
+    Attributes:
+        pictures: missing pictures, of which those that have not arrived are named by their event's number.
+        warnings: events that could not be used, in words.
+    """
+
+    pictures: list[MissingPicture]
+    warnings: list[str]
+
+
+def missing_by_events(
+    views: Sequence[View], events: Iterable[CameraEvent], rejected: Iterable[Exposure] = ()
+) -> Missing:
+    """Missing pictures of all vehicles; those of vehicles without events by holes in their rows alone.
+
+    Args:
+        views: pictures that were placed. events: in any order. rejected: files that could not be used.
+    """
+    lost = list(rejected)
+    by_vehicle: dict[str, list[CameraEvent]] = defaultdict(list)
+    for event in events:
+        by_vehicle[event.vehicle].append(event)
+    rows: dict[str, list[View]] = defaultdict(list)
+    for view in views:
+        rows[view.vehicle].append(view)
+    found: list[MissingPicture] = []
+    warnings: list[str] = []
+    for vehicle, row in rows.items():
+        own = sorted(by_vehicle[vehicle], key=lambda e: e.time_s)
+        files = [e for e in lost if e.vehicle == vehicle]
+        timed = sorted((v for v in row if v.time_s is not None), key=lambda v: v.time_s or 0.0)
+        if len(own) < 2 or not timed:
+            found += missing_pictures(row, files)
+            continue
+        without = _without_picture(own, np.array([*(v.time_s for v in timed), *(e.time_s for e in files)], float))
+        if len(own) - len(without) < _LEAST_MATCHED * len(timed):
+            warnings.append(f"the camera events of {vehicle} are not at the times of its pictures: they are not used")
+            found += missing_pictures(row, files)
+            continue
+        waiting = [_not_arrived(event, timed) for event in without]
+        found += [picture for picture in waiting if picture is not None]
+        taken = [replace(p.view, time_s=e.time_s) for p, e in zip(waiting, without, strict=True) if p is not None]
+        holes = missing_pictures([*timed, *taken], files)
+        found += [
+            h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=_SURE) for h in holes
+        ]
+    return Missing(found, warnings)
+
+
+def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[CameraEvent]:
+    """Events that no picture was taken at; each picture takes the nearest event."""
+    at = np.array([e.time_s for e in events])
+    slack = _MATCH_SHARE * float(np.median(np.diff(at)))
+    nearest = np.abs(at[None, :] - times[:, None]).argmin(1)
+    taken = {int(k) for k, t in zip(nearest, times, strict=True) if abs(at[k] - t) <= slack}
+    return [event for k, event in enumerate(events) if k not in taken]
+
+
+def _not_arrived(event: CameraEvent, timed: Sequence[View]) -> MissingPicture | None:
+    """The picture of an event, seen as by the vehicle's camera at the nearest picture; None without a place."""
+    if event.position is None:
+        return None
+    times = np.array([v.time_s for v in timed], float)
+    near = timed[int(np.abs(times - event.time_s).argmin())]
+    before = max(0, int(np.searchsorted(times, event.time_s)) - 1)
+    place = np.array([*event.position[:2], near.position[2]])
+    view = near.moved_to(place, f"event {event.number}", event.time_s)
+    return MissingPicture(view, timed[before].image, Cause.NOT_ARRIVED, _SURE)

@@ -1,0 +1,55 @@
+"""Camera events against pictures: what has not arrived, what was not triggered, and events that say nothing."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
+from orthoswarm.coverage.missing_pictures import Cause
+from orthoswarm.coverage.view import View
+from tests.kit.flown_area import FlownArea
+
+
+def _views() -> list[View]:
+    views = [View.of_frame(p) for p in FlownArea(vehicles=1).placed()]
+    return [v for v in views if v.vehicle == views[0].vehicle]
+
+
+def _events(views: list[View], keep: Callable[[int], bool] = lambda k: True, later_s: float = 0.0) -> list[CameraEvent]:
+    return [
+        CameraEvent(v.vehicle, 100 + k, (v.time_s or 0.0) + later_s, v.position) for k, v in enumerate(views) if keep(k)
+    ]
+
+
+def test_events_without_a_picture_have_not_arrived_and_are_named_by_number() -> None:
+    views = _views()
+    gone = range(30, 36)
+    found = missing_by_events([v for k, v in enumerate(views) if k not in gone], _events(views))
+    assert [m.view.image for m in found.pictures] == [f"event {100 + k}" for k in gone]
+    assert {m.cause for m in found.pictures} == {Cause.NOT_ARRIVED} and not found.warnings
+    assert np.allclose([m.view.position for m in found.pictures], [views[k].position for k in gone], atol=1.0)
+
+
+def test_pictures_behind_a_dead_link_are_known_by_their_events_alone() -> None:
+    views = _views()
+    found = missing_by_events(views[:40], _events(views))  # no picture follows, so there is no hole
+    assert len(found.pictures) == len(views) - 40
+
+
+def test_a_hole_without_events_was_not_triggered_whatever_the_numbers_of_the_files_say() -> None:
+    views = _views()
+    there = [v for k, v in enumerate(views) if k not in range(5, 9)]  # the files' numbers leave a hole
+    found = missing_by_events(there, _events(views, lambda k: k not in range(5, 9)))
+    assert {m.cause for m in found.pictures} == {Cause.NOT_TRIGGERED} and len(found.pictures) == 4
+    assert min(m.confidence for m in found.pictures) >= 0.9
+
+
+def test_events_that_are_a_little_late_still_belong_to_their_pictures() -> None:
+    views = _views()
+    assert missing_by_events(views, _events(views, later_s=0.3)).pictures == []
+
+
+def test_events_of_another_time_are_not_used_and_that_is_said() -> None:
+    views = _views()
+    found = missing_by_events(views, _events(views, later_s=86_400.0))
+    assert found.pictures == [] and "not at the times" in found.warnings[0]

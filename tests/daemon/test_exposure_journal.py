@@ -1,0 +1,48 @@
+"""Camera events from vehicles' links in the journal: once each, with the time of the exposure, over a restart."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.links.mavlink import dialect
+from orthoswarm.model.geo import LocalGrid
+
+GRID = LocalGrid(32632)
+PLACE = np.array([600_100.0, 5_300_200.0])
+
+
+def _feedback(number: int, time_s: float) -> Any:
+    lat, lon = GRID.to_geographic(PLACE)
+    return dialect.MAVLink_camera_feedback_message(
+        int(time_s * 1e6), 1, 0, number, round(lat * 1e7), round(lon * 1e7), 480.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0
+    )
+
+
+def _captured(number: int, result: int = 1, time_s: float = 0.0) -> Any:
+    return dialect.MAVLink_camera_image_captured_message(
+        1000 * number, int(time_s * 1e6), 1, 0, 0, 0, 0, [1.0, 0.0, 0.0, 0.0], number, result, b""
+    )
+
+
+def test_events_are_kept_once_each_and_survive_a_restart(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.db")
+    kept = ExposureJournal(journal, lambda system: f"v{system}")
+    first, second = SimpleNamespace(system=1), SimpleNamespace(system=2)
+    for number in (1, 2, 2, 3):
+        kept.message(first, _feedback(number, 1.78e9 + number), 1.78e9 + number + 0.4)  # type: ignore[arg-type]
+        kept.message(first, _captured(number), 1.78e9 + number + 0.5)  # type: ignore[arg-type]
+    kept.message(second, _captured(7), 1.78e9 + 0.5)  # type: ignore[arg-type]
+    kept.message(second, _captured(8, result=0), 1.78e9 + 1.5)  # type: ignore[arg-type]
+    assert kept.write() and not kept.write()
+    journal.close()
+    journal = Journal(tmp_path / "journal.db")
+    events = ExposureJournal(journal, lambda system: f"v{system}").events(GRID)
+    journal.close()
+    assert [(e.vehicle, e.number, e.time_s) for e in events] == [
+        ("v1", 1, 1.78e9 + 1), ("v1", 2, 1.78e9 + 2), ("v1", 3, 1.78e9 + 3), ("v2", 7, 1.78e9 + 0.5),
+    ]  # fmt: skip
+    assert np.allclose(events[0].position[:2], PLACE, atol=0.1) and events[3].position is None  # type: ignore[index]
