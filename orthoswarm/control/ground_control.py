@@ -73,7 +73,6 @@ def place_on_control(
     Raises:
         InputError: a point's pixel lies outside its photo.
     """
-    config = active().control
     placed = [p for s in refinement.fine for p in s.placed]
     terrain = refinement.terrain or Terrain.flat()
     fits: dict[bool, ControlFit] = {}
@@ -86,8 +85,7 @@ def place_on_control(
             observations += on_basemap(points, grid, map_gsd_m)
         if observations:
             nadirs = np.array([p.camera.nadir for p in own])
-            border = config.map_border_m if on_map else config.receivers_border_m
-            fits[on_map] = fit_similarity(observations, nadirs, border)
+            fits[on_map] = fit_similarity(observations, nadirs, active().control.border_m)
     result = GroundControl(fits.get(True), fits.get(False), _warnings(fits, placed))
     if not fits:
         return refinement, result
