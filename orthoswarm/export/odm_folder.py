@@ -50,7 +50,7 @@ def write_odm(
                 gone.append(str(row["image"]))
             else:
                 name = names[str(row["image"])]
-                _link(file, part / "images" / name)
+                link_file(file, part / "images" / name)
                 lines.append(_line(name, row))
             if progress is not None:
                 progress(done, len(placed))
@@ -91,7 +91,7 @@ def unique_names(images: Iterable[str]) -> dict[str, str]:
     return out
 
 
-def _link(file: Path, target: Path) -> None:
+def link_file(file: Path, target: Path) -> None:
     """The same file under another name, without a copy where the file system can."""
     try:
         os.link(file, target)

@@ -31,7 +31,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
     """The line of frames.jsonl of a placed frame.
 
     `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
-    `ground_z_m`; `camera` says where the camera was and how it looked (yaw from true north), for other programs.
+    `ground_z_m`; `camera` says where the camera was, how it looked (yaw from true north) and through which lens (focal
+    length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for other programs.
     """
     frame, camera = placed.frame, placed.camera
     lens = camera.lens
@@ -65,6 +66,8 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
     yaw, pitch, roll = angles_from_rotation(camera.rotation)
     lat, lon = (float(v) for v in grid.to_geographic(camera.position[:2]))
     true = math.degrees(float(yaw + grid.convergence_rad(lat, lon)))
+    lens = camera.lens
+    terms = {name: getattr(lens, name) for name in ("k1", "k2", "k3", "cx", "cy")}
     return {
         "lat_deg": lat,
         "lon_deg": lon,
@@ -72,6 +75,8 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
         "yaw_deg": wrap_deg(true),
         "pitch_deg": math.degrees(float(pitch)),
         "roll_deg": math.degrees(float(roll)),
+        "focal_px": lens.focal_px,
+        **{name: value for name, value in terms.items() if value},
     }
 
 

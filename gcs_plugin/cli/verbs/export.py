@@ -6,7 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-FORMATS = ("mbtiles", "kmz", "gpkg", "odm", "cog", "stac", "pmtiles", "pdf", "places", "tak", "pack")
+FORMATS = (
+    "mbtiles",
+    "kmz",
+    "gpkg",
+    "odm",
+    "colmap",
+    "opensfm",
+    "cog",
+    "stac",
+    "pmtiles",
+    "pdf",
+    "places",
+    "tak",
+    "pack",
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -16,6 +30,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "kmz      Google Earth, ATAK and other globes\n"
         "gpkg     footprints of the pictures as polygons\n"
         "odm      pictures and refined positions for OpenDroneMap\n"
+        "colmap   refined cameras as a COLMAP model, to densify from\n"
+        "opensfm  refined cameras as an OpenSfM reconstruction, to densify from\n"
         "cog      the orthoimage in another coordinate system or as a small JPEG\n"
         "stac     a STAC item beside the orthoimage, for catalogues\n"
         "pmtiles  web map tiles in one file for web servers\n"
@@ -116,10 +132,13 @@ def _gpkg(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) ->
     return path
 
 
-def _odm(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+def _cameras(kind: str, args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
+    """A folder of another program with the refined cameras."""
     import json
 
+    from orthoswarm.export.colmap_folder import write_colmap
     from orthoswarm.export.odm_folder import write_odm
+    from orthoswarm.export.opensfm_folder import write_opensfm
     from orthoswarm.export.product_files import read_frames
     from orthoswarm.model.errors import InputError
 
@@ -133,10 +152,11 @@ def _odm(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> 
         path = root / row["image"] if root else None
         return path if path is not None and path.is_file() else None
 
-    gone = write_odm(list(read_frames(lines)), find, dest / "odm", progress=tell)
+    write = {"odm": write_odm, "colmap": write_colmap, "opensfm": write_opensfm}[kind]
+    gone = write(list(read_frames(lines)), find, dest / kind, progress=tell)
     if gone:
         notes.append(f"{len(gone)} pictures are not where they were and were left out, the first is {gone[0]}")
-    return dest / "odm"
+    return dest / kind
 
 
 def _cog(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
@@ -167,7 +187,9 @@ _WRITERS: dict[str, Callable[[argparse.Namespace, Path, Tell, list[str]], Path]]
     "mbtiles": _mbtiles,
     "kmz": _kmz,
     "gpkg": _gpkg,
-    "odm": _odm,
+    "odm": partial(_cameras, "odm"),
+    "colmap": partial(_cameras, "colmap"),
+    "opensfm": partial(_cameras, "opensfm"),
     "cog": _cog,
     **{name: partial(_form, name) for name in ("stac", "pmtiles", "pdf", "places", "tak", "pack")},
 }

@@ -1,0 +1,88 @@
+"""A COLMAP model of the refined cameras: text files and the pictures, to be densified from (`image_undistorter`).
+
+World axes are east, north, up in metres from `origin.txt`, a corner of the map's grid. COLMAP's camera axes are ours (x
+right, y down, z forward); its pixel (0, 0) is the upper left CORNER of the upper left pixel, ours its centre.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
+from orthoswarm.model.camera import Lens
+
+Array = NDArray[np.float64]
+_ORIGIN_STEP_M = 100.0
+
+
+def write_colmap(
+    rows: Sequence[Mapping[str, Any]],
+    find: Callable[[Mapping[str, Any]], Path | None],
+    folder: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """Write `sparse/0/{cameras,images,points3D}.txt`, `origin.txt` and `images/`.
+
+    Args:
+        rows: lines of frames.jsonl.
+        find: from a row to its picture file, None where it is gone.
+        folder: appears when it is complete; an existing one is replaced.
+        progress: called with pictures done and pictures in all.
+
+    Returns:
+        Images whose files are gone: they are in the model, but not in `images`.
+
+    Raises:
+        InputError: if no picture was placed.
+        OrthoSwarmError: if the disk is full.
+    """
+    pictures = oriented_pictures(rows)
+    positions = np.array([p.camera.position for p in pictures])
+    origin = np.floor(positions[:, :2].min(0) / _ORIGIN_STEP_M) * _ORIGIN_STEP_M
+    numbers = by_lens(pictures)
+    with written_whole(folder) as part:
+        model = part / "sparse" / "0"
+        model.mkdir(parents=True)
+        cameras = [f"{number} {_model(lens)}" for lens, number in numbers.items()]
+        _write(model / "cameras.txt", ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS", *cameras])
+        images = [_image(i, p, numbers[p.camera.lens], origin) for i, p in enumerate(pictures, 1)]
+        _write(
+            model / "images.txt",
+            ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME and a line of its points (none)", *images],
+        )
+        _write(model / "points3D.txt", ["# no points"])
+        _write(part / "origin.txt", [f"EPSG:{pictures[0].row['epsg']} {origin[0]:.1f} {origin[1]:.1f} 0"])
+        return link_pictures(pictures, find, part / "images", progress)
+
+
+def _model(lens: Lens) -> str:
+    """COLMAP's model of a lens with its parameters: the plainest that holds all its terms."""
+    u, v = (c + 0.5 for c in lens.principal_point)
+    f = lens.focal_px
+    if lens.is_pinhole:
+        name, values = "SIMPLE_PINHOLE", [f, u, v]
+    elif lens.k3 == 0.0:
+        name, values = "RADIAL", [f, u, v, lens.k1, lens.k2]
+    else:
+        name, values = "FULL_OPENCV", [f, f, u, v, lens.k1, lens.k2, 0.0, 0.0, lens.k3, 0.0, 0.0, 0.0]
+    return f"{name} {lens.width} {lens.height} " + " ".join(repr(float(v)) for v in values)
+
+
+def _image(number: int, picture: OrientedPicture, camera: int, origin: Array) -> str:
+    """Two lines of images.txt: the pose from world to camera, and no points."""
+    from scipy.spatial.transform import Rotation
+
+    to_camera = picture.camera.rotation.T
+    x, y, z, w = Rotation.from_matrix(to_camera).as_quat()
+    centre = picture.camera.position - np.append(origin, 0.0)
+    values = [w, x, y, z, *(-to_camera @ centre)]
+    return f"{number} " + " ".join(repr(float(v)) for v in values) + f" {camera} {picture.name}\n"
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

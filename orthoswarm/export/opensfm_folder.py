@@ -1,0 +1,120 @@
+"""An OpenSfM data set whose reconstruction is the refined cameras, to be densified from.
+
+OpenSfM's world is a plane tangent to the ellipsoid at `reference_lla`: east, north, up in metres. Pixels are counted
+from the picture's middle in units of the longer side; its camera axes are ours.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
+from orthoswarm.model.camera import Lens
+from orthoswarm.model.geo import LocalGrid
+
+Array = NDArray[np.float64]
+
+
+def write_opensfm(
+    rows: Sequence[Mapping[str, Any]],
+    find: Callable[[Mapping[str, Any]], Path | None],
+    folder: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """Write `reconstruction.json`, `camera_models.json`, `reference_lla.json` and `images/`.
+
+    Args:
+        rows: lines of frames.jsonl.
+        find: from a row to its picture file, None where it is gone.
+        folder: appears when it is complete; an existing one is replaced.
+        progress: called with pictures done and pictures in all.
+
+    Returns:
+        Images whose files are gone: they are in the reconstruction, but not in `images`.
+
+    Raises:
+        InputError: if no picture was placed.
+        OrthoSwarmError: if the disk is full.
+    """
+    pictures = oriented_pictures(rows)
+    lat, lon = (float(np.mean([getattr(p, name) for p in pictures])) for name in ("lat_deg", "lon_deg"))
+    reference = {"latitude": lat, "longitude": lon, "altitude": 0.0}
+    names = {lens: f"lens {number}" for lens, number in by_lens(pictures).items()}
+    cameras = {name: _camera(lens) for lens, name in names.items()}
+    centres, rotations = _topocentric(pictures, lat, lon)
+    shots = {
+        p.name: _shot(p, names[p.camera.lens], centre, rotation)
+        for p, centre, rotation in zip(pictures, centres, rotations)
+    }
+    reconstruction = {"cameras": cameras, "shots": shots, "points": {}, "reference_lla": reference}
+    with written_whole(folder) as part:
+        part.mkdir(parents=True)
+        for name, document in (
+            ("reconstruction.json", [reconstruction]),
+            ("camera_models.json", cameras),
+            ("reference_lla.json", reference),
+        ):
+            (part / name).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        return link_pictures(pictures, find, part / "images", progress)
+
+
+def _camera(lens: Lens) -> dict[str, Any]:
+    """OpenSfM's "brown" camera."""
+    size = float(max(lens.width, lens.height))
+    return {
+        "projection_type": "brown", "width": lens.width, "height": lens.height,
+        "focal_x": lens.focal_px / size, "focal_y": lens.focal_px / size, "c_x": lens.cx / size, "c_y": lens.cy / size,
+        "k1": lens.k1, "k2": lens.k2, "p1": 0.0, "p2": 0.0, "k3": lens.k3,
+    }  # fmt: skip
+
+
+def _topocentric(pictures: Sequence[OrientedPicture], lat: float, lon: float) -> tuple[Array, Array]:
+    """Centres (N, 3) and camera-to-world rotations (N, 3, 3) in the plane tangent at a reference on the ellipsoid."""
+    from pyproj import Transformer
+
+    plane_at = f"+proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r} +h_0=0"
+    to_plane = Transformer.from_pipeline(f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step {plane_at}")
+    lats, lons = np.array([p.lat_deg for p in pictures]), np.array([p.lon_deg for p in pictures])
+    altitude = np.array([p.altitude_m for p in pictures])
+    centres = np.stack(to_plane.transform(np.radians(lons), np.radians(lats), altitude, radians=True), 1)
+    grids = {int(p.row["epsg"]): LocalGrid(int(p.row["epsg"])) for p in pictures}
+    rotations = np.empty((len(pictures), 3, 3))
+    for i, p in enumerate(pictures):
+        convergence = float(grids[int(p.row["epsg"])].convergence_rad(p.lat_deg, p.lon_deg))
+        local = _east_north_up(np.radians(p.lat_deg), np.radians(p.lon_deg))
+        plane = _east_north_up(np.radians(lat), np.radians(lon))
+        rotations[i] = plane @ local.T @ _about_up(-convergence) @ p.camera.rotation
+    return np.asarray(centres), rotations
+
+
+def _east_north_up(lat: float, lon: float) -> Array:
+    """Rows: east, north and up at a place, in earth-centred axes."""
+    sl, cl, so, co = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
+
+
+def _about_up(angle: float) -> Array:
+    """Rotation of east, north, up counter-clockwise about up."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _shot(picture: OrientedPicture, camera: str, centre: Array, rotation: Array) -> dict[str, Any]:
+    """A shot: axis and angle from world to camera, and the world's origin in camera axes."""
+    from scipy.spatial.transform import Rotation
+
+    to_camera = rotation.T
+    return {
+        "rotation": Rotation.from_matrix(to_camera).as_rotvec().tolist(),
+        "translation": (-to_camera @ centre).tolist(),
+        "camera": camera,
+        "orientation": 1,
+        "gps_position": centre.tolist(),
+        "gps_dop": max(float(picture.row["sigma_m"]), 0.01),
+    }
