@@ -23,6 +23,7 @@ from telemetry.live.live_poses import LivePoses
 from telemetry.samples.rotations import euler_ned
 
 _WAIT_S: Final = 0.2
+_MOST_FAILURES: Final = 100
 _EXTENDED: Final = 0x80000000
 _FRAME_BYTES: Final = {"CAN_FRAME": 8, "CANFD_FRAME": 64}
 # Of an extended identifier: the message's type, and the bit that tells messages from services.
@@ -78,14 +79,23 @@ class CanSource:
         }
 
     def run(self, url: str, stop: threading.Event) -> None:
-        """Read a bus until told to stop.
+        """Read a bus until told to stop; packets that are no frames (strangers on a multicast group) are skipped.
 
         Raises:
             InputError: it cannot be opened. OSError, can.CanError: it broke off.
         """
+        from can import CanOperationError
+
+        failures = 0
         with open_bus(url) as bus:
             while not stop.is_set():
-                self.read(bus, _WAIT_S)
+                try:
+                    self.read(bus, _WAIT_S)
+                    failures = 0
+                except CanOperationError:
+                    failures += 1
+                    if failures > _MOST_FAILURES:
+                        raise
 
     def read(self, bus: Any, wait_s: float = 0.0) -> bool:
         """Take one frame of a python-can bus, waiting for it at most so long; returns whether one came."""

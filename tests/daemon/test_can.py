@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.multirotor import Airframe
@@ -14,6 +15,7 @@ from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
+from telemetry.live.live_poses import LivePoses
 from tests.daemon.test_daemon_flight import fly, square
 from tests.kit.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
 from tests.kit.mosaic_scene import EAST, NORTH
@@ -186,6 +188,17 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
     assert vehicle.asked == (1000, 1044, 1060, 1063)
     assert rows[0]["can"]["bus"] == "mavlink"
     assert rows[0]["poses"]["position"] == "DroneCAN node 42"
+
+
+def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
+    said = []
+    reader = CanReader("v1", "socketcan:nothing0", LivePoses("v1"), said.append, None, None)
+    reader.start()
+    time.sleep(5.0)  # more than two attempts
+    state = reader.document()
+    reader.close()
+    assert len(said) == 1
+    assert "cannot be opened" in state["state"]
 
 
 def test_a_wrong_name_of_a_bus_is_refused(tmp_path):

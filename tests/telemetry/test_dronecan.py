@@ -1,5 +1,6 @@
 """DroneCAN over python-can and through MAVLink CAN_FRAME: the best source is used, loss and noise are borne."""
 
+import socket
 import threading
 import time
 
@@ -69,7 +70,7 @@ def test_fixes_attitude_and_gimbal_come_from_a_bus(wire):
     assert found.origin == dict.fromkeys(("position", "flight_yaw", "angles"), "DroneCAN node 42")
 
 
-def test_fixes_come_over_udp_multicast():
+def test_fixes_come_over_udp_multicast_between_foreign_packets():
     pytest.importorskip("msgpack")
     poses = LivePoses("uav1")
     number = 0
@@ -83,12 +84,16 @@ def test_fixes_come_over_udp_multicast():
     end = time.monotonic() + 20.0
     while source.received < 3 and time.monotonic() < end:
         node.send(out, fix_at(number))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            stranger.sendto(b"no CAN frame", ("239.74.163.2", 43113))
         time.sleep(0.02)
         number += 1
     stop.set()
     thread.join(5.0)
     out.shutdown()
     assert source.received >= 3
+    assert number < 100
     assert 47.0 <= poses.latest.lat_deg < 47.01
 
 

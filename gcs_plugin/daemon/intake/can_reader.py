@@ -76,7 +76,7 @@ class CanReader:
         from telemetry.live.dronecan_bus import CanSource
 
         self.vehicle = vehicle
-        self._bus, self._tell, self._state = bus, tell, "waiting"
+        self._bus, self._tell, self._state, self._said = bus, tell, "waiting", ""
         self._source = CanSource(poses)
         self._stop = threading.Event()
         self._heard, self._count = float("-inf"), 0
@@ -114,17 +114,18 @@ class CanReader:
 
         while not self._stop.is_set():
             try:
-                self._say("waiting")
+                self._state = "waiting"
                 self._source.run(self._bus, self._stop)
                 return
             except (OrthoSwarmError, OSError, can.CanError) as error:
-                self._say(str(error))
+                self._fail(str(error))
             self._stop.wait(_AGAIN_S)
 
-    def _say(self, state: str) -> None:
-        if state != self._state and state != "waiting":
-            self._tell(f"the CAN bus of {self.vehicle}: {state}")
-        self._state = state
+    def _fail(self, reason: str) -> None:
+        """Say once what is wrong; it is tried again and again."""
+        if reason != self._said:
+            self._tell(f"the CAN bus of {self.vehicle}: {reason}")
+        self._state = self._said = reason
 
 
 class _Tunnel:
