@@ -6,3 +6,92 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True)
 class StrategyConfig:
     """What runs when, and when a result is doubted."""
+
+    # Without a map
+    schedule: tuple[float, ...] = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
+    """Robust scales of the steps without a map, from a start that may be far off; squared, of normalised residuals
+    (chosen; not measured)."""
+    near_schedule: tuple[float, ...] = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
+    """The same from a start that is known to be near: wrong tracks, far off, weigh less from the first step on
+    (chosen)."""
+    flow_pairs: int = 6
+    """So many pairs of pictures must have told the focal length by their flow before an adjustment is held against
+    it (chosen; not measured)."""
+    runaway_share: float = 0.15
+    """A focal length that leaves what flow told by this share is another minimum and not believed, unless flow
+    itself is so unsure (next field; chosen)."""
+    runaway_sigmas: float = 5.0
+    """... and by so many of its sigmas (chosen; not measured)."""
+    narrowest_fov_deg: float = 33.0
+    """Horizontal fields of view, degrees, to which recorded heights are believed, a little wider than those that
+    flow is believed to show (chosen)."""
+    widest_fov_deg: float = 137.0
+    """The same at the other end."""
+
+    # Recorded heights that the pictures contradict
+    rest_steps: int = 3
+    """Steps after which a contradiction must still be there (chosen; not measured)."""
+    free_steps: int = 6
+    """Steps of a round without the recorded heights (chosen; not measured)."""
+    free_rounds: int = 4
+    """So many rounds at most (chosen; not measured)."""
+    at_rest_share: float = 0.03
+    """A focal length that still moves by this share in three steps is not at rest (chosen; not measured)."""
+    agreeing_share: float = 0.08
+    """Pictures that, set free, come to rest within this share of the recorded height do not contradict it
+    (chosen)."""
+
+    # On the map
+    map_fov_sigmas: float = 6.0
+    """A place on the map that moves the field of view by more sigmas than this is not believed (chosen; not
+    measured)."""
+    map_fov_deg: float = 4.0
+    """... and by more than this, degrees (chosen; not measured)."""
+    coherent_sigmas: float = 2.0
+    """Ties that agree on an offset of so many sigmas beside a picture show an error that the adjustment does not
+    know (chosen; not measured)."""
+
+    # What the field of view's sigma takes in
+    takeoff_level_sigma_m: float = 2.0
+    """How well the takeoff spot is known to lie at the level of the ground, metres (chosen; not measured)."""
+    no_height_share: float = 0.03
+    """Sigma of the focal length of followed pictures without a height, a share: relief and tilt tell it (15
+    flights: 2.5 % rms)."""
+    one_way_fov_sigma_deg: float = 5.0
+    """The same of photos on one straight way, degrees: tilt, height and lens stand for each other (11 such legs of
+    a suburb: 5.6 rms)."""
+    decentred_share: float = 0.02
+    """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share
+    (measured: 1.6 %)."""
+
+    # A given height model
+    dem_differs_m: float = 0.2
+    """What is left over a given height model is said from here on, metres (chosen)."""
+    dem_covers_share: float = 0.97
+    """A height model that covers more than this of the area covers it (chosen)."""
+
+    # In flight
+    followed_fewest: int = 10
+    """Fewer pictures are not followed from one to the next but matched in pairs (chosen; not measured)."""
+    sparse_fewest: int = 4
+    """Fewer photos are not placed in flight (chosen; not measured)."""
+    sparse_most: int = 60
+    """More photos that must be matched in pairs wait for the refinement: they cost fifty times as much as those
+    that can be followed."""
+    held_drift_m: float = 3.0
+    """Sigma of a receiver's drift over one straight run, metres: tilt and drift stand for each other there. Without
+    this hold single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""
+    held_drift_bend_m: float = 0.3
+    """The same for the second difference of the drift's knots, metres (measured together)."""
+    held_lag_s: float = 0.2
+    """The same for the delay of positions behind the shutter, seconds (measured together)."""
+    one_way_sigma_share: float = 0.025
+    """Error of a leg's coarse placement on the map as a share of the height (simulated flights: 2 to 4 m)."""
+    many_ways_sigma_share: float = 0.014
+    """The same from two legs in opposite directions on (simulated flights: 0.5 to 2 m)."""
+    odd_focal_change: float = 0.2
+    """A placement whose focal length left its start by more than this, as a logarithm, is not shown (chosen)."""
+    odd_height_change: float = 0.2
+    """The same for the height (chosen; not measured)."""
+    odd_turn_deg: float = 12.0
+    """The same for the attitude where tilt was recorded, degrees (chosen; not measured)."""

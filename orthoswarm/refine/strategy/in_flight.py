@@ -35,15 +35,6 @@ __all__ = ["coarse_of", "local_origin", "place_in_flight"]
 
 Array = NDArray[np.float64]
 
-FEWEST = 10
-"""Fewer pictures tell too little."""
-FEWEST_SPARSE, MOST_SPARSE = 4, 60
-"""Photos that must be matched in pairs cost fifty times as much as those that can be followed."""
-HELD_DRIFT_M, HELD_BEND_M, HELD_LAG_S = 3.0, 0.3, 0.2
-ONE_WAY_SIGMA, MANY_WAYS_SIGMA = 0.025, 0.014
-"""Error of a coarse placement on the map as a share of the height, measured (see above)."""
-_FOV_CHANGE, _HEIGHT_CHANGE, _TURN_RAD = 0.2, 0.2, float(np.radians(12.0))
-
 
 def place_in_flight(
     frames: Sequence[Frame],
@@ -70,7 +61,8 @@ def place_in_flight(
     if frames and hovering_vehicles(recorded_cameras(frames, LocalGrid(epsg)).placed):
         raise OrthoSwarmError("all its pictures were taken at one spot; they stay as they were recorded")
     units = split_units({frames[0].vehicle: frames} if frames else {})
-    found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= FEWEST_SPARSE]
+    fewest = active().strategy.sparse_fewest
+    found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= fewest]
     if not found:
         raise OrthoSwarmError(f"{len(frames)} pictures are too few to be laid side by side; more will come")
     return replace(merge_units(found)[0], state=None)
@@ -99,9 +91,10 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     grid, watch = LocalGrid(epsg), Stopwatch()
-    flight = open_flight(frames, grid, origin, read_frame, start) if len(frames) >= FEWEST else None
+    enough = len(frames) >= active().strategy.followed_fewest
+    flight = open_flight(frames, grid, origin, read_frame, start) if enough else None
     if flight is None:
-        if len(frames) > MOST_SPARSE:
+        if len(frames) > active().strategy.sparse_most:
             raise OrthoSwarmError("its pictures cannot be followed from one to the next; they wait for the refinement")
         flight = open_sparse_flight(frames, grid, origin, read_frame)
         one_way = leads_one_way(flight.records.position, flight.leg)
@@ -119,7 +112,8 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         flight.pictures.drop()
     if fit is not None:
         height = float(np.median(flight.cameras().position[:, 2]))
-        share = ONE_WAY_SIGMA if one_way else MANY_WAYS_SIGMA
+        config = active().strategy
+        share = config.one_way_sigma_share if one_way else config.many_ways_sigma_share
         state = _shifted(state, fit.correction)
         state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(fit)), state.coarse_sigma_m)
     legs = _legs(state, fit)
@@ -127,11 +121,12 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
 
 
 def _hold_drift(flight: Flight) -> None:
-    priors = flight.adjustment.priors
+    """Hold the receiver's drift, which a single straight run cannot tell from the camera's tilt."""
+    held, priors = active().strategy, flight.adjustment.priors
     models = tuple(
         replace(
-            m, drift_sigma=min(m.drift_sigma, HELD_DRIFT_M), drift_bend=HELD_BEND_M,
-            lag_sigma=min(m.lag_sigma, HELD_LAG_S),
+            m, drift_sigma=min(m.drift_sigma, held.held_drift_m), drift_bend=held.held_drift_bend_m,
+            lag_sigma=min(m.lag_sigma, held.held_lag_s),
         )
         for m in priors.models
     )  # fmt: skip
@@ -140,7 +135,7 @@ def _hold_drift(flight: Flight) -> None:
 
 def _check(flight: Flight) -> None:
     """Refuse what a few pictures can make of themselves but no camera can be."""
-    cameras, records = flight.cameras(), flight.records
+    config, cameras, records = active().strategy, flight.cameras(), flight.records
     if float(np.median(observations_per_camera(flight))) < active().flight.held_observations:
         raise OrthoSwarmError("its pictures show too little that one can be laid beside the other")
     if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
@@ -150,10 +145,11 @@ def _check(flight: Flight) -> None:
     begun = flight.calibration.height_m
     axes = np.einsum("ni,ni->n", cameras.rotation[:, :, 2], records.rotation()[:, :, 2])
     turned = np.arccos(np.clip(axes, -1.0, 1.0))
-    tilt_off = bool(records.has_tilt.any()) and float(np.median(turned[records.has_tilt])) > _TURN_RAD
+    tilted = records.has_tilt
+    tilt_off = bool(tilted.any()) and float(np.median(turned[tilted])) > np.radians(config.odd_turn_deg)
     if (
-        abs(np.log(focal / flight.calibration.focal_px)) > _FOV_CHANGE
-        or abs(np.log(max(height, 0.1) / begun)) > _HEIGHT_CHANGE
+        abs(np.log(focal / flight.calibration.focal_px)) > config.odd_focal_change
+        or abs(np.log(max(height, 0.1) / begun)) > config.odd_height_change
         or tilt_off
     ):
         raise OrthoSwarmError("its pictures do not hold together yet; they stay as they were recorded")

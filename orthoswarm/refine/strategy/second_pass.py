@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.covariance import common_map_sigma, frame_sigmas, systematic_tie_offset
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
@@ -19,9 +20,6 @@ from orthoswarm.refine.strategy.vehicle_passes import level_sigma_deg
 from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
 
 Array = NDArray[np.float64]
-
-COHERENT = 2.0
-"""Ties that agree on so many sigmas beside a picture tell of an error that the adjustment does not know."""
 
 
 def second_pass(
@@ -82,7 +80,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
     if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
         off = systematic_tie_offset(flight.leg, state.matches.camera, adj.tie_residual)
-        off[off < COHERENT * state.sigma_m] = 0.0
+        off[off < active().strategy.coherent_sigmas * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)
 
 

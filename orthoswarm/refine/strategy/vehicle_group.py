@@ -21,11 +21,6 @@ from orthoswarm.refine.surface.vehicle_ground import ground_points
 
 Array = NDArray[np.float64]
 
-DIFFERS_M = 0.2
-"""What is left over a height model is worth a word from here on."""
-WHOLE = 0.97
-"""A height model that covers more than this of the area covers it."""
-
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
     """The other vehicles whose paths come within sight of this one's."""
@@ -131,12 +126,12 @@ def _doubts(given: LocalDem, unused: bool, off_m: float, states: Sequence[Vehicl
         who = ", ".join(sorted({s.vehicle for s in doubted}))
         off = max(s.surface.contradicted_m for s in doubted)
         out.append(f"{name} contradicts the pictures of {who} by {off:.1f} m in the median; check it")
-    elif off_m > DIFFERS_M:
+    elif off_m > active().strategy.dem_differs_m:
         out.append(
             f"the ground differs from {name} by {off_m:.1f} m in the median: it is coarse, old or displaced; the "
             "pictures are followed where they differ from it"
         )
-    if given.model.cover < WHOLE:
+    if given.model.cover < active().strategy.dem_covers_share:
         share = given.model.cover
         out.append(f"{name} has heights on {share:.0%} of the area; elsewhere the ground is found from the pictures")
     return out

@@ -15,7 +15,7 @@ from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
-from orthoswarm.refine.bundle.adjustment import MapTies
+from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import frame_sigmas
 from orthoswarm.refine.bundle.height_consistency import contradicted_heights, height_disagreement, release_heights
@@ -37,31 +37,6 @@ from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 
 Array = NDArray[np.float64]
-
-
-TAKEOFF_LEVEL_M = 2.0
-"""How well the takeoff level is known to be the level of the ground, one sigma."""
-NO_HEIGHT_SHARE = 0.03
-"""Of the focal length of followed pictures without a height: relief and tilt tell it (15 flights: 2.5 % rms)."""
-ONE_WAY_FOV_SIGMA_DEG = 5.0
-"""Of photos on one straight way: tilt, height and lens stand for each other (11 such legs of a suburb: 5.6 rms)."""
-SCHEDULE = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
-"""Robust scales of the steps without a map, from far off; WARY is for a start that is known to be near."""
-WARY = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
-FLOW_PAIRS = 6
-RUNAWAY, RUNAWAY_SIGMAS = 0.15, 5.0
-"""A focal length that leaves what the flow of so many pairs told by this share and so many sigmas is not believed."""
-FOV_SIGMAS, FOV_MOVES_DEG = 6.0, 4.0
-"""A place on the map that moves the field of view by more than this is not believed."""
-NARROWEST_RAD, WIDEST_RAD = float(np.radians(33.0)), float(np.radians(137.0))
-"""Fields of view to which recorded heights are believed, a little wider than those that flow is believed to show."""
-DECENTRED_SHARE = 0.02
-"""What tangential distortion, which is not modelled, does to the focal length of a strong lens (measured: 1.6 %)."""
-REST_STEPS, FREE_STEPS, FREE_ROUNDS = 3, 6, 4
-AT_REST = 0.03
-"""A focal length that still moves by this share in three steps is not at rest."""
-AGREES = 0.08
-"""Pictures that, set free, come to rest within this share of the recorded height do not contradict it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +100,8 @@ def followed(
         return None
     try:
         surface = relative(flight, options.ground(origin))
-        if not NARROWEST_RAD < fov_rad(float(flight.cameras().lens[0, F]), flight.pictures.size[0]) < WIDEST_RAD:
+        config = active().strategy
+        if not config.narrowest_fov_deg < field_of_view_deg(flight.adjustment, flight) < config.widest_fov_deg:
             return None  # the recorded height that is behind such a lens cannot be right
         if len(frames) < active().flight.few_photos and distorts_strongly(flight):
             return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
@@ -180,29 +156,35 @@ def from_flight(
 def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
     """The adjustment without a map, its ground fitted as soon as the points allow (surface: what is known of it)."""
     surface = surface or GroundModel()
-    begun = flight.adjustment.copy()
-    found = _relative(flight, surface, SCHEDULE)
+    begun, config = flight.adjustment.copy(), active().strategy
+    found = _relative(flight, surface, config.schedule)
     if ran_away(flight):
         # A few wrong tracks, far off, threw it out of the valley before it could tell that they are wrong.
         flight.adjustment = begun.copy()
-        found = _relative(flight, surface, WARY)
+        found = _relative(flight, surface, config.near_schedule)
     if ran_away(flight):
         flight.adjustment = begun.copy()
         p = flight.adjustment.priors
         sigma = p.lens_sigma.copy()
         sigma[:, 0] = flight.calibration.focal_sigma
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
-        found = _relative(flight, surface, WARY)
+        found = _relative(flight, surface, config.near_schedule)
     return _without_wrong_heights(flight, found)
 
 
+def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:
+    """Horizontal field of view of a flight's first lens, degrees."""
+    return float(np.degrees(fov_rad(float(adjustment.cameras.lens[0, F]), flight.pictures.size[0])))
+
+
 def ran_away(flight: Flight) -> bool:
-    """True if the focal length is far from what the flow of the pictures told: another minimum was found."""
-    told = flight.calibration
-    if told.pairs < FLOW_PAIRS or not told.trusted_height or not np.isfinite(told.spread):
+    """True if the focal length is far from what the flow of the pictures shows: another minimum was found."""
+    flow = flight.calibration
+    config = active().strategy
+    if flow.pairs < config.flow_pairs or not flow.trusted_height or not np.isfinite(flow.spread):
         return False
-    away = abs(float(np.log(flight.adjustment.cameras.lens[0, F] / told.focal_px)))
-    return away > max(RUNAWAY, RUNAWAY_SIGMAS * told.focal_sigma)
+    away = abs(float(np.log(flight.adjustment.cameras.lens[0, F] / flow.focal_px)))
+    return away > max(config.runaway_share, config.runaway_sigmas * flow.focal_sigma)
 
 
 def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -> GroundModel:
@@ -227,21 +209,22 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     They must do so still when the adjustment is at rest, and it must come to rest without the heights, too: few
     pictures of a camera that is held level tell little of the focal length, and without heights run anywhere.
     """
+    config = active().strategy
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
-    surface, _ = _steps(flight, surface, REST_STEPS)
+    surface, _ = _steps(flight, surface, config.rest_steps)
     believed, calibration, was = flight.adjustment.copy(), flight.calibration, surface
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
-    for _ in range(FREE_ROUNDS):
-        surface, focal_px = _steps(flight, surface, FREE_STEPS)
-        at_rest = np.ptp(np.log(focal_px[-3:])) < AT_REST
+    for _ in range(config.free_rounds):
+        surface, focal_px = _steps(flight, surface, config.free_steps)
+        at_rest = np.ptp(np.log(focal_px[-3:])) < config.at_rest_share
         if at_rest:
             break
     said = float(np.median(flight.records.position[flight.records.has_height, 2]))
     seen = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
-    if not at_rest or abs(seen - said) < AGREES * said:
+    if not at_rest or abs(seen - said) < config.agreeing_share * said:
         flight.adjustment, flight.calibration = believed, calibration
         return was
     flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
@@ -307,15 +290,13 @@ def _onto_map(
     if found is None:
         return False
     settled = settle(flight, found.ground, found.matches, state.surface)
-    told, now = (
-        float(np.degrees(fov_rad(float(a.cameras.lens[0, F]), flight.pictures.size[0])))
-        for a in (before, flight.adjustment)
-    )
-    if abs(now - told) > max(FOV_SIGMAS * float(np.hypot(sigma, level_sigma_deg(flight, alone))), FOV_MOVES_DEG):
+    alone_deg, now_deg = (field_of_view_deg(a, flight) for a in (before, flight.adjustment))
+    config, known_deg = active().strategy, float(np.hypot(sigma, level_sigma_deg(flight, alone)))
+    if abs(now_deg - alone_deg) > max(config.map_fov_sigmas * known_deg, config.map_fov_deg):
         flight.adjustment = before
         flight.warnings.append(
-            f"on the map its field of view would be {now:.0f} degrees, by its own pictures it is {told:.0f}: the place "
-            "found on the map is not believed"
+            f"on the map its field of view would be {now_deg:.0f} degrees, by its own pictures it is {alone_deg:.0f}: "
+            "the place found on the map is not believed"
         )
         return True
     state.map_shift = found.fit.correction
@@ -338,17 +319,20 @@ def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     pictures. Photos without heights tell it a little, on one straight way not at all. A lens that was found together
     with other vehicles is held, and known as well as it was then; one that distorts strongly is not quite as modelled.
     """
+    config = active().strategy
     unknown = flight.sparse or not flight.records.has_height.any()
     if unknown and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
-        return ONE_WAY_FOV_SIGMA_DEG
+        return config.one_way_fov_sigma_deg
     cameras = flight.cameras()
     held = flight.focal_sigma
-    share = float(np.hypot(held, DECENTRED_SHARE if distorts_strongly(flight) else 0.0))
+    share = float(np.hypot(held, config.decentred_share if distorts_strongly(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
-        level = float(np.hypot(TAKEOFF_LEVEL_M, relief)) / max(float(np.median(cameras.position[:, 2])), 1.0)
+        level = float(np.hypot(config.takeoff_level_sigma_m, relief)) / max(
+            float(np.median(cameras.position[:, 2])), 1.0
+        )
         share = float(np.linalg.norm([share, level, height_disagreement(flight.adjustment)]))
     elif not flight.sparse:
-        share = float(np.hypot(share, NO_HEIGHT_SHARE))
+        share = float(np.hypot(share, config.no_height_share))
     half = 0.5 * fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
     return float(np.degrees(np.sin(2 * half))) * share

@@ -42,7 +42,7 @@ def fov_deg(flight):
 def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up):
     frames, _ = made_up
     flight = opened(frames)
-    vehicle_passes._relative(flight, Options().ground(ORIGIN), vehicle_passes.SCHEDULE)
+    vehicle_passes._relative(flight, Options().ground(ORIGIN), active().strategy.schedule)
     assert fov_deg(flight) > 90.0 and ran_away(flight)  # two wrong tracks of ninety were enough
     flight = opened(frames)
     relative(flight)
