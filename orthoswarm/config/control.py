@@ -11,9 +11,9 @@ class ControlConfig:
     """Sigma of a surveyed position, an axis, where its file states none, metres: a network receiver's (chosen)."""
     pointing_sigma_px: float = 1.0
     """Sigma of a point's place in a photo, in pixels; photos of a point count as independent (chosen)."""
-    height_sigma_m: float = 10.0
-    """Sigma of a point's height over the mapped ground below it, metres: holds a point that one photo shows, or photos
-    from nearly the same place; rays from several sides are not held by it (chosen)."""
+    height_sigma_m: float = 2.0
+    """Sigma of a point's height over the solved terrain below it, metres: holds a point that one photo shows, or photos
+    from nearly the same place; rays from several sides are hardly held by it (chosen)."""
     shift_sigma_m: float = 100.0
     """What is known of the shift before the control points: nothing, so that they decide it (chosen)."""
     border_m: float = 0.5

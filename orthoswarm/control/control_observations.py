@@ -78,8 +78,9 @@ def in_photos(
             continue
         rays = [_ray(p, pixel) for p, pixel in photos]
         level = float(np.median([terrain.height(p.camera.nadir) for p, _ in photos]))
-        found = intersection(rays, level, config.height_sigma_m)
-        found = intersection(rays, float(terrain.height(found)), config.height_sigma_m)
+        pixel_rad = config.pointing_sigma_px / float(np.median([p.camera.lens.focal_px for p, _ in photos]))
+        found = intersection(rays, level, config.height_sigma_m, pixel_rad)
+        found = intersection(rays, float(terrain.height(found)), config.height_sigma_m, pixel_rad)
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
         pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else config.receivers_local_sigma_m

@@ -17,7 +17,7 @@ from orthoswarm.control.control_observations import in_photos, on_basemap
 from orthoswarm.control.similarity import ControlFit, Similarity, fit_similarity
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
+from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
 
 Array = NDArray[np.float64]
 
@@ -98,12 +98,23 @@ def place_on_control(
 
     main = fits.get(True) or fits[False]
     scale = main.similarity.scale
-    fine = [
-        replace(s, placed=[moved(p) for p in s.placed], ground_z_m=level + scale * (s.ground_z_m - level))
-        for s in refinement.fine
-    ]
+
+    def solution(s: Solution) -> Solution:
+        own = [moved(p) for p in s.placed]
+        return replace(s, placed=own, legs=_restated(s.legs, own), ground_z_m=level + scale * (s.ground_z_m - level))
+
+    fine = [solution(s) for s in refinement.fine]
     ground = None if refinement.terrain is None else _moved_terrain(refinement.terrain, main.similarity, level)
     return replace(refinement, fine=fine, terrain=ground), result
+
+
+def _restated(legs: Sequence[Leg], placed: Sequence[PlacedFrame]) -> list[Leg]:
+    """Legs with the sigma that their photos have now."""
+    sigma = np.array([p.sigma_m for p in placed])
+    return [
+        replace(leg, sigma_m=float(np.median(sigma[leg.first : leg.last + 1]))) if leg.first < len(sigma) else leg
+        for leg in legs
+    ]
 
 
 def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:

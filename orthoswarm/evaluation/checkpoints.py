@@ -374,15 +374,24 @@ def photo_named(known: Mapping[str, Any], image: str) -> str | None:
     return hits[0] if hits else None
 
 
-def intersection(rays: Sequence[tuple[Array, Array]], ground_z_m: float, height_sigma_m: float = _RELIEF_M) -> Array:
+def intersection(
+    rays: Sequence[tuple[Array, Array]],
+    ground_z_m: float,
+    height_sigma_m: float = _RELIEF_M,
+    pixel_rad: float = 1e-3,
+) -> Array:
     """East and north (2,) of the point nearest to all rays; its height is held by the ground where they do not hold it.
 
     Every ray counts by its distance over the camera's range, so that a metre at 50 m height and two at 100 m are alike.
+
+    Args:
+        rays: camera position (3,) and unit direction (3,) of each. ground_z_m: level of the ground there, metres.
+        height_sigma_m: of the point's height over it. pixel_rad: sigma of a ray's direction, radians.
     """
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for position, direction in rays:
         distance = max(position[2] - ground_z_m, 1.0)
-        across = (np.eye(3) - np.outer(direction, direction)) * (1000.0 / distance) ** 2  # a pixel: about 1/1000
+        across = (np.eye(3) - np.outer(direction, direction)) / (pixel_rad * distance) ** 2
         normal += across
         right += across @ position
     normal[2, 2] += 1.0 / height_sigma_m**2

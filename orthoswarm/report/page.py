@@ -65,7 +65,7 @@ def write_page(
     placed: Sequence[PlacedFrame],
     rejected: Sequence[Rejection],
     basemap: Basemap | None,
-) -> None:
+) -> dict[str, float | int] | None:
     """Write report.html beside the products.
 
     Args:
@@ -74,6 +74,11 @@ def write_page(
         placed: the frames as last placed.
         rejected: the pictures that were left out.
         basemap: the map, if there is one.
+
+    Returns:
+        How far blocks of the orthoimage lie from the map: `median` and `p95` in metres, `blocks` that were found. The
+        finished picture is compared, not the tie points that placed it; but with the map, not with the ground. None
+        without a map, or where control points placed the orthoimage elsewhere.
 
     Raises:
         OrthoSwarmError: if the disk is full.
@@ -105,6 +110,12 @@ def write_page(
     values["times"] = charts.times(report["stages"])
     values["legs"] = _leg_summary(report)
     write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
+    return None if shifts is None or not len(shifts.at) else _against_map(shifts)
+
+
+def _against_map(shifts: Moved) -> dict[str, float | int]:
+    median, p95 = (float(v) for v in np.percentile(shifts.size_m, (50.0, 95.0)))
+    return {"median": median, "p95": p95, "blocks": len(shifts.at)}
 
 
 def _shifts(best: Path, ortho: Picture, there: MapView, basemap: Basemap, least: float) -> Moved:
@@ -276,6 +287,12 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
         text += f". The map itself lies {away:.1f} m from where the receivers say, who know it to {sigma:.1f} m"
         if offset["doubted"]:
             return {"kind": "doubt", "text": text + ": one of the two is wrong, see below."}
+    checked = report.get("checkpoints")
+    text += (
+        ". These are errors against the map; against the ground only surveyed points tell them"
+        if checked is None
+        else f". Against the ground: {checked['statement']}"
+    )
     return {"kind": "good" if fine >= 0.9 * len(placed) else "rough", "text": text + "."}
 
 

@@ -54,6 +54,7 @@ def test_control_points_move_a_map_that_lies_beside_its_place(flight, tmp_path, 
     report = mosaic(flight, tmp_path / "followed", "--basemap", beside, "--checkpoints", check)
     offset = report["map_offset_m"]
     assert (offset["east"], offset["north"]) == pytest.approx(tuple(SHIFT), abs=1.0)
+    assert report["against_map_m"]["median"] < 0.4  # it lies on the map, however wrong that is
     assert any("--control FILE" in w for w in report["warnings"])
     assert report["checkpoints"]["rmse_h_m"] == pytest.approx(np.hypot(*SHIFT), abs=0.5)
 
@@ -65,6 +66,7 @@ def test_control_points_move_a_map_that_lies_beside_its_place(flight, tmp_path, 
     assert report["control"]["points"] == 3
     assert (moved["east"], moved["north"]) == pytest.approx(tuple(-SHIFT), abs=0.3)
     assert report["map_offset_m"]["east"] == pytest.approx(offset["east"], abs=0.1)  # still the map's own
+    assert report["against_map_m"] is None
     assert not any("--control FILE" in w for w in report["warnings"])
     page = (out / "report.html").read_text()
     assert "Placed on 3 surveyed points" in page and "4 checkpoints" in page

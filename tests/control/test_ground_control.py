@@ -13,7 +13,7 @@ from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
 
 GRID = LocalGrid(32632)
 MIDDLE = np.array([690_000.0, 5_330_000.0])
@@ -100,7 +100,9 @@ def block(stage="fine", move=distorted) -> tuple[dict[str, Camera], Refinement]:
     west, south = MIDDLE + SHIFT - 300.0
     slope = SCALE * 0.02 * ((np.stack([e, n], -1) @ np.array([np.cos(TURN), np.sin(TURN)])) / SCALE)
     terrain = Terrain(float(west), float(south), step, slope.astype(np.float32))
-    return cameras, Refinement([], [Solution("a", placed, {}, [], 63.0, 0.1, None)], terrain)
+    return cameras, Refinement(
+        [], [Solution("a", placed, {}, [Leg("a", 0, 8, "matched", 1.0, 0.1)], 63.0, 0.1, None)], terrain
+    )
 
 
 def surveyed_points(cameras, sigma=0.02) -> list[Checkpoint]:
@@ -127,6 +129,7 @@ def test_photos_and_terrain_move_together():
         assert np.abs(p.camera.position - true.position).max() < 0.25
         assert np.abs(p.camera.rotation - true.rotation).max() < 0.003
         assert 0.1 < p.sigma_m < 0.3
+    assert moved.fine[0].legs[0].sigma_m == np.median([p.sigma_m for p in moved.fine[0].placed])
     at = truth((20,), 9)
     assert np.abs(moved.terrain.height(at) - 0.02 * (at - MIDDLE)[:, 0]).max() < 0.1
     assert did.document()["shift_m"]["east"] == pytest.approx(-SHIFT[0], abs=0.2)

@@ -81,7 +81,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
-    write_page(out, report, placed, rejected, basemap)
+    report["against_map_m"] = write_page(out, report, placed, rejected, basemap)
     write_json(out / "report.json", report)
     place_files.write_geojson(task.places, out / place_files.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
