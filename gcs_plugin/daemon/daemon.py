@@ -439,7 +439,7 @@ class Daemon:
         return facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
             time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
-        )  # fmt: skip
+        ) | ({} if self.coverage.document["state"] == "no area" else {"coverage": self.coverage.document})  # fmt: skip
 
     # -- health ---------------------------------------------------------------------------------------------------
 

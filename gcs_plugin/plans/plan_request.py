@@ -53,6 +53,7 @@ class PlanRequest:
         gaps: the area is a file of gaps as `orthoswarm coverage` writes it. fly_not_arrived: fly gaps, too, whose
             pictures were taken but have not arrived.
         dem: height model of the ground; lines are then spaced for the highest ground of the area.
+        wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
     """
 
     area: Path
@@ -80,6 +81,15 @@ class PlanRequest:
     gaps: bool = False
     fly_not_arrived: bool = False
     dem: Path | None = None
+    wind_m_s: float = 0.0
+    wind_from_deg: float = 0.0
+
+    def _motion(self) -> Motion:
+        if not 0.0 <= self.wind_m_s < math.inf or not math.isfinite(self.wind_from_deg):
+            raise InputError(f"a wind of {self.wind_m_s:g} m/s from {self.wind_from_deg:g} degrees is none; give both")
+        to = math.radians(self.wind_from_deg + 180.0)
+        wind = (self.wind_m_s * math.sin(to), self.wind_m_s * math.cos(to)) if self.wind_m_s else (0.0, 0.0)
+        return Motion(wind_m_s=wind) if self.speed_m_s is None else Motion(self.speed_m_s, wind_m_s=wind)
 
     def flight_options(self) -> Options:
         """How the flights are to be.
@@ -95,7 +105,7 @@ class PlanRequest:
         step = self.height_step_m
         layers = int(min(_MOST_LAYERS, (ceiling - self.altitude_m) / step + 1e-9)) if step > 0 else 0
         return Options(
-            motion=Motion() if self.speed_m_s is None else Motion(speed_m_s=self.speed_m_s),
+            motion=self._motion(),
             end=self.end,
             starts=list(self.starts),
             endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
@@ -119,6 +129,8 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     fov = math.radians(request.fov_min_deg)
     foot = footprint(request.altitude_m, fov, request.aspect, request.side_overlap, request.forward_overlap)
     options = request.flight_options()
+    options.check()
+    foot = foot.turned(options.motion.crab_rad)
     progress("area")
     if request.gaps:
         if request.dem is not None:
@@ -132,6 +144,7 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         if ground is not None:
             above = request.altitude_m - ground.high_m
             foot = footprint(above, fov, request.aspect, request.side_overlap, request.forward_overlap)
+            foot = foot.turned(options.motion.crab_rad)
         plan = plan_area(area, request.vehicles, request.altitude_m, foot, request.method, options, progress)
         if ground is not None:
             plan = replace(plan, warnings=(*plan.warnings, ground.note(request.altitude_m)))

@@ -50,6 +50,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="straight flight before a leg's first picture (default 0)",
     )
     flight.add_argument("--endurance", type=float, metavar="MIN", help="longest flight, minutes (default: no limit)")
+    flight.add_argument("--wind-m-s", type=float, default=0.0, metavar="V", help="wind, m/s (default none)")
+    wind_help = "where it comes from, degrees clockwise from north; --speed is then the speed through the air"
+    flight.add_argument("--wind-from", type=float, default=0.0, metavar="DEG", help=wind_help)
     flight.add_argument("--swap", type=float, default=2.0, metavar="MIN", help="time to change a battery (default 2)")
     camera = parser.add_argument_group("pictures")
     camera.add_argument("--side-overlap", type=float, default=0.4, metavar="SHARE", help="between lines (default 0.4)")
@@ -118,6 +121,8 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         speed_m_s=args.speed,
         run_in_m=args.run_in,
         endurance_min=args.endurance,
+        wind_m_s=args.wind_m_s,
+        wind_from_deg=args.wind_from,
         swap_min=args.swap,
         side_overlap=args.side_overlap,
         forward_overlap=args.forward_overlap,

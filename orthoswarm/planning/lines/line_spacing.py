@@ -1,7 +1,7 @@
 """What the narrowest camera sees from the planned height, and the distances between lines and pictures from it."""
 
-from dataclasses import dataclass
-from math import isfinite, radians, tan
+from dataclasses import dataclass, replace
+from math import cos, isfinite, radians, sin, tan
 
 from orthoswarm.model.errors import InputError
 
@@ -18,22 +18,41 @@ class Footprint:
         height_m: along the leg, width over the aspect ratio.
         spacing_m: largest distance between neighbouring lines, width (1 - side overlap).
         trigger_m: distance between pictures on a leg, height (1 - forward overlap).
+        slant_m: how much less far pictures see along the leg at its strip's edge, as they are turned against it.
     """
 
     width_m: float
     height_m: float
     spacing_m: float
     trigger_m: float
+    slant_m: float = 0.0
 
     @property
     def overshoot_m(self) -> float:
         """How far a leg must go beyond what it shall cover, for any phase of the trigger; 0 from 50 % overlap on."""
-        return max(0.0, self.trigger_m - 0.5 * self.height_m)
+        return max(0.0, self.trigger_m - 0.5 * self.height_m + self.slant_m)
 
     @property
     def reach_m(self) -> float:
         """How far pictures are certain to see beyond a leg's ends, for any phase of the trigger."""
-        return max(0.0, 0.5 * self.height_m - self.trigger_m)
+        return max(0.0, 0.5 * self.height_m - self.trigger_m - self.slant_m)
+
+    def turned(self, crab_rad: float) -> "Footprint":
+        """The footprint of pictures that are turned against the leg by up to an angle, as a vehicle crabs in wind.
+
+        A turned picture w x h covers a chord at the offset y from the leg. Its length is h / cos(a), and falls to 0
+        between y = (w cos a - h sin a) / 2 and (w cos a + h sin a) / 2, from one end; its other end lies
+        y tan(a) + h / (2 cos a) further along. Pictures d apart leave nothing out where the chord is at least d.
+        """
+        a, h = crab_rad, self.height_m
+        if a == 0.0:
+            return self
+        most = self.width_m * cos(a) + h * sin(a)
+        width = min(self.width_m, most - 2.0 * self.trigger_m * sin(a) * cos(a))
+        chord = min(h / cos(a), 0.5 * (most - width) / (sin(a) * cos(a)))
+        slant = 0.5 * h - chord + 0.5 * h / cos(a) + 0.5 * width * tan(a)
+        spacing = self.spacing_m * width / self.width_m
+        return replace(self, width_m=width, spacing_m=spacing, slant_m=max(0.0, slant))
 
 
 def footprint(

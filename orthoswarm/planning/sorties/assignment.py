@@ -27,6 +27,7 @@ _SPARE_ITEMS = 40
 _FARTHEST_M = 100_000.0
 _SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
 _LONGEST_RUN_IN_M = 200.0
+_MOST_WIND = 0.8  # of the speed through the air
 _FAIR, _UNFAIR = 1.15, 1.22
 
 
@@ -67,6 +68,12 @@ class Options:
         speed = self.motion.speed_m_s
         if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
             raise InputError(f"the speed is {speed:g} m/s; give a number from {_SLOWEST_M_S:g} to {_FASTEST_M_S:g}")
+        wind = math.hypot(*self.motion.wind_m_s)
+        if not wind <= _MOST_WIND * speed:
+            raise InputError(
+                f"a wind of {wind:g} m/s is too much for {speed:g} m/s: at most {_MOST_WIND * speed:g} m/s leave some "
+                "speed against it; fly faster, or another day"
+            )
         positive = {
             "endurance": (min((self.endurance_s, *self.endurances_s)) / 60.0, "min"),
             "clearance": (1.0 if self.clearance_m is None else self.clearance_m, "m"),

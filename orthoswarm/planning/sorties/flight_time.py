@@ -17,16 +17,37 @@ class Motion:
     """A simple multirotor: constant speed on straights, time lost where the direction changes.
 
     Attributes:
-        speed_m_s: ground speed.
+        speed_m_s: ground speed without wind.
         acceleration_m_s2: horizontal acceleration (ArduCopter's default is 2.5).
         climb_m_s: rate of climb.
         descent_m_s: rate of descent.
+        wind_m_s: where the wind blows to, east and north. The speed is then that through the air.
     """
 
     speed_m_s: float = 10.0
     acceleration_m_s2: float = 2.5
     climb_m_s: float = 2.5
     descent_m_s: float = 1.5
+    wind_m_s: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def crab_rad(self) -> float:
+        """Largest angle between heading and course, on a course across the wind, radians."""
+        return float(np.arcsin(min(1.0, np.hypot(*self.wind_m_s) / self.speed_m_s)))
+
+    @property
+    def even_speed_m_s(self) -> float:
+        """Ground speed, averaged over a way out and back along the wind: no other direction averages less."""
+        return self.speed_m_s - (self.wind_m_s[0] ** 2 + self.wind_m_s[1] ** 2) / self.speed_m_s
+
+    def ground_speed(self, steps: Array) -> Array:
+        """Ground speed (n,) on courses along steps (n, 2), metres per second: v cos(crab) plus the wind along it."""
+        if self.wind_m_s == (0.0, 0.0):
+            return np.full(len(steps), self.speed_m_s)
+        course = steps / np.maximum(np.hypot(steps[:, 0], steps[:, 1]), 1e-9)[:, None]
+        along = course[:, 0] * self.wind_m_s[0] + course[:, 1] * self.wind_m_s[1]
+        across = course[:, 0] * self.wind_m_s[1] - course[:, 1] * self.wind_m_s[0]
+        return np.asarray(np.sqrt(self.speed_m_s**2 - across**2) + along)
 
     def turn_s(self, angle_rad: Array) -> Array:
         """Seconds lost by changing direction by an angle.
@@ -47,7 +68,7 @@ class Motion:
         flat = np.hypot(step[:, 0], step[:, 1])
         rise = step[:, 2]
         vertical = np.maximum(rise, 0.0) / self.climb_m_s + np.maximum(-rise, 0.0) / self.descent_m_s
-        seconds = np.maximum(flat / self.speed_m_s, vertical)
+        seconds = np.maximum(flat / self.ground_speed(step[:, :2]), vertical)
         moving = np.flatnonzero(flat > 0.01)
         if len(moving):
             seconds[moving[1:]] += self.turn_s(angles(points))

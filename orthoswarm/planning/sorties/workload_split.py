@@ -69,11 +69,11 @@ def cut(legs: Array, router: Router, motion: Motion, shares: int, least_m: float
     parts[at == 0, 0], parts[at == count[leg] - 1, 1] = legs[:, 0], legs[:, 1]
     way_s = np.zeros(len(parts))
     if len(legs) > 1:
-        ways = router.each(legs[:-1, 1], legs[1:, 0]) / motion.speed_m_s
+        ways = router.each(legs[:-1, 1], legs[1:, 0]) / motion.even_speed_m_s
         for k in range(len(legs) - 1):
             ways[k] += motion.turn_s(angles(legs[k : k + 2].reshape(4, 2))).sum()
         way_s[np.flatnonzero(at == 0)[1:]] = ways
-    part_s = np.hypot(*(parts[:, 1] - parts[:, 0]).T) / motion.speed_m_s
+    part_s = np.hypot(*(parts[:, 1] - parts[:, 0]).T) / motion.even_speed_m_s
     end_s = np.cumsum(way_s + part_s)
     return Row(parts, leg, end_s - part_s, end_s)
 
@@ -168,7 +168,7 @@ def _evenly(
         np.ascontiguousarray(home),
         own,
         single,
-        1.0 / motion.speed_m_s if returns else 0.0,
+        1.0 / motion.even_speed_m_s if returns else 0.0,
         np.array(np.broadcast_to(np.asarray(limits.endurance_s, np.float64), len(out))),
         np.array([limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
@@ -205,8 +205,8 @@ def share(
         return None if cuts is None else _pairs(cuts)
     places, kind = np.unique(starts, axis=0, return_inverse=True)
     kind = kind.reshape(-1)
-    out = router.distances(places, row.parts[:, 0]) / motion.speed_m_s
-    home = router.distances(places, row.parts[:, 1]) / motion.speed_m_s * returns
+    out = router.distances(places, row.parts[:, 0]) / motion.even_speed_m_s
+    home = router.distances(places, row.parts[:, 1]) / motion.even_speed_m_s * returns
     order = np.arange(vehicles)
     if len(places) > 1:  # who flies which piece: first cut without ways, then the cheapest assignment
         free = Limits(swap_s=limits.swap_s)
@@ -239,8 +239,8 @@ def sorties(
         motion: gives times.
         limits: of each flight; one endurance.
     """
-    out = router.distances(start, row.parts[:, 0]) / motion.speed_m_s
-    home = router.distances(start, row.parts[:, 1]) / motion.speed_m_s * returns
+    out = router.distances(start, row.parts[:, 0]) / motion.even_speed_m_s
+    home = router.distances(start, row.parts[:, 1]) / motion.even_speed_m_s * returns
     begin, count = 0, 0
     while begin < len(row.parts):  # as far as one flight goes, again and again: how many it takes at least
         ways = out[0, begin] + home[0, begin:] + limits.fixed_s
