@@ -1,12 +1,19 @@
 """Robust statistics that several stages share."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
 
 _MAD_TO_SIGMA = 1.4826
 """Sigma of a Gaussian over the median of its absolute values: 1 / 0.6745 (Huber 1981)."""
 
 
 def mad_sigma(deviation: ArrayLike) -> float:
-    """One sigma of deviations from their middle by the median of their absolute values, whatever a minority does."""
+    """Robust sigma of deviations from their median: the median absolute deviation, scaled for Gaussian errors."""
     return _MAD_TO_SIGMA * float(np.median(np.abs(deviation)))
+
+
+def mad_sigmas(deviation: ArrayLike) -> Array:
+    """The same of each column of deviations (N, K): float64 (K,)."""
+    return np.asarray(_MAD_TO_SIGMA * np.median(np.abs(deviation), axis=0), np.float64)

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from orthoswarm.model.robust import mad_sigma
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -34,7 +36,6 @@ _CLOCK_DOUBT = 1e-3
 _CANDIDATES = 24
 _FIRST_JITTER_S = 0.08
 _JITTERS_S = (0.02, 0.04, 0.08, 0.16)
-_MAD_TO_SIGMA = 1.4826
 _MOST_BINS = 1 << 19
 _MOST_DRIFTS = 81
 
@@ -205,7 +206,7 @@ class _Problem:
         is worth as much as the intervals vary, and not a whole interval.
         """
         steps = np.diff(self.e)
-        spread = _MAD_TO_SIGMA * float(np.median(np.abs(steps - np.median(steps))))
+        spread = mad_sigma(steps - np.median(steps))
         widest = max(self.resolution_s, float(np.sqrt(2.0 * np.pi)) * max(self.jitter_s, spread))
         return replace(self, interval_s=min(self.interval_s, widest))
 

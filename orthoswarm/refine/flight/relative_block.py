@@ -11,6 +11,7 @@ from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.legs import leads_one_way, split_legs
+from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
@@ -109,7 +110,7 @@ def weigh_records(flight: Flight) -> None:
     if flight.calibration.trusted_height:
         sigma[:, 2] = np.where(sigma[:, 2] > c.first_height_sigma_m, sigma[:, 2], z)
     off = adj.position_residuals()[:, :2] / np.maximum(sigma[:, :2], 1e-9)
-    sigma[:, :2] *= max(1.0, 1.4826 * float(np.median(np.abs(off))))
+    sigma[:, :2] *= max(1.0, mad_sigma(off))
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
@@ -138,7 +139,7 @@ def free_full_lens(flight: Flight) -> bool:
 def _step_sigma(values: Array) -> Array:
     """Robust sigma of each column of a sequence's noise from one picture to the next."""
     step = np.diff(values, axis=0)
-    return np.asarray(1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0) / np.sqrt(2.0))
+    return np.asarray(mad_sigmas(step - np.median(step, axis=0)) / np.sqrt(2.0))
 
 
 def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration) -> tuple[Tracks, Array]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
 from orthoswarm.refine.bundle.height_consistency import release_heights
@@ -160,8 +161,9 @@ def _widen_position_sigmas(adjustment: Adjustment) -> None:
     Heights with too small sigmas push the cameras up, where errors of heights matter less.
     """
     p = adjustment.priors
-    off = np.abs(adjustment.position_residuals()) / np.maximum(p.position_sigma, 1e-9)
-    scatter = 1.4826 * np.array([np.median(off[:, :2]), np.median(off[:, :2]), np.median(off[:, 2])])
+    off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
+    horizontal = mad_sigma(off[:, :2])
+    scatter = np.array([horizontal, horizontal, mad_sigma(off[:, 2])])
     adjustment.priors = replace(p, position_sigma=p.position_sigma * np.maximum(scatter, 1.0))
 
 
@@ -174,7 +176,7 @@ def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:
         rows = np.flatnonzero(p.group == g)
         bias = adjustment.group_values(g)[0]
         off = log_rotation(np.swapaxes(p.rotation[rows], 1, 2) @ adjustment.cameras.rotation[rows]) - bias
-        scatter = 1.4826 * np.median(np.abs(off), axis=0)
+        scatter = mad_sigmas(off)
         sigma[rows] = np.clip(c.sparse_attitude_scatters * scatter, *np.radians(c.sparse_attitude_range_deg))
     adjustment.priors = replace(p, rotation_sigma=sigma)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
+from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
@@ -198,7 +199,7 @@ def weighed(ties: MapTies, residual: Array) -> MapTies:
     """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
     if len(residual) < FEWEST_TO_WEIGH:
         return ties
-    sigma = float(np.clip(1.4826 * np.median(np.abs(residual)), *TIE_SIGMA_LIMITS_M))
+    sigma = float(np.clip(mad_sigma(residual), *TIE_SIGMA_LIMITS_M))
     return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 

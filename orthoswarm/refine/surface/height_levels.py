@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
+from orthoswarm.model.robust import mad_sigma
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def level_network(ground: Sequence[Array]) -> LevelNetwork:
             if len(d) >= c.level_least_points:
                 pairs.append((i, j))
                 difference.append(float(np.median(d)))
-                spread = 1.4826 * float(np.median(np.abs(d - difference[-1])))
+                spread = mad_sigma(d - difference[-1])
                 sigma.append(float(np.hypot(1.25 * spread / np.sqrt(len(d)), c.level_sigma_floor_m)))
     edge = np.array(pairs, np.int64).reshape(-1, 2)
     return _adjust(count, edge, np.array(difference, float), np.array(sigma, float))
