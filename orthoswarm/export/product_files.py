@@ -221,13 +221,15 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
             "fov_sigma_deg": finite(s.fov_sigma_deg),
             "legs": len(s.legs),
             "gsd_m": finite(s.gsd_m),
+            "false_matches": finite(s.false_matches),
         }
         for s in solutions
     ]
     for vehicle, count in used.items():
         assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
         fov = statistics.median(assumed)
-        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None})
+        rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None,
+                     "false_matches": None})  # fmt: skip
     for row in rows:
         origins = [p.frame.origin.get("position", "") for p in placed if p.frame.vehicle == row["id"]]
         row["positions_from"] = dict(Counter(origin for origin in origins if origin).most_common())

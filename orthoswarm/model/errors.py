@@ -1,4 +1,24 @@
-"""The package's exceptions; each message is one sentence that tells the user what to do next."""
+"""The failures that callers tell apart. Each message is one sentence that tells the user what to do next.
+
+    Exception
+    ├── OrthoSwarmError                nothing could be made of valid input (exit code 1)
+    │   ├── InputError                 an argument or an input file is wrong (exit code 2)
+    │   │   └── UnreadableMapError     the basemap cannot be read here      raster.map_check
+    │   ├── AdjustmentError            photos of a vehicle do not hold together
+    │   ├── PictureError               a picture cannot be decoded          raster.picture_file
+    │   ├── StorageError               a file cannot be written; the same may succeed later
+    │   │   └── DiskFullError          there is no room on the disk
+    │   ├── WorkerStoppedError         a worker process was ended from outside
+    │   ├── SolutionFileError          a refined sortie's file is damaged or old    gcs_plugin.daemon.jobs.solution_file
+    │   ├── OutdatedError              somebody else changed the shared plan meanwhile  gcs_plugin.daemon.store
+    │   └── TooLarge                   a request's body is too large        gcs_plugin.web.guard
+    ├── UnavailableError               a matcher's weights or packages are missing  matchers.matcher
+    ├── Unreadable                     bytes are not of the format they claim       telemetry.samples.unreadable
+    └── Preempted                      a job gave way to one of higher priority     gcs_plugin.daemon.jobs.job_queue
+
+The last three are no failure of the whole: their callers take the next matcher, reject the file and say why, or start
+the job again.
+"""
 
 
 class OrthoSwarmError(Exception):
@@ -14,7 +34,7 @@ class InputError(OrthoSwarmError):
 
 
 class AdjustmentError(OrthoSwarmError):
-    """Pictures of a vehicle do not hold together: their adjustment is singular."""
+    """Photos of a vehicle do not hold together: its normal equations are singular."""
 
 
 class StorageError(OrthoSwarmError):

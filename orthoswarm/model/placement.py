@@ -63,7 +63,7 @@ class Terrain:
         west: easting of node column 0; south: northing of node row 0 (rows go north), metres.
         step_m: distance of nodes.
         z: float32 (rows, columns), metres over the datum of the cameras.
-        bare: the same without what is broad and stands on the ground (halls, woods); None where z has no such tops.
+        bare: the same without tall surfaces (halls, woods); None where z has no such tops.
     """
 
     west: float
@@ -114,6 +114,8 @@ class Solution:
         gsd_m: mean size of its pictures' pixels on the ground: height above the mean of the points that count as
             ground (rubble and hedges among them, so it is a little above the plane of the homographies) over the
             focal length. NaN where not known.
+        false_matches: how many registrations as good as this one a map of other ground would give (expected number);
+            NaN where the map did not register it.
     """
 
     vehicle: str
@@ -129,6 +131,7 @@ class Solution:
     warnings: list[str] = field(default_factory=list)
     timings: dict[str, float] = field(default_factory=dict)
     gsd_m: float = float("nan")
+    false_matches: float = float("nan")
 
 
 class MapWindow(Protocol):
@@ -192,6 +195,13 @@ class Refiner(Protocol):
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Place a vehicle again beside neighbours that were solved since; the same solution where nothing changes."""
+
+    def refined_frames(self, solution: Solution) -> list[Frame]:
+        """The frames that this refiner solved; others of a solution were placed as recorded or by their neighbours.
+
+        Args:
+            solution: an earlier one of this refiner.
+        """
 
     def refine_batch(
         self,

@@ -124,6 +124,7 @@ def test_the_report_has_its_keys(mapped):
     assert report["frames"] == {"input": 33, "used": 32, "rejected": 1}
     assert {v["id"] for v in report["vehicles"]} == {"a", "b"}
     assert all({"id", "frames", "fov_deg", "fov_sigma_deg", "legs", "gsd_m"} <= set(v) for v in report["vehicles"])
+    assert all(0 <= v["false_matches"] < 1e-4 for v in report["vehicles"])  # the map has evidence for both
     for leg in report["legs"]:
         assert {"vehicle", "first", "last", "state", "confidence", "sigma_m"} <= set(leg)
         assert leg["state"] in {"matched", "carried", "failed"}

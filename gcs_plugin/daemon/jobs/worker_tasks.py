@@ -163,16 +163,15 @@ def refine_jointly(task: JointTask) -> tuple[SortieResult, float] | None:
 
     Its exposure stays as it is: its neighbours were drawn to agree with it.
     """
-    from orthoswarm.refine.strategy.swarm_refiner import states_of
-
     watch = _Watch()
     before = read_solution(task.before)
-    frames = [frame for state in states_of(before.solution) for frame in state.flight.frames]
+    refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
+    frames = refiner.refined_frames(before.solution)
     if not frames:
         return None
     others = [read_solution(path).solution for path in task.neighbours]
     basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
-    solution = make_refiner("swarm", task.epsg, np.array(task.origin)).again(before.solution, others, basemap)
+    solution = refiner.again(before.solution, others, basemap)
     if solution is before.solution:
         return None
     sortie = replace(before, solution=solution)
@@ -202,7 +201,7 @@ def place(task: SolveTask) -> SortieResult:
     """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
 
     Raises:
-        OrthoSwarmError: the pictures do not hold together (yet).
+        OrthoSwarmError: the pictures cannot be adjusted (yet).
     """
     from orthoswarm.refine.strategy.in_flight import place_in_flight
 

@@ -77,4 +77,5 @@ def _merged(parts: Sequence[Solution]) -> Solution:
         state=[part.state for part in parts if part.state is not None],
         warnings=list(dict.fromkeys(w for part in parts for w in part.warnings)),
         timings=timings,
+        false_matches=float(np.fmax.reduce([part.false_matches for part in parts])),
     )

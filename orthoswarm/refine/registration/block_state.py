@@ -143,6 +143,7 @@ def to_solution(
         findings(state),
         dict(state.timings),
         _mean_gsd(cameras, flight),
+        state.false_matches,
     )
 
 

@@ -105,17 +105,18 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else relative(flight)
     _check(flight)
     state = from_flight(flight, surface, origin, None, watch)
-    fit = None
+    found = None
     if basemap is not None:
         found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
-        fit = None if found is None else found.fit
         flight.pictures.drop()
-    if fit is not None:
+    fit = None if found is None else found.fit
+    if found is not None:
+        state.false_matches = found.false_matches
         height = float(np.median(flight.cameras().position[:, 2]))
         config = active().strategy
         share = config.one_way_sigma_share if one_way else config.many_ways_sigma_share
-        state = _shifted(state, fit.correction)
-        state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(fit)), state.coarse_sigma_m)
+        state = _shifted(state, found.fit.correction)
+        state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(found.fit)), state.coarse_sigma_m)
     legs = _legs(state, fit)
     return replace(to_solution(state, origin, None, coarse=True), legs=legs)
 

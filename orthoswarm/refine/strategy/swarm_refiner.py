@@ -129,6 +129,10 @@ class SwarmRefiner:
         lean = pooled_lean(everyone)
         return merge_units([to_solution(s, self.origin, terrain, map_lean=lean, ground_z_m=level) for s in done])[0]
 
+    def refined_frames(self, solution: Solution) -> list[Frame]:
+        """The frames of the vehicle's blocks (placement.Refiner)."""
+        return [frame for state in states_of(solution) for frame in state.flight.frames]
+
     def refine_batch(
         self,
         vehicles: Mapping[str, Sequence[Frame]],
