@@ -9,6 +9,7 @@ import numpy as np
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.config import active
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import describe_frame
@@ -26,8 +27,6 @@ from orthoswarm.raster.height_model import read_dem
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
-_CANVAS_MB = 48.0
-"""Memory that a canvas keeps of its tiles, megabytes."""
 
 
 def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
@@ -176,7 +175,9 @@ def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: 
         reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
         raise OrthoSwarmError(f"no picture can be drawn: {reason}")
     grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
-    return Canvas.create(run.space.scratch(name.removesuffix(".tif")), grid, plane="frame", memory_mb=_CANVAS_MB)
+    return Canvas.create(
+        run.space.scratch(name.removesuffix(".tif")), grid, plane="frame", memory_mb=active().compute.canvas_mb
+    )
 
 
 def _write(run: RunContext, canvas: Canvas, name: str) -> None:

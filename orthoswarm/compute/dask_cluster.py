@@ -19,16 +19,11 @@ from uuid import uuid4
 
 from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, single_threaded
-from orthoswarm.config import overridden, override
+from orthoswarm.config import active, overridden, override
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-CONNECT_S = 20.0
-_QUEUE_PER_WORKER = 3
-_POLL_S = 1.0
-_PATIENCE_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +43,16 @@ class Cluster:
     Args:
         address: of the scheduler, for example tcp://192.168.1.10:8786.
         shared: files and folders that every worker must see under the same path.
-        patience_s: how long to wait for a worker to come back when all are gone.
+        patience_s: how long to wait for a worker to come back when all are gone; None for the configuration's.
 
     Raises:
         InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
             does not see a shared path or that uses several threads for sums.
     """
 
-    def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float = _PATIENCE_S) -> None:
+    def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float | None = None) -> None:
         self._client = _connect(address)
-        self._patience_s = patience_s
+        self._patience_s = active().compute.cluster_patience_s if patience_s is None else patience_s
         self._cpu_s: dict[str, float] = {}
         self._rss_mb: dict[str, float] = {}
         self._first_cpu_s: dict[str, float] = {}
@@ -78,7 +73,7 @@ class Cluster:
         queue: deque[Any] = deque()
         try:
             while True:
-                wanted = _QUEUE_PER_WORKER * self.count
+                wanted = active().compute.cluster_queue_per_worker * self.count
                 while len(queue) < wanted:
                     for item in source:
                         queue.append(self._submit(function, item))
@@ -123,7 +118,7 @@ class Cluster:
         alone_since = None
         while True:
             try:
-                outcome: _Outcome = future.result(timeout=_POLL_S)
+                outcome: _Outcome = future.result(timeout=active().compute.cluster_poll_s)
                 break
             except Late:
                 if self._workers():
@@ -179,7 +174,7 @@ def _connect(address: str) -> Any:
     # States of vehicles are megabytes large; they have to travel, and a warning for each helps nobody.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
     try:
-        return Client(address, timeout=CONNECT_S, set_as_default=False)
+        return Client(address, timeout=active().compute.cluster_connect_s, set_as_default=False)
     except (OSError, ValueError) as error:  # no route, wrong form
         raise InputError(f"there is no Dask scheduler at {address} ({_short(error)}); check the address") from None
 

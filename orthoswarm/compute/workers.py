@@ -22,14 +22,13 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
-from orthoswarm.config import Overrides, overridden, override
+from orthoswarm.config import Overrides, active, overridden, override
 from orthoswarm.model.errors import WorkerStoppedError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-_LONG_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +103,11 @@ class Processes:
             yield from (_alone(function, item) for item in items)
             return
         source = iter(items)
+        ahead = active().compute.queue_per_process * self.count
         queue: deque[Future[_Outcome[Result]]] = deque()
         try:
             while True:
-                while sum(not f.done() for f in queue) < self.count and len(queue) < 4 * self.count:
+                while sum(not f.done() for f in queue) < self.count and len(queue) < ahead:
                     for item in source:
                         queue.append(self._started().submit(_measured, function, item, overridden()))
                         break
@@ -115,7 +115,7 @@ class Processes:
                         break
                 if not queue:
                     return
-                if not queue[0].done() and len(queue) < 4 * self.count:
+                if not queue[0].done() and len(queue) < ahead:
                     for item in source:  # rather than wait, do one here
                         queue.append(_here(function, item))
                         break
@@ -188,7 +188,7 @@ def _tidily(function: Callable[[Item], Result], item: Item) -> Result:
     """Apply a function; what a long one leaves unused goes back to the system, or it piles up over a hundred tasks."""
     begun = time.process_time()
     value = function(item)
-    if time.process_time() - begun > _LONG_S:
+    if time.process_time() - begun > active().compute.trim_after_s:
         trim_memory()
     return value
 

@@ -1,4 +1,4 @@
-"""Every threshold of the default refiner: one frozen dataclass a stage, each field with unit, meaning and source.
+"""Every threshold: one frozen dataclass a stage, each field with unit, meaning and source.
 
 `active()` gives the values in force. `orthoswarm mosaic --config FILE.toml` overrides them, a table a stage:
 

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from orthoswarm.config.bundle import BundleConfig
+from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.features import FeaturesConfig
 from orthoswarm.config.flight import FlightConfig
 from orthoswarm.config.initial import InitialConfig
+from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
+from orthoswarm.config.paper import PaperConfig
 from orthoswarm.config.records import RecordsConfig
 from orthoswarm.config.registration import RegistrationConfig
 from orthoswarm.config.strategy import StrategyConfig
@@ -37,6 +40,9 @@ class Config:
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    matchers: MatchersConfig = field(default_factory=MatchersConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
 
 
 _DEFAULT = Config()

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 class StrategyConfig:
     """What runs when, and when a result is doubted."""
 
+    start_fov_deg: float = 80.0
+    """Horizontal field of view to start from where no tag hints at one, degrees (chosen; the pictures correct it)."""
+
     # Without a map
     schedule: tuple[float, ...] = (1e4, 1e4, 100.0, 100.0, 9.0, 9.0)
     """Robust scales of the steps without a map, from a start that may be far off; squared, of normalised residuals

@@ -9,32 +9,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Array, Floats, Mask, Matches
 from orthoswarm.raster.subpixel_peak import vertex
 
-DIRECTIONS = 6
-TILE_PX = 64
-_FEWEST_SHARE = 0.4
-_MIN_PEAK = 0.12
-_MAX_RATIO = 0.92
-_APART = 4
-
 
 def features(gray: Floats, valid: Mask) -> Floats:
-    """Features float32 (DIRECTIONS, rows, columns), zero where not valid; their mean over directions is zero."""
+    """Features float32 (directions, rows, columns), zero where not valid; their mean over directions is zero."""
     import cv2
 
-    smooth = cv2.GaussianBlur(np.where(valid, gray, 0.0).astype(np.float32), (0, 0), 0.8)
+    config = active().matchers
+    directions, blur, border = config.cfog_directions, config.cfog_blur_px, config.cfog_border_px
+    smooth = cv2.GaussianBlur(np.where(valid, gray, 0.0).astype(np.float32), (0, 0), blur)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0) > 0
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((border, border), np.uint8), borderValue=0) > 0
     length = np.sqrt(gx * gx + gy * gy)
     middle = float(np.median(length[inner])) if inner.any() else 1.0
-    angle = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    channels = np.empty((DIRECTIONS, *gray.shape), np.float32)
+    angle = np.pi * np.arange(directions) / directions
+    channels = np.empty((directions, *gray.shape), np.float32)
     for k, a in enumerate(angle):
         strength = np.abs(np.float32(np.cos(a)) * gx + np.float32(np.sin(a)) * gy)
-        channels[k] = cv2.GaussianBlur(strength, (0, 0), 0.8)
-    channels = 0.25 * np.roll(channels, 1, 0) + 0.5 * channels + 0.25 * np.roll(channels, -1, 0)
+        channels[k] = cv2.GaussianBlur(strength, (0, 0), blur)
+    own = config.cfog_direction_blur
+    beside = 0.5 * (1.0 - own)
+    channels = beside * np.roll(channels, 1, 0) + own * channels + beside * np.roll(channels, -1, 0)
     norm = np.sqrt((channels * channels).sum(0)) + 1e-3
     weight = np.where(inner, length / (length + max(middle, 1e-3)) / norm, 0.0).astype(np.float32)
     channels -= channels.mean(0)
@@ -56,6 +54,7 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     """Best place of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
     from scipy import fft
 
+    config = active().matchers
     rows, cols = window.shape[1] - tile.shape[1] + 1, window.shape[2] - tile.shape[2] + 1
     shape = tuple(int(fft.next_fast_len(n, real=True)) for n in window.shape[1:])
     product = (fft.rfft2(window, shape) * np.conj(fft.rfft2(tile, shape))).sum(0)
@@ -64,11 +63,12 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     energy = fft.irfft2(fft.rfft2((window * window).sum(0), shape) * np.conj(fft.rfft2(weight, shape)), shape)
     energy = energy[:rows, :cols]
     own = float((tile * tile).sum())
-    score = dot / np.sqrt(np.maximum(energy, 0.1 * float(energy.max()) + 1e-6) * max(own, 1e-6))
+    score = dot / np.sqrt(np.maximum(energy, config.cfog_energy_share * float(energy.max()) + 1e-6) * max(own, 1e-6))
     r, c = (int(v) for v in np.unravel_index(int(score.argmax()), score.shape))
     peak = float(score[r, c])
     rest = score.copy()
-    rest[max(0, r - _APART) : r + _APART + 1, max(0, c - _APART) : c + _APART + 1] = -1.0
+    apart = config.cfog_peak_distance_px
+    rest[max(0, r - apart) : r + apart + 1, max(0, c - apart) : c + apart + 1] = -1.0
     ratio = float(rest.max()) / max(peak, 1e-9)
     if not (0 < r < rows - 1 and 0 < c < cols - 1):
         return Peak(c - (cols - 1) / 2, r - (rows - 1) / 2, peak, 1.0)
@@ -93,21 +93,22 @@ def match_tiles(
     Returns:
         One match for each tile with a clear peak; the score is the peak.
     """
-    half = TILE_PX // 2
+    config = active().matchers
+    half = config.cfog_tile_px // 2
     a, b, score = [], [], []
     for centre, expected in zip(centres, predict, strict=True):
         c, r = int(centre[0]), int(centre[1])
         cut = (slice(r - half, r + half), slice(c - half, c + half))
         wc, wr = round(float(expected[0])), round(float(expected[1]))
         c0, r0 = wc - half - search, wr - half - search
-        size = TILE_PX + 2 * search
-        if valid[cut].mean() < _FEWEST_SHARE or c0 < 0 or r0 < 0:
+        size = 2 * (half + search)
+        if valid[cut].mean() < config.cfog_valid_share or c0 < 0 or r0 < 0:
             continue
         area = window[:, r0 : r0 + size, c0 : c0 + size]
         if area.shape[1:] != (size, size) or not area.any():
             continue
         found = correlate(patch[(slice(None), *cut)], area)
-        if found.peak >= _MIN_PEAK and found.ratio <= _MAX_RATIO:
+        if found.peak >= config.cfog_least_peak and found.ratio <= config.cfog_most_ratio:
             a.append((c, r))
             b.append((wc + found.column, wr + found.row))
             score.append(found.peak)
@@ -116,32 +117,28 @@ def match_tiles(
     return Matches(np.array(a, float), np.array(b, float), np.array(score))
 
 
-def tile_centres(valid: Mask, step: int = TILE_PX) -> NDArray[np.int64]:
+def tile_centres(valid: Mask) -> NDArray[np.int64]:
     """Centres (column, row), int64 (N, 2), of tiles that lie in a patch and hold some of its valid part."""
-    half = TILE_PX // 2
+    config = active().matchers
+    step = config.cfog_tile_px
+    half = step // 2
     rows, cols = valid.shape
     c, r = np.arange(half, cols - half + 1, step), np.arange(half, rows - half + 1, step)
     grid = np.stack(np.meshgrid(c, r), -1).reshape(-1, 2)
-    return np.asarray([p for p in grid if valid[p[1] - half : p[1] + half, p[0] - half : p[0] + half].mean() >= 0.4]
-                      or np.zeros((0, 2)), np.int64)  # fmt: skip
+    share = [valid[r - half : r + half, c - half : c + half].mean() for c, r in grid]
+    return np.asarray(grid[np.array(share) >= config.cfog_valid_share], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Cfog:
-    """Patch to map without weights: one shift of the complete patch first, then tiles about it.
-
-    Attributes:
-        search: reach of the tiles about the common shift, pixels.
-    """
-
-    search: int = 14
+    """Patch to map without weights: one shift of the complete patch first, then tiles about it."""
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
         import cv2
 
         size = (patch.shape[1] // 2, patch.shape[0] // 2)
-        if min(size) < 16 or not valid.any():
+        if min(size) < active().matchers.cfog_least_side_px or not valid.any():
             return Matches.none()
         half_reach = reach // 2
         wide = (size[0] + 2 * half_reach, size[1] + 2 * half_reach)
@@ -156,4 +153,6 @@ class Cfog:
         shift = np.array([reach + 2 * common.column, reach + 2 * common.row])
         centres = tile_centres(valid)
         wanted = centres + shift
-        return match_tiles(features(patch, valid), features(window, known), valid, wanted, centres, self.search)
+        return match_tiles(
+            features(patch, valid), features(window, known), valid, wanted, centres, active().matchers.cfog_search_px
+        )

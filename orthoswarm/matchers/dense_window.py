@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Floats, Gray, Mask, Matches
 from orthoswarm.matchers.sparse_learned import device, extractor, padded_tensor
@@ -16,23 +17,11 @@ from orthoswarm.raster.subpixel_peak import vertices
 
 CELL_PX = 8
 _STRIDE = 32
-_NEIGHBOURS = 5
-_LEAST_CONTRAST = 4.0
-_PART, _MARGIN = 96, 12
-"""Cells that the network describes at once, and those around them that it sees."""
 
 
 @dataclass(frozen=True, slots=True)
 class XFeatWindow:
-    """Patch to map by dense XFeat descriptors.
-
-    Attributes:
-        neighbours: side of the square of cells whose scores are averaged.
-        contrast: how far the best shift must stand above the others of its cell, in their standard deviations.
-    """
-
-    neighbours: int = _NEIGHBOURS
-    contrast: float = _LEAST_CONTRAST
+    """Patch to map by dense XFeat descriptors."""
 
     @classmethod
     def make(cls) -> "XFeatWindow":
@@ -48,7 +37,7 @@ class XFeatWindow:
         """See MapMatcher."""
         steps = reach // CELL_PX
         rows, cols = patch.shape[0] // CELL_PX, patch.shape[1] // CELL_PX
-        if steps < 1 or min(rows, cols) < 3:
+        if steps < 1 or min(rows, cols) < active().matchers.window_least_side:
             return Matches.none()
         spare = reach - steps * CELL_PX  # cells of both on one grid
         own, own_ok = _described(patch, valid)
@@ -65,10 +54,11 @@ class XFeatWindow:
         import cv2
         import torch
 
+        config = active().matchers
         n = 2 * steps + 1
         rows, cols = own_ok.shape
         out = np.zeros((n, n, rows, cols), np.float32)
-        side = (self.neighbours, self.neighbours)
+        side = (config.window_neighbours, config.window_neighbours)
         with torch.inference_mode():
             for dr in range(n):
                 for dc in range(n):
@@ -76,11 +66,12 @@ class XFeatWindow:
                     dot = (own * other[:, dr : dr + rows, dc : dc + cols]).sum(0).cpu().numpy()
                     total = cv2.boxFilter(np.where(both, dot, 0.0).astype(np.float32), -1, side, normalize=False)
                     count = cv2.boxFilter(both.astype(np.float32), -1, side, normalize=False)
-                    out[dr, dc] = np.where(count >= 4, total / np.maximum(count, 1.0), 0.0)
+                    out[dr, dc] = np.where(count >= config.window_least_cells, total / np.maximum(count, 1.0), 0.0)
         return out
 
     def _best(self, score: Floats, own_ok: Mask, steps: int, spare: int) -> Matches:
         """The clear best shift of each cell, refined between shifts by parabolas."""
+        config = active().matchers
         n, _, rows, cols = score.shape
         flat = score.reshape(n * n, rows, cols)
         best = flat.argmax(0)
@@ -88,7 +79,7 @@ class XFeatWindow:
         contrast = (peak - flat.mean(0)) / np.maximum(flat.std(0), 1e-6)
         at_r, at_c = best // n, best % n
         inside = (at_r > 0) & (at_r < n - 1) & (at_c > 0) & (at_c < n - 1)
-        rr, cc = np.nonzero(own_ok & inside & (contrast >= self.contrast))
+        rr, cc = np.nonzero(own_ok & inside & (contrast >= config.window_contrast))
         if not len(rr):
             return Matches.none()
         r, c = at_r[rr, cc], at_c[rr, cc]
@@ -98,7 +89,7 @@ class XFeatWindow:
         centre = 0.5 * (CELL_PX - 1)
         a = (np.column_stack([cc, rr]) * float(CELL_PX) + centre).astype(np.float64)
         b = a + spare + CELL_PX * np.column_stack([c + dc, r + dr])
-        sure = np.clip(contrast[rr, cc] / 10.0, 0.0, 1.0).astype(np.float64)
+        sure = np.clip(contrast[rr, cc] / config.window_sure_contrast, 0.0, 1.0).astype(np.float64)
         return Matches(a, np.asarray(b, np.float64), sure)
 
 
@@ -110,25 +101,27 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     filled = np.where(valid, gray, float(gray[valid].mean()) if valid.any() else 127.0)
     image = np.clip(filled, 0, 255).astype(np.uint8)
     rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
+    side = active().matchers.window_part_cells
     dense = torch.zeros((64, rows, cols), device=device())
     with torch.inference_mode():
-        for r in range(0, rows, _PART):
-            for c in range(0, cols, _PART):
+        for r in range(0, rows, side):
+            for c in range(0, cols, side):
                 part = _part(image, r, c)
-                dense[:, r : r + _PART, c : c + _PART] = part[:, : rows - r, : cols - c]
+                dense[:, r : r + side, c : c + side] = part[:, : rows - r, : cols - c]
     share = cv2.resize(
         valid[: rows * CELL_PX, : cols * CELL_PX].astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA
     )
-    return dense[:, :rows, :cols], share > 0.8
+    return dense[:, :rows, :cols], share > active().matchers.window_valid_share
 
 
 def _part(image: Gray, row: int, column: int) -> Any:
-    """Unit descriptors (64, <= _PART, <= _PART) of some cells: the network's memory grows with what it sees at once."""
+    """Unit descriptors (64, <= n, <= n) of n x n cells: the network's memory grows with what it sees at once."""
     import torch
 
-    r0, c0 = max(0, row - _MARGIN), max(0, column - _MARGIN)
-    r1, c1 = row + _PART + _MARGIN, column + _PART + _MARGIN
+    side, margin = active().matchers.window_part_cells, active().matchers.window_margin_cells
+    r0, c0 = max(0, row - margin), max(0, column - margin)
+    r1, c1 = row + side + margin, column + side + margin
     cut = image[r0 * CELL_PX : r1 * CELL_PX, c0 * CELL_PX : c1 * CELL_PX]
     found = extractor("xfeat").net(padded_tensor(cut, _STRIDE))[0]
-    found = found[0, :, row - r0 : row - r0 + _PART, column - c0 : column - c0 + _PART]
+    found = found[0, :, row - r0 : row - r0 + side, column - c0 : column - c0 + side]
     return torch.nn.functional.normalize(found, dim=0)

@@ -9,14 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers import cfog
 from orthoswarm.matchers.matcher import Array, Floats, MapMatcher, Mask, Matches
-
-AGREE_PX = 3.0
-"""A tile agrees with a homography if it lies within this of where the homography puts it."""
-FEWEST_TILES = 12
-_COARSE_PX = 6.0
-_SEARCH = (10, 6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +49,9 @@ def register(
     Returns:
         None where no homography is found at all; else what was found, however little it is to be trusted.
     """
+    config = active().matchers
     first = matcher.match(patch, valid, window, known, reach)
-    fit = magsac(first, _COARSE_PX)
+    fit = magsac(first, config.coarse_agreement_px)
     if fit is None or not plausible(fit, patch.shape, reach):
         shift = robust_shift(first)
         if shift is None:
@@ -66,15 +62,15 @@ def register(
     inside = known_below(known, apply(fit, centres.astype(float)))
     tried = centres[inside]
     found = Matches.none()
-    for search in _SEARCH:
+    for search in config.tile_search_px:
         found = cfog.match_tiles(own, other, valid, apply(fit, tried.astype(float)), tried, search)
         chosen = found if keep is None else found.take(keep(found, fit))
-        better = magsac(chosen, AGREE_PX)
+        better = magsac(chosen, config.agreement_px)
         if better is None or not plausible(better, patch.shape, reach):
             return Registration(fit, Matches.none(), 0.0, float("nan"), len(tried))
         fit = better
     error = found.b - apply(fit, found.a)
-    agrees = np.hypot(*error.T) < AGREE_PX
+    agrees = np.hypot(*error.T) < config.agreement_px
     if keep is not None:
         agrees &= keep(found, fit)
     share = float(agrees.sum()) / max(len(tried), 1)
@@ -86,11 +82,15 @@ def magsac(matches: Matches, threshold_px: float) -> Array | None:
     """Homography from a to b by MAGSAC++; None where there is none (also where OpenCV 5 throws because of it)."""
     import cv2
 
-    if len(matches) < 8:
+    config = active().matchers
+    if len(matches) < config.least_matches:
         return None
     cv2.setRNGSeed(1)
     try:
-        found, _ = cv2.findHomography(matches.a, matches.b, cv2.USAC_MAGSAC, threshold_px, None, 5000, 0.999)
+        found, _ = cv2.findHomography(
+            matches.a, matches.b, cv2.USAC_MAGSAC, threshold_px, None,
+            config.magsac_iterations, config.magsac_confidence,
+        )  # fmt: skip
     except cv2.error:
         return None
     if found is None or not np.isfinite(found).all() or abs(found[2, 2]) < 1e-12:
@@ -106,28 +106,32 @@ def apply(homography: Array, points: Array) -> Array:
 
 def plausible(homography: Array, shape: tuple[int, ...], reach: int) -> bool:
     """Whether a homography could be a correction of poses: mild scale and perspective, no corner beyond the reach."""
+    config = active().matchers
     rows, cols = shape
     corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], float)
     depth = np.c_[corners, np.ones(4)] @ homography[2]
-    if (depth < 0.5).any() or (depth > 2.0).any():
+    if (depth < config.plausible_depth[0]).any() or (depth > config.plausible_depth[1]).any():
         return False
     moved = apply(homography, corners)
-    if np.abs(moved - corners - reach).max() > 1.5 * reach + 0.05 * max(rows, cols):
+    most = config.plausible_reach * reach + config.plausible_side_share * max(rows, cols)
+    if np.abs(moved - corners - reach).max() > most:
         return False
     sides = np.linalg.norm(np.roll(moved, -1, 0) - moved, axis=1) / np.linalg.norm(
         np.roll(corners, -1, 0) - corners, axis=1
     )
-    return bool((sides > 0.8).all() and (sides < 1.25).all())
+    return bool((sides > config.plausible_stretch[0]).all() and (sides < config.plausible_stretch[1]).all())
 
 
-def robust_shift(matches: Matches, width_px: float = 8.0) -> Array | None:
-    """The shift that most matches share within a width, None where fewer than 8 or a tenth of them do."""
-    if len(matches) < 8:
+def robust_shift(matches: Matches) -> Array | None:
+    """The shift (2,) in pixels that most matches share, None where too few do."""
+    config = active().matchers
+    width_px, least = config.shift_width_px, config.least_matches
+    if len(matches) < least:
         return None
     shift = matches.b - matches.a
     best = shift[np.argmax([np.count_nonzero(np.abs(shift - s).max(1) < width_px) for s in shift])]
     near = np.abs(shift - best).max(1) < width_px
-    if near.sum() < max(8, 0.1 * len(shift)):
+    if near.sum() < max(least, config.shift_share * len(shift)):
         return None
     return np.asarray(np.median(shift[near], axis=0))
 

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, Mask, Matches, UnavailableError
 from orthoswarm.matchers.sparse_learned import device, read_state
 
-_COUNT = 4000
-_LEAST_CERTAINTY = 0.3
 
-
-def load(state: dict[str, Any], backbone: dict[str, Any], coarse_px: int = 560, upsample_px: int = 864) -> Any:
+def load(state: dict[str, Any], backbone: dict[str, Any]) -> Any:
     """The network from its own state and that of its DINOv2 backbone, on the fastest device of this machine.
 
     Raises:
@@ -37,8 +35,8 @@ def load(state: dict[str, Any], backbone: dict[str, Any], coarse_px: int = 560, 
 
     on_gpu = device().type == "cuda"
     options = {
-        "coarse_res": coarse_px,
-        "upsample_res": upsample_px,
+        "coarse_res": active().matchers.roma_coarse_px,
+        "upsample_res": active().matchers.roma_fine_px,
         "amp_dtype": torch.float16 if on_gpu else torch.float32,
         "use_custom_corr": on_gpu and find_spec("local_corr") is not None,  # a CUDA extension of its own
     }
@@ -66,11 +64,9 @@ class Roma:
 
     Attributes:
         network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
-        count: matches to sample.
     """
 
     network: Any
-    count: int = _COUNT
 
     @classmethod
     def make(cls) -> "Roma":
@@ -87,10 +83,10 @@ class Roma:
 
         first, second = (Image.fromarray(np.clip(g, 0, 255).astype(np.uint8)).convert("RGB") for g in (patch, window))
         warp, certainty = self.network.match(first, second, device=device())
-        found, sure = self.network.sample(warp, certainty, num=self.count)
+        found, sure = self.network.sample(warp, certainty, num=active().matchers.roma_samples)
         a, b = self.network.to_pixel_coordinates(found, *patch.shape, *window.shape)
         a, b = (t.detach().cpu().numpy().astype(np.float64) - 0.5 for t in (a, b))  # its pixel corners are integers
         score = sure.detach().cpu().numpy().astype(np.float64)
         near = np.abs(b - a - reach).max(1) <= reach
         c, r = np.clip(np.round(a), 0, np.array(patch.shape)[::-1] - 1).astype(np.int64).T
-        return Matches(a, b, score).take(near & (score >= _LEAST_CERTAINTY) & valid[r, c])
+        return Matches(a, b, score).take(near & (score >= active().matchers.roma_certainty) & valid[r, c])

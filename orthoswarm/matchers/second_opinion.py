@@ -4,13 +4,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, MapMatcher, Mask
-from orthoswarm.matchers.patch_registration import FEWEST_TILES, apply, register
+from orthoswarm.matchers.patch_registration import apply, register
 from orthoswarm.matchers.registry import map_matcher
 from orthoswarm.model.errors import InputError
-
-TRUSTED_SHARE = 0.35
-"""Least share of tiles that agree. By chance a tile agrees in one of twelve cases."""
 
 
 def second_opinion(
@@ -34,8 +32,9 @@ def second_opinion(
             matcher = _default()
         except InputError:
             return None
+    config = active().matchers
     found = register(patch, valid, window, known, reach, matcher)
-    if found is None or found.share < TRUSTED_SHARE or len(found.matches) < FEWEST_TILES:
+    if found is None or found.share < config.trusted_share or len(found.matches) < config.least_tiles:
         return None
     middle = np.median(found.matches.a, axis=0)[None]
     shift = (apply(found.homography, middle) - middle)[0] - reach

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Gray, Matches, UnavailableError
 
@@ -17,7 +18,6 @@ Kind = Literal["xfeat", "disk", "aliked"]
 _STRIDE = {"xfeat": 32, "disk": 16, "aliked": 32}
 _EXTRACTOR = {"xfeat": "xfeat", "disk": "disk", "aliked": "aliked"}
 _MATCHER = {"xfeat": "xfeat-lighterglue", "disk": "disk-lightglue", "aliked": "aliked-lightglue"}
-_DETECTION = 0.05
 
 
 def device() -> Any:
@@ -97,11 +97,10 @@ class Learned:
     """Keypoints of one network, matched by LightGlue.
 
     Attributes:
-        kind: which network. count: most keypoints a picture.
+        kind: which network.
     """
 
     kind: Kind = "xfeat"
-    count: int = 1024
 
     @classmethod
     def make(cls, kind: Kind) -> "Learned":
@@ -120,7 +119,7 @@ class Learned:
 
         with torch.inference_mode():
             one, two = self._features(a), self._features(b)
-            if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < 4:
+            if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < active().matchers.learned_least_keypoints:
                 return Matches.none()
             found = glue(self.kind)({"image0": one, "image1": two})
         pairs = found["matches"][0].cpu().numpy()
@@ -132,18 +131,20 @@ class Learned:
     def _features(self, gray: Gray) -> dict[str, Any]:
         import torch
 
+        config = active().matchers
+        count = config.learned_keypoints
         rows, cols = gray.shape
         image = padded_tensor(gray, _STRIDE[self.kind], 1 if self.kind == "xfeat" else 3)
         model = extractor(self.kind)
         if self.kind == "xfeat":
-            found = model.detectAndCompute(image, top_k=self.count, detection_threshold=_DETECTION)[0]
+            found = model.detectAndCompute(image, top_k=count, detection_threshold=config.learned_detection)[0]
             points, descriptors = found["keypoints"], found["descriptors"]
         elif self.kind == "disk":
-            result = model(image, n=self.count)[0]
+            result = model(image, n=count)[0]
             points, descriptors = result.keypoints, result.descriptors
         else:
             result = model(image)[0]
-            best = torch.argsort(result.keypoint_scores, descending=True)[: self.count]
+            best = torch.argsort(result.keypoint_scores, descending=True)[:count]
             points, descriptors = result.keypoints[best], result.descriptors[best]
         inside = (points[:, 0] <= cols - 1) & (points[:, 1] <= rows - 1)  # not in the padding
         points, descriptors = points[inside].float(), descriptors[inside].float()

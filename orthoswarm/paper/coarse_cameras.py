@@ -6,6 +6,7 @@ from time import process_time
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers import picture_matcher
 from orthoswarm.model.camera import focal_px
 from orthoswarm.model.frame import Frame
@@ -17,9 +18,6 @@ from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F,
 from orthoswarm.refine.bundle.flight_records import Array, read_records
 from orthoswarm.refine.features.grey_pictures import Pictures
 
-RECEIVER_SIGMA_M = 3.0
-"""How far a receiver may be off as a whole, which no line tells."""
-
 
 @dataclass(frozen=True, slots=True)
 class CoarseOptions:
@@ -28,15 +26,10 @@ class CoarseOptions:
     Attributes:
         fov_start_rad: guess that places the orthogonal centre, and what is taken where nothing can be matched.
         matcher: name of the picture matcher; None for the best available.
-        pairs: matched pairs a vehicle, about. ratio: their distance as a share of the height.
-        work_width: wider pictures are reduced.
     """
 
-    fov_start_rad: float = float(np.radians(80.0))
+    fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
     matcher: str | None = None
-    pairs: int = 40
-    ratio: float = 0.35
-    work_width: int = 960
 
 
 @dataclass(slots=True)
@@ -68,18 +61,18 @@ class CoarseVehicle:
 
 def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions) -> CoarseVehicle:
     """Coarse cameras of one vehicle (one lens) in the local frame: III.C from legs to Eq. 4."""
-    began = process_time()
+    began, config = process_time(), active().paper
     records = read_records(frames, LocalGrid(epsg), origin)
-    pictures = Pictures(frames, lambda f: read_gray(f.path), options.work_width)
+    pictures = Pictures(frames, lambda f: read_gray(f.path))
     leg = find_legs(records)
     count = int(leg.max()) + 1 if len(leg) else 0
     lines = [fit_line(records.position[leg == k, :2]) for k in range(count)]
     position = records.position.copy()
-    sigma = np.full(len(frames), float(np.hypot(RECEIVER_SIGMA_M, RECEIVER_SIGMA_M)))
+    sigma = np.full(len(frames), float(np.hypot(config.receiver_sigma_m, config.receiver_sigma_m)))
     for k, line in enumerate(lines):
         mine = leg == k
         position[mine, :2] = line.project(records.position[mine, :2])
-        sigma[mine] = np.hypot(RECEIVER_SIGMA_M, line.sigma_m)
+        sigma[mine] = np.hypot(config.receiver_sigma_m, line.sigma_m)
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     rotation = records.rotation()
@@ -88,8 +81,8 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     for k, line in enumerate(lines):
         members = np.flatnonzero(leg == k)
         along = line.along(records.position[members, :2])
-        share = max(3, round(options.pairs * len(members) / max(int((leg >= 0).sum()), 1)))
-        tasks += choose_pairs(along, position[members, 2], tilt[members], members, share, options.ratio)
+        share = max(config.scale_least_pairs, round(config.scale_pairs * len(members) / max(int((leg >= 0).sum()), 1)))
+        tasks += choose_pairs(along, position[members, 2], tilt[members], members, share)
     warnings = []
     found = None
     if records.has_height.any():
@@ -98,7 +91,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are taken")
     fov = start if found is None else found.mean
-    fov_sigma = np.radians(10.0) if found is None else found.sigma / np.sqrt(max(found.kept, 1))
+    fov_sigma = np.radians(config.unknown_fov_sigma_deg) if found is None else found.sigma / np.sqrt(max(found.kept, 1))
     width, height = frames[0].width, frames[0].height
     lens = np.zeros((1, 8))
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height

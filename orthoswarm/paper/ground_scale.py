@@ -6,15 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Gray, Matches, PictureMatcher
 from orthoswarm.model.camera import focal_px
+from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import Array
-
-NEAR_CENTRE = 0.3
-"""Matches count up to this share of the picture's height from the orthogonal centre."""
-FEWEST_MATCHES = 12
-FEWEST_PAIRS = 3
-_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +26,17 @@ class Gaussian:
     kept: int
 
 
-def gaussian(samples: Array, rounds: int = 20) -> Gaussian:
-    """Gaussian outlier suppression: mean and deviation of what lies within two deviations of the mean, repeated.
+def gaussian(samples: Array) -> Gaussian:
+    """Gaussian outlier suppression: mean and deviation of what lies near the mean, repeated.
 
     It starts at the median and the median deviation, since a mean of everything may be far from all of it.
     """
+    config = active().paper
     mean = float(np.median(samples))
-    sigma = 1.4826 * float(np.median(np.abs(samples - mean)))
+    sigma = mad_sigma(samples - mean)
     kept = samples
-    for _ in range(rounds):
-        inside = np.abs(samples - mean) <= _SIGMAS * max(sigma, 1e-12)
+    for _ in range(config.outlier_rounds):
+        inside = np.abs(samples - mean) <= config.outlier_sigmas * max(sigma, 1e-12)
         if not inside.any():
             break
         kept = samples[inside]
@@ -62,16 +59,17 @@ def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: fl
     Returns:
         Metres per pixel; None where too few matches agree.
     """
-    if len(matches) < FEWEST_MATCHES or flown_m <= 0:
+    config = active().paper
+    if len(matches) < config.scale_matches or flown_m <= 0:
         return None
     middle = 0.5 * (matches.a + matches.b)
     near = np.hypot(*(middle - centre).T) <= reach_px
     shift = np.hypot(*(matches.b - matches.a)[near].T)
-    shift = shift[shift > 2.0]
-    if len(shift) < FEWEST_MATCHES:
+    shift = shift[shift > config.scale_least_shift_px]
+    if len(shift) < config.scale_matches:
         return None
     found = gaussian(shift)
-    if found.kept < FEWEST_MATCHES or found.sigma > 0.2 * found.mean:
+    if found.kept < config.scale_matches or found.sigma > config.scale_scatter * found.mean:
         return None
     return flown_m / found.mean
 
@@ -102,10 +100,8 @@ class ScaleTask:
     tilt_rad: float
 
 
-def choose_pairs(
-    along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int, ratio: float
-) -> list[ScaleTask]:
-    """Up to `count` pairs of a leg, evenly spread, whose distance is nearest to `ratio` times the height.
+def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:
+    """Up to `count` pairs of a leg, evenly spread, whose distance is nearest to the wanted share of the height.
 
     Args:
         along: float64 (n,), distance along the line of the leg's frames, in flying order.
@@ -113,15 +109,16 @@ def choose_pairs(
         tilt: float64 (n,), radians from straight down.
         members: (n,), the frames' indices in the vehicle.
         count: how many pairs.
-        ratio: wanted distance as a share of the height.
     """
-    n = len(along)
+    config = active().paper
+    n, ratio = len(along), config.scale_pair_heights
+    least, most = config.scale_pair_range_heights
     found = []
     for i in np.unique(np.linspace(0, n - 2, min(count, n - 1)).round().astype(int)).tolist():
         later = np.arange(i + 1, n)
         j = int(later[np.argmin(np.abs(np.abs(along[later] - along[i]) - ratio * height[i]))])
         flown = float(abs(along[j] - along[i]))
-        if 0.05 * height[i] <= flown <= 1.0 * height[i]:
+        if least * height[i] <= flown <= most * height[i]:
             h, t = float(0.5 * (height[i] + height[j])), float(0.5 * (tilt[i] + tilt[j]))
             found.append(ScaleTask(int(members[i]), int(members[j]), flown, h, t))
     return found
@@ -153,15 +150,16 @@ def estimate_fov(
         start_rad: a first guess, which only places the orthogonal centre.
         matcher: for the pairs.
     """
+    config = active().paper
     focal = focal_px(start_rad, size[0])
     found = []
     for task in tasks:
         matches = matcher.match(gray(task.first), gray(task.second))
         centres = [orthogonal_centre(rotation[i], focal, size) for i in (task.first, task.second)]
         middle = (0.5 * (centres[0][0] + centres[1][0]), 0.5 * (centres[0][1] + centres[1][1]))
-        scale = metres_per_pixel(matches, middle, NEAR_CENTRE * size[1], task.flown_m)
+        scale = metres_per_pixel(matches, middle, config.scale_centre_share * size[1], task.flown_m)
         if scale is not None:
             found.append(field_of_view(scale, size[0], task.height_m, task.tilt_rad))
-    if len(found) < FEWEST_PAIRS:
+    if len(found) < config.scale_least_pairs:
         return None
     return gaussian(np.array(found))

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera
 from orthoswarm.refine.bundle.flight_records import Array
-
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +28,7 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> Pose:
     points = np.c_[corrected, np.zeros(len(corrected))]
     position = camera.position + np.array([*(corrected - camera.to_ground(pixels)).mean(axis=0), 0.0])
     current = Camera(position, camera.rotation, camera.lens)
-    for _ in range(_ROUNDS):
+    for _ in range(active().paper.pose_rounds):
         seen = current.project(points)
         jacobian = np.empty((2 * len(points), 6))
         for k in range(6):

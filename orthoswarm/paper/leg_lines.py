@@ -4,14 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.legs import split_legs
 from orthoswarm.refine.bundle.block_arrays import Ints
 from orthoswarm.refine.bundle.flight_records import Array, FlightRecords
-
-HEADING_RAD = np.radians(20.0)
-SHORTEST = 3
-_ON_LINE_M = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +55,7 @@ def find_legs(records: FlightRecords) -> Ints:
     number = 0
     for k in range(int(path.max()) + 1 if len(path) else 0):
         for run in _one_heading(np.flatnonzero(path == k).astype(np.int32), records.yaw):
-            if len(run) >= SHORTEST:
+            if len(run) >= active().paper.leg_photos:
                 out[run] = number
                 number += 1
     return _grown(out, records)
@@ -69,11 +66,13 @@ def _grown(leg: Ints, records: FlightRecords) -> Ints:
 
     The path alone tells a turn only a few frames away from it.
     """
+    config = active().paper
+    most_turned = np.radians(config.leg_heading_deg)
     out = leg.copy()
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
         members = np.flatnonzero(leg == k)
         line = fit_line(records.position[members, :2])
-        reach = max(3.0 * line.sigma_m, _ON_LINE_M)
+        reach = max(config.line_sigmas * line.sigma_m, config.line_distance_m)
         mean = np.angle(np.exp(1j * records.yaw[members]).mean())
         for start, step in ((members[-1] + 1, 1), (members[0] - 1, -1)):
             i = int(start)
@@ -81,7 +80,7 @@ def _grown(leg: Ints, records: FlightRecords) -> Ints:
             while 0 <= i < len(out) and out[i] < 0:
                 offset = records.position[i, :2] - line.project(records.position[i, None, :2])[0]
                 along = line.along(records.position[i, None, :2])[0]
-                turned = abs(wrap_rad(float(records.yaw[i] - mean))) > HEADING_RAD
+                turned = abs(wrap_rad(float(records.yaw[i] - mean))) > most_turned
                 if turned or np.hypot(*offset) > reach or (along - last) * step <= 0:
                     break
                 out[i], last = k, along
@@ -90,12 +89,13 @@ def _grown(leg: Ints, records: FlightRecords) -> Ints:
 
 
 def _one_heading(members: Ints, yaw: Array) -> list[Ints]:
-    """Runs of frames whose heading stays within HEADING_RAD of the run's mean."""
+    """Runs of frames whose heading stays near the run's mean."""
+    most_turned = np.radians(active().paper.leg_heading_deg)
     runs: list[list[int]] = []
     for i in members.tolist():
         if runs:
             mean = np.angle(np.exp(1j * yaw[runs[-1]]).mean())
-            if abs(wrap_rad(float(yaw[i] - mean))) <= HEADING_RAD:
+            if abs(wrap_rad(float(yaw[i] - mean))) <= most_turned:
                 runs[-1].append(i)
                 continue
         runs.append([i])

@@ -5,24 +5,19 @@ from time import perf_counter, process_time
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Floats, Mask
-from orthoswarm.matchers.patch_registration import FEWEST_TILES, Registration, apply, register
+from orthoswarm.matchers.patch_registration import Registration, apply, register
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
+from orthoswarm.model.robust import mad_sigma
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
-
-TRUSTED_SHARE = 0.35
-_GSD_RANGE = (0.3, 1.0)
-_FARTHEST_PX = 240
-_LARGEST_PX = 3_000_000
-_HEIGHT_TOLERANCE_M = 3.0
-_LEVER = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,18 +73,15 @@ class PatchOptions:
 
     Attributes:
         matcher: name of the map matcher; None for the best available.
-        reach_m: how far coarse cameras may be off, first try and second.
-        trusted: least share of tiles that agree.
     """
 
     matcher: str | None = None
-    reach_m: tuple[float, ...] = (30.0, 70.0)
-    trusted: float = TRUSTED_SHARE
 
 
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
     """Find one leg on the map."""
     began, clock = process_time(), perf_counter()
+    config, trust = active().paper, active().matchers
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
     centre = task.cameras.position[:, :2].mean(axis=0)
     gsd = patch_gsd(task.cameras, basemap.native_gsd_m)
@@ -99,15 +91,15 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
     if strip is not None:
         patch, valid, west, north = strip
         own = GroundGrid(basemap.epsg, west, north, gsd, patch.shape[1], patch.shape[0])
-        for reach_m in options.reach_m:
-            reach = min(int(np.ceil(reach_m / gsd)), _FARTHEST_PX)
+        for reach_m in config.patch_search_m:
+            reach = min(int(np.ceil(reach_m / gsd)), config.patch_most_search_px)
             window, known, there = map_window(basemap, origin, own, reach)
             if not known.any():
                 break
             consistent = HeightFilter(task.cameras, own, there)
             matcher = map_matcher(options.matcher)
             found = register(patch, valid, window, known, reach, matcher, consistent)
-            if found is not None and found.share >= options.trusted and len(found.matches) >= FEWEST_TILES:
+            if found is not None and found.share >= trust.trusted_share and len(found.matches) >= trust.least_tiles:
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
@@ -122,10 +114,11 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
 
 def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
     """Pixel of a leg's patch: that of the coarser of pictures and map, coarser still if the leg is long."""
+    config = active().paper
     own = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, F])
-    gsd = float(np.clip(max(own, map_gsd_m), *_GSD_RANGE))
-    spread = np.ptp(cameras.position[:, :2], axis=0) + 1.5 * own * float(cameras.lens[0, WIDTH])
-    return max(gsd, float(np.sqrt(spread[0] * spread[1] / _LARGEST_PX)))
+    gsd = float(np.clip(max(own, map_gsd_m), *config.patch_gsd_m))
+    spread = np.ptp(cameras.position[:, :2], axis=0) + config.patch_margin_widths * own * float(cameras.lens[0, WIDTH])
+    return max(gsd, float(np.sqrt(spread[0] * spread[1] / config.patch_most_px)))
 
 
 def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -> tuple[Floats, Mask, GroundGrid]:
@@ -174,6 +167,7 @@ class HeightFilter:
         """Which matches to keep, bool (N,)."""
         if not len(matches):
             return np.zeros(0, bool)
+        config = active().paper
         ground = self.own.to_ground(matches.a)
         lack = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
         away = ground[:, None] - self.cameras.position[None, :, :2]
@@ -181,10 +175,12 @@ class HeightFilter:
         lever = away[np.arange(len(ground)), nearest]
         rho = np.hypot(*lever.T)
         height = np.maximum(self.cameras.position[nearest, 2], 1.0)
-        leaning = rho > _LEVER * height
+        leaning = rho > config.roof_distance_share * height
         apparent = (lack * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
-        if leaning.sum() < FEWEST_TILES:
+        if leaning.sum() < active().matchers.least_tiles:
             return np.ones(len(matches), bool)
         usual = float(np.median(apparent[leaning]))
-        spread = 1.4826 * float(np.median(np.abs(apparent[leaning] - usual)))
-        return np.asarray(~leaning | (np.abs(apparent - usual) <= max(_HEIGHT_TOLERANCE_M, 2.0 * spread)))
+        spread = mad_sigma(apparent[leaning] - usual)
+        return np.asarray(
+            ~leaning | (np.abs(apparent - usual) <= max(config.roof_tolerance_m, config.roof_sigmas * spread))
+        )

@@ -11,20 +11,19 @@ from time import perf_counter, process_time
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
 from orthoswarm.model.task_runner import Run, serial
-from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
+from orthoswarm.paper.coarse_cameras import CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 
 Progress = Callable[[str, int, int], None]
-_NEAREST = 3
-_CARRIED_SIGMA_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +72,10 @@ class PaperRefiner:
         if _found(solution) or not any(_found(n) for n in neighbours):
             return solution
         return self.refine([p.frame for p in solution.placed], neighbours, basemap)
+
+    def refined_frames(self, solution: Solution) -> list[Frame]:
+        """All frames of a solution (placement.Refiner)."""
+        return [p.frame for p in solution.placed]
 
     def refine_batch(
         self,
@@ -224,19 +227,20 @@ def _carried(
 
     The second number is how far such a correction may be off, metres.
     """
+    config = active().paper
     number = np.arange(len(vehicle.frames), dtype=float)
     if matched:
         own = [(float(np.flatnonzero(vehicle.leg == k).mean()), f.shift) for k, f in matched.items()]
         shifts = np.array([s for _, s in own])
-        return carried_shift(number, own), float(max(np.hypot(*shifts.std(axis=0)), _CARRIED_SIGMA_M))
+        return carried_shift(number, own), float(max(np.hypot(*shifts.std(axis=0)), config.carried_sigma_m))
     if everyone:
         centre = np.array([c for c, _ in everyone])
         shifts = np.array([s for _, s in everyone])
         away = np.hypot(*(centre - vehicle.cameras.position[:, :2].mean(axis=0)).T)
-        nearest = np.argsort(away)[:_NEAREST]
+        nearest = np.argsort(away)[: config.carrying_neighbours]
         usual = np.median(shifts[nearest], axis=0)
-        return np.tile(usual, (len(number), 1)), RECEIVER_SIGMA_M
-    return None, RECEIVER_SIGMA_M
+        return np.tile(usual, (len(number), 1)), config.receiver_sigma_m
+    return None, config.receiver_sigma_m
 
 
 def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, carried: bool) -> list[Leg]:

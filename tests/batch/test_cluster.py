@@ -143,8 +143,8 @@ def test_a_path_that_workers_do_not_see_is_refused(loopback, tmp_path):
         Cluster(loopback.address, [tmp_path / "missing"])
 
 
-def test_a_wrong_address_is_one_sentence(monkeypatch):
-    monkeypatch.setattr("orthoswarm.compute.dask_cluster.CONNECT_S", 0.5)
+def test_a_wrong_address_is_one_sentence(configure):
+    configure({"compute": {"cluster_connect_s": 0.5}})
     with pytest.raises(InputError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         Cluster("tcp://127.0.0.1:9")
     for address in ("nonsense:::", "scheduler", "tcp://10.0.0.1"):

@@ -184,8 +184,9 @@ class FakeRoma:
         return found[:, :2], found[:, 2:]
 
 
-def test_romas_matches_are_on_pixel_centres_and_within_reach(ground):
-    found = Roma(FakeRoma(), count=200).match(*case(ground[0]), REACH)
+def test_romas_matches_are_on_pixel_centres_and_within_reach(ground, configure):
+    configure({"matchers": {"roma_samples": 200}})
+    found = Roma(FakeRoma()).match(*case(ground[0]), REACH)
     assert 100 < len(found) < 180 and found.score.min() >= 0.3
     assert found.b - found.a == pytest.approx(np.tile([9.0 + REACH, -13 + REACH], (len(found), 1)))
 

@@ -33,11 +33,12 @@ def files(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_roma_is_made_of_its_weight_files_and_matches(files):
-    network = load(read_state("roma"), read_state("roma-dinov2"), COARSE_PX, UPSAMPLE_PX)
+def test_roma_is_made_of_its_weight_files_and_matches(files, configure):
+    configure({"matchers": {"roma_coarse_px": COARSE_PX, "roma_fine_px": UPSAMPLE_PX, "roma_samples": 500}})
+    network = load(read_state("roma"), read_state("roma-dinov2"))
     window = np.random.default_rng(0).uniform(0, 255, (200, 240)).astype(np.float32)
     patch = window[20:180, 20:220]
-    found = Roma(network, count=500).match(patch, np.ones(patch.shape, bool), window, np.ones(window.shape, bool), 20)
+    found = Roma(network).match(patch, np.ones(patch.shape, bool), window, np.ones(window.shape, bool), 20)
     assert found.a.shape == found.b.shape == (len(found), 2)
     if len(found):  # it has learned nothing: where its matches lie is chance, but not how far they may
         assert np.abs(found.b - found.a - 20).max() <= 20 and found.score.min() >= 0.3

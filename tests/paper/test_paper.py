@@ -23,8 +23,14 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords
 from telemetry import load
 from tests.kit.scene import FOV, Scene, legs
 
-OPTIONS = Options(CoarseOptions(matcher="sift", pairs=9), PatchOptions(matcher="cfog", reach_m=(25.0,)))
+OPTIONS = Options(CoarseOptions(matcher="sift"), PatchOptions(matcher="cfog"))
 BIAS = (6.0, -4.0)
+
+
+@pytest.fixture(autouse=True)
+def _small(configure):
+    """Fewer pairs and a shorter search than usual: the scenes are small."""
+    configure({"paper": {"scale_pairs": 9, "patch_search_m": (25.0, 25.0)}})
 
 
 # -- III.C --------------------------------------------------------------------------------------------------------
@@ -120,7 +126,7 @@ def test_no_scale_without_matches_that_agree():
 
 def test_pairs_have_the_wanted_distance():
     along, height = np.arange(30) * 10.0, np.full(30, 100.0)
-    tasks = choose_pairs(along, height, np.zeros(30), np.arange(30) + 7, 6, 0.35)
+    tasks = choose_pairs(along, height, np.zeros(30), np.arange(30) + 7, 6)
     assert 4 <= len(tasks) <= 6
     assert all(10 <= t.flown_m <= 40 and t.second > t.first >= 7 for t in tasks)
 

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.batch import pipeline
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
-    from orthoswarm.config import read_overrides
+    from orthoswarm.config import override, read_overrides
     from orthoswarm.model.errors import InputError
     from orthoswarm.model.frame import Ingest
 
@@ -88,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
         pixel_scale=args.pixel_scale,
         config=read_overrides(args.config) if args.config is not None else {},
     )
+
+    override(options.config)  # before workers are made, which have values of their own
 
     def load(progress: pipeline.Progress) -> Ingest:
         reading = telemetry.LoadOptions(

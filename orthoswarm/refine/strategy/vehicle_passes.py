@@ -1,7 +1,7 @@
 """The two passes of one vehicle: by itself, then on the common level beside neighbours that are held."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,12 +45,10 @@ class Options:
 
     Attributes:
         fov_start_rad: field of view to start from where the tags hint at none.
-        work_width: pictures wider than this are reduced for the refinement.
         dem: shape of the ground from outside, None to find it from the pictures.
     """
 
-    fov_start_rad: float = float(np.radians(80.0))
-    work_width: int = 960
+    fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
     dem: HeightModel | None = None
 
     def ground(self, origin: Array) -> GroundModel:

@@ -1,0 +1,23 @@
+"""Workers and memory. These change how long a run takes, never its products."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ComputeConfig:
+    """Workers and memory. These change how long a run takes, never its products."""
+
+    queue_per_process: int = 4
+    """Items begun or done ahead of the one that is waited for, for each process (chosen; bounds memory)."""
+    trim_after_s: float = 0.5
+    """After a task that took more CPU seconds unused memory goes back to the system (chosen)."""
+    cluster_connect_s: float = 20.0
+    """Time to reach a Dask scheduler, seconds (chosen)."""
+    cluster_queue_per_worker: int = 3
+    """Items sent to a cluster for each worker, so that none waits for the network (chosen)."""
+    cluster_poll_s: float = 1.0
+    """How often the cluster's workers are counted while a result is awaited, seconds (chosen)."""
+    cluster_patience_s: float = 120.0
+    """A cluster without workers is given up after so many seconds: machines restart within that(chosen)."""
+    canvas_mb: float = 48.0
+    """Memory that a canvas keeps of its tiles, megabytes; tiles beyond it are on disk (chosen)."""
