@@ -66,6 +66,18 @@ class BundleConfig:
     """With fewer ties about a photo a systematic offset of the map there is not estimated (chosen; not measured)."""
     systematic_reach_photos: int = 4
     """... which uses the ties of so many photos before and after, of the same leg (chosen; not measured)."""
+    variogram_near_heights: tuple[float, float] = (0.4, 0.6)
+    """Distance of ties within a photo, flying heights, least and most: half a photo (of a square's points 0.52 of its
+    side on average; photos of 640 x 480 with 90 degrees are 2 by 1.5 heights, those ties that hold it nearer)."""
+    variogram_far_heights: float = 1.0
+    """Ties farther apart than so many flying heights show the distortion's full variance (chosen: past a photo)."""
+    distortion_followed: float = 1.5
+    """Variance of the map's distortion that the adjustment followed, for one that it left (three simulated sets of 120
+    photos on maps distorted by 1 to 3 m over 150 and 300 m: 1.0 to 1.9)."""
+    variogram_least_pairs: int = 30
+    """With fewer pairs of ties at either distance the map's distortion is not estimated (chosen; not measured)."""
+    variogram_most_ties: int = 500
+    """Of more ties every so many-th is used: pairs grow with their square (chosen for its cost)."""
     systematic_sigmas: float = 2.0
     """So many sigmas of the ties' median are taken off before it counts as a systematic offset (chosen)."""
     oblique_axis_down: float = 0.2

@@ -95,6 +95,38 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
     return out
 
 
+def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
+    """Variance of an axis of what the map is displaced by under a whole picture, from place to place, metres squared.
+
+    Matching noise differs from tie to tie, a distortion of the map is alike for neighbouring ties: so the semivariogram
+    of the residuals rises with distance by the distortion's variance. What differs within a picture averages out over
+    its ties: the variance of a mean over it is the semivariogram far away less that at the usual distance within it
+    (Cressie 1993, Statistics for Spatial Data, chapter 2). Medians instead of means of the
+    squared differences, as ties may be wrong: of two Gaussian axes ln 2 of the mean. That is what the adjustment left;
+    it followed somewhat more (`distortion_followed`).
+
+    Args:
+        place: float64 (Q, 2), where the ties are. residual: float64 (Q, 2), of them after the adjustment, metres.
+        height_m: flying height.
+
+    Returns:
+        0 where there are too few pairs of ties near each other and far apart to tell.
+    """
+    config = active().bundle
+    step = max(1, -(-len(place) // config.variogram_most_ties))
+    place, residual = place[::step], residual[::step]
+    i, j = np.triu_indices(len(place), 1)
+    apart = np.hypot(*(place[i] - place[j]).T)
+    half = ((residual[i] - residual[j]) ** 2).sum(1) / 4.0
+    inner, outer = config.variogram_near_heights
+    near = half[(apart > inner * height_m) & (apart < outer * height_m)]
+    far = half[apart > config.variogram_far_heights * height_m]
+    if min(len(near), len(far)) < config.variogram_least_pairs:
+        return 0.0
+    left = float(np.median(far) - np.median(near)) / float(np.log(2.0))
+    return max(0.0, config.distortion_followed * left)
+
+
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
     """Variance of an axis, mean of both, of the point where the picture's optical axis meets the ground (height 0)."""
     rotation, height = adjustment.cameras.rotation[i], max(float(adjustment.cameras.position[i, 2]), 1.0)

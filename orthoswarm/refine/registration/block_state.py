@@ -43,6 +43,8 @@ class VehicleState:
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
             were carry it.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
+        map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
+            more than the error that all ties have in common; NaN without ties.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -68,6 +70,7 @@ class VehicleState:
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unfound: bool = False
     false_matches: float = float("nan")
+    map_distortion_m2: float = float("nan")
 
 
 def lies_on_map(state: VehicleState) -> bool:

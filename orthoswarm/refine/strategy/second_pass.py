@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.refine.bundle.covariance import common_map_sigma, frame_sigmas, systematic_tie_offset
+from orthoswarm.refine.bundle.covariance import (
+    common_map_sigma,
+    frame_sigmas,
+    map_distortion_variance,
+    systematic_tie_offset,
+)
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, resettle, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
@@ -79,6 +84,11 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
     if state.on_map and len(adj.tie_residual) == len(state.matches.camera):
+        place, height = adj.points[state.matches.point, :2], float(np.median(adj.cameras.position[:, 2]))
+        beyond = (
+            map_distortion_variance(place, adj.tie_residual, height) - floor**2
+        )  # of which the floor covers so much
+        state.map_distortion_m2 = max(0.0, beyond)
         off = systematic_tie_offset(flight.leg, state.matches.camera, adj.tie_residual)
         off[off < active().strategy.coherent_sigmas * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)

@@ -28,6 +28,7 @@ from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
     coarse_terrain,
     common_terrain,
+    map_distortion_sigma,
     mapped_level,
     neighbours_of,
     pooled_lean,
@@ -123,6 +124,10 @@ class SwarmRefiner:
             beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
             item = (own[k], beside, float(network.correction_m[k]) - anchor)
             done[k] = second_pass(item, basemap=basemap, origin=self.origin)
+        distortion = map_distortion_sigma([*done, *others])
+        for state in done:
+            if state.on_map:  # what neighbours carry has it with their sigma
+                state.sigma_m = np.hypot(state.sigma_m, distortion)
         terrain = common_terrain([*done, *others], self.options.ground(self.origin).dem)[0]
         level = mapped_level(done, terrain)
         terrain = _shifted(terrain, self.origin)
@@ -152,6 +157,10 @@ class SwarmRefiner:
         coarse = [to_solution(s, origin, below, coarse=True) for s in states]
         states = _second_passes(states, basemap, self.epsg, origin, run, progress)
         _level(states)
+        distortion = map_distortion_sigma(states)
+        for state in states:
+            if lies_on_map(state):
+                state.sigma_m = np.hypot(state.sigma_m, distortion)
         terrain, warnings = common_terrain(states, self.options.ground(origin).dem)
         level = mapped_level(states, terrain)
         terrain = _shifted(terrain, origin)

@@ -79,6 +79,15 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     return drawn, _doubts(given, fit is None, off, states) if given is not None else []
 
 
+def map_distortion_sigma(states: Sequence[VehicleState]) -> float:
+    """What the map itself is displaced by from place to place, metres, as a stated sigma; all vehicles saw one map."""
+    found = [(s.map_distortion_m2, len(s.matches.point)) for s in states if np.isfinite(s.map_distortion_m2)]
+    if not found:
+        return 0.0
+    variance, ties = np.array(found, float).T
+    return active().bundle.stated_sigma_factor * float(np.sqrt(variance @ ties / max(ties.sum(), 1.0)))
+
+
 def mapped_level(states: Sequence[VehicleState], terrain: Terrain | None) -> float:
     """Level of the ground that vehicles map, metres; terrain: theirs, in the local frame."""
     position = np.concatenate([np.zeros((0, 3)), *(s.flight.adjustment.cameras.position for s in states)])

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from orthoswarm.config import active
-from orthoswarm.refine.bundle.covariance import common_map_sigma, systematic_tie_offset
+from orthoswarm.refine.bundle.covariance import (
+    common_map_sigma,
+    map_distortion_variance,
+    systematic_tie_offset,
+)
 
 BUNDLE = active().bundle
 
@@ -47,3 +51,20 @@ def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not()
     off = systematic_tie_offset(leg, camera, residual)
     assert off[:15].max() < 0.1
     assert off[32:].min() > 0.8
+
+
+def test_a_distorted_map_is_told_from_one_whose_ties_only_scatter():
+    """What neighbouring ties have in common is the map's distortion; what differs from tie to tie is not."""
+    rng = np.random.default_rng(3)
+    place = rng.uniform(0.0, 600.0, (400, 2))
+    noise = rng.normal(0.0, 0.2, (400, 2))
+    waves = 1.5 * np.sin(place[:, ::-1] / 100.0)
+    assert map_distortion_variance(place, noise, 150.0) < 0.15**2
+    found = map_distortion_variance(place, noise + waves, 150.0)
+    assert 0.5 * waves.var() < found / BUNDLE.distortion_followed < 1.5 * waves.var()
+    ripples = 1.5 * np.sin(place[:, ::-1] / 5.0)
+    assert map_distortion_variance(place, noise + ripples, 150.0) < 0.2 * ripples.var(), "averages out in a picture"
+    wrong = noise + waves
+    wrong[::10] += 8.0
+    assert map_distortion_variance(place, wrong, 150.0) == pytest.approx(found, rel=0.5)
+    assert map_distortion_variance(place[:5], noise[:5], 150.0) == 0.0

@@ -1,0 +1,117 @@
+"""Is the stated error true? Shares of pictures within one and two `sigma_m`, on maps that are right and distorted ones.
+
+    python -m benchmarks.sigma_truth SET... [--kinds plain season 2x150 ...] [--out FILE.jsonl]
+
+SET is a folder of `orthoswarm twin make`. A kind `AxL` is the set's basemap warped by a smooth random field: its
+displacements have a root mean square length of A metres and a Gaussian correlation of length L metres. The truth stays,
+so that `sigma_m` has to cover what the map is wrong by. A line a run: the error of the pictures' middles on the stated
+plane, and the shares of it within one and two sigma, of each axis and of its length.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import telemetry
+from benchmarks.wrong_maps import altered, season
+from orthoswarm.batch.refiners import make_refiner
+from orthoswarm.evaluation.true_cameras import read_truth
+from orthoswarm.model.geo import local_origin
+from orthoswarm.mosaic.extent import from_takeoff, solved_level
+from orthoswarm.mosaic.recorded_pose import area_grid
+from orthoswarm.raster.basemap import Basemap
+
+KINDS = ("plain", "season", "1x50", "1x150", "1x300", "2x150", "3x50", "3x150", "3x300")
+
+
+def warped(picture, gsd_m, rms_m, length_m, seed=1):
+    """A map (bands, rows, columns) whose content is displaced by a smooth random field."""
+    rows, columns = picture.shape[1:]
+    step = max(1, round(length_m / gsd_m / 8))  # the field is smooth: it is drawn on a coarse grid
+    sigma = length_m / gsd_m / step / np.sqrt(2)  # white noise blurred by this has that correlation length
+    margin = int(np.ceil(4 * sigma))
+    size = (-(-rows // step) + 2 * margin, -(-columns // step) + 2 * margin)
+    random = np.random.default_rng(seed)
+    field = []
+    for _ in range(2):
+        smooth = cv2.GaussianBlur(random.normal(size=size), (0, 0), sigma)
+        smooth *= 2 * np.sqrt(np.pi) * sigma * rms_m / np.sqrt(2) / gsd_m
+        inner = smooth[margin:-margin, margin:-margin].astype(np.float32)
+        field.append(cv2.resize(inner, (columns, rows), interpolation=cv2.INTER_CUBIC))
+    column, row = np.meshgrid(np.arange(columns, dtype=np.float32), np.arange(rows, dtype=np.float32))
+    moved = [
+        cv2.remap(b, column + field[0], row + field[1], cv2.INTER_LINEAR, None, cv2.BORDER_REFLECT) for b in picture
+    ]
+    return np.stack(moved)
+
+
+def write_map(source, target, kind):
+    """The set's basemap, or a changed one, as a file."""
+    if kind in ("plain", "season"):
+        altered(source, target, season if kind == "season" else lambda picture, _: picture)
+        return
+    rms_m, length_m = (float(v) for v in kind.split("x"))
+    altered(source, target, lambda picture, gsd_m: warped(picture, gsd_m, rms_m, length_m))
+
+
+def measure(folder, basemap_file):
+    """Errors and stated errors of a set with a map."""
+    frames = telemetry.load([folder / "photos"]).frames
+    grid = area_grid(frames)
+    vehicles = {}
+    for frame in frames:
+        vehicles.setdefault(frame.vehicle, []).append(frame)
+    start = time.process_time()
+    refiner = make_refiner("swarm", grid.epsg, local_origin(grid, frames))
+    refinement = refiner.refine_batch(vehicles, Basemap.open(basemap_file, grid.epsg))
+    seconds = time.process_time() - start
+    truth = read_truth(folder / "truth" / "frames.csv")
+    placed = [p for solution in refinement.fine for p in solution.placed]
+    placed, level = from_takeoff(placed, solved_level(refinement.fine), refinement.terrain)
+    error = []
+    for p in placed:
+        true = truth[p.frame.image][2]
+        middle = np.array(true.lens.principal_point)
+        error.append(p.camera.to_ground(middle, level) - true.to_ground(middle, level))
+    error, sigma = np.array(error), np.array([p.sigma_m for p in placed])
+    length = np.hypot(*error.T)
+    states = [leg.state for solution in refinement.fine for leg in solution.legs]
+    return {
+        "pictures": len(placed), "fine": sum(p.stage == "fine" for p in placed), "matched": states.count("matched"),
+        "legs": len(states), "median_m": round(float(np.median(length)), 3),
+        "p95_m": round(float(np.percentile(length, 95)), 3), "sigma_m": round(float(np.median(sigma)), 3),
+        "axis_1": share(np.abs(error), sigma[:, None]), "axis_2": share(np.abs(error), 2 * sigma[:, None]),
+        "length_1": share(length, sigma), "length_2": share(length, 2 * sigma), "cpu_s": round(seconds, 1),
+    }  # fmt: skip
+
+
+def share(error, limit):
+    """Percentage of errors within a limit."""
+    return round(100 * float((error <= limit).mean()))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", nargs="+", type=Path)
+    parser.add_argument("--kinds", nargs="+", default=KINDS)
+    parser.add_argument("--out", type=Path, help="lines are added to this file")
+    args = parser.parse_args()
+    for folder in args.sets:
+        for kind in args.kinds:
+            with tempfile.TemporaryDirectory() as scratch:
+                target = Path(scratch) / "map.tif"
+                write_map(folder / "basemap.tif", target, kind)
+                row = {"set": folder.name, "map": kind, **measure(folder, target)}
+            print(json.dumps(row), flush=True)
+            if args.out:
+                with args.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()
