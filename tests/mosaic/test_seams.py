@@ -56,7 +56,8 @@ def test_in_haze_the_clearest_picture_wins(tmp_path):
     hazy = flight.frames[0].frame.image
     flight.pictures[hazy] = np.rint(150.0 + 0.3 * (flight.pictures[hazy].astype(float) - 128.0)).astype(np.uint8)
     nearest = drawn(tmp_path / "nearest", flight, seams=False)[1]
-    both = np.logical_and(*(scene.seen(c, scene.grid(260.0), margin=4.0)[0] for c in flight.cameras))
+    # contrasts are compared at nodes some 60 m apart here: beside the clear picture's border there is none to compare
+    both = np.logical_and(*(scene.seen(c, scene.grid(260.0), margin=20.0)[0] for c in flight.cameras))
     assert (nearest[both] == 1).mean() > 0.4
     assert (drawn(tmp_path / "cost", flight)[1][both] == 2).mean() > 0.95
 

@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 
 NONE, FOREIGN = -1, -2
 """Labels of cells that no picture sees, and of a neighbour's cells whose picture is no candidate here."""
-_SCHEDULE = ((8, 0), (8, 4), (4, 0), (4, 2), (2, 0), (2, 1), (1, 0), (1, 0))
+_SCHEDULE = ((8, 0), (4, 2), (2, 1), (1, 0))
 """Sides and offsets of the blocks that are moved, in cells."""
 _MOST_LABELS = 8
 

@@ -18,7 +18,7 @@ Ints = NDArray[np.int32]
 
 BORDER_PX = 32
 """Pixels around a tile that its seams are chosen together with, so that they go on well in the next tile."""
-_LEAST_CELL_PX, _MOST_CELL_PX = 2, 8
+_LEAST_CELL_PX, _MOST_CELL_PX = 4, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class SeamCells:
 
 
 def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
-    """Side of the cells, pixels of the map (2, 4 or 8): about a pixel of the previews.
+    """Side of the cells, pixels of the map (4 or 8): about a pixel of the previews.
 
     Args:
         picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
