@@ -108,7 +108,7 @@ def test_a_vehicle_that_stood_at_one_spot_stays_as_recorded_and_says_so(daemon, 
     assert job.detail["warnings"] == ["v1: all pictures were taken at one spot; they are placed as recorded"]
     assert set(stages(daemon).values()) == {"realtime"}
     (coarse,) = [job for job in daemon.jobs.all() if job.kind == "coarse"]
-    assert "stays where its receiver says" in coarse.detail["note"]
+    assert "lies where its receiver says" in coarse.detail["note"]
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
 
 

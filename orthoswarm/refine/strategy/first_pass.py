@@ -1,4 +1,4 @@
-"""The first pass of a batch: each vehicle by itself, or matched together with others, then onto the map."""
+"""The first pass of a batch: each vehicle by itself, or matched together with others, then registered on the map."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -39,24 +39,24 @@ def first_passes(
     Returns:
         The states of all units that could be adjusted, in order; unit -> why not, of the others.
     """
-    # The network for the second look is loaded by one process only, afterwards.
+    # Learned matching is left to one process afterwards: its network takes 400 MB.
     task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
         if progress:
             progress("solo", n + 1, len(units))
-    waiting = [k for k, state in enumerate(states) if state is None]
+    unfollowed = [k for k, state in enumerate(states) if state is None]
     lost: dict[int, str] = {}
-    if waiting:
+    if unfollowed:
         watch = Stopwatch()
-        opened = _sparse_flights([units[k] for k in waiting], grid, origin, run, progress)
+        opened = _sparse_flights([units[k] for k in unfollowed], grid, origin, run, progress)
         watch.lap("tracks")
-        lost = {k: flight for k, flight in zip(waiting, opened, strict=True) if isinstance(flight, str)}
+        lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
         flights = [flight for flight in opened if not isinstance(flight, str)]
         place = partial(matched, origin=origin, basemap=basemap, options=options, learned=False)
-        for k, state in zip([k for k in waiting if k not in lost], run(place, flights), strict=True):
-            state.timings["tracks"] = watch.seconds["tracks"] / len(waiting)
+        for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
+            state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
             states[k] = state
     return _second_looks([state for state in states if state is not None], basemap, origin, run, progress), lost
 
@@ -64,9 +64,9 @@ def first_passes(
 def _sparse_flights(
     units: Sequence[list[Frame]], grid: LocalGrid, origin: Array, run: Run, progress: Progress | None
 ) -> list[Flight | str]:
-    """Flights matched and adjusted together; each by itself where that fails; why, of one that fails by itself.
+    """Flights whose photos are matched and adjusted together, each by itself where that fails; else the reason.
 
-    Photos of one vehicle that do not hold together must not cost the others theirs.
+    A vehicle whose photos match nothing must not keep the others from being adjusted.
     """
     try:
         return list(open_sparse_flights(units, grid, origin, read_frame, run, progress))
@@ -83,7 +83,7 @@ def _second_looks(
     run: Run,
     progress: Progress | None,
 ) -> list[VehicleState]:
-    """Learned matching for the flights that edges did not find, here, one after the other; then settled as usual."""
+    """Learned matching in this process for flights that edges did not find on the map; then registered as others."""
     lost = [k for k, state in enumerate(states) if state.unfound]
     found = []
     for n, k in enumerate(lost):

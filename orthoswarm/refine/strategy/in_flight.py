@@ -1,10 +1,9 @@
-"""The coarse map in flight: pictures of legs that are over, adjusted with each other and laid on the map as a whole.
+"""The coarse map in flight: pictures of finished legs, adjusted with each other and registered on the map as one block.
 
-Tracks and relative adjustment as on completion, then the consensus shift of its windows on the map; no tie points, no
-second pass. A single straight run is another matter than a whole flight: it cannot tell
-the receiver's drift from the camera's tilt, so there the drift is held. Measured on simulated flights with biases and
-drift: one leg is 2 to 4 m off on the map (without the hold up to 12 m, or not found at all), from two legs in opposite
-directions on 0.5 to 2 m.
+Tracks and adjustment without a map as on completion, then the consensus shift of its windows on the map; no tie points,
+no second pass. On a single straight leg the receiver's drift and the camera's tilt are not separable, so the drift is
+held there. Measured on simulated flights with biases and drift: one leg is 2 to 4 m off on the map (up to 12 m, or not
+found at all, where the drift is not held), two legs in opposite directions 0.5 to 2 m.
 """
 
 from collections.abc import Sequence
@@ -47,7 +46,7 @@ def place_in_flight(
     """Coarse placement of a vehicle's pictures so far.
 
     Args:
-        frames: pictures of legs that are over, in order of time, of one vehicle; turns between them included.
+        frames: pictures of finished legs of one vehicle, in order of time, with the turns between them.
         epsg: the area's grid. origin: float64 (2,) of the local frame.
         basemap: the map, or None to stay in the receiver's frame.
         options: see Options.
@@ -56,29 +55,29 @@ def place_in_flight(
         A solution of stage coarse without state; its legs say how the map holds them (failed where there is none).
 
     Raises:
-        OrthoSwarmError: the pictures do not hold together (yet); the sentence says why.
+        OrthoSwarmError: the block of pictures cannot be adjusted (yet); the message says why.
     """
     if frames and hovering_vehicles(recorded_cameras(frames, LocalGrid(epsg)).placed):
-        raise OrthoSwarmError("all its pictures were taken at one spot; they stay as they were recorded")
+        raise OrthoSwarmError("all its pictures were taken at one spot; they are drawn where its receiver says")
     units = split_units({frames[0].vehicle: frames} if frames else {})
     fewest = active().strategy.sparse_fewest
     found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= fewest]
     if not found:
-        raise OrthoSwarmError(f"{len(frames)} pictures are too few to be laid side by side; more will come")
+        raise OrthoSwarmError(f"{len(frames)} pictures are too few to be adjusted; the next leg is tried")
     return replace(merge_units(found)[0], state=None)
 
 
 def coarse_of(solution: Solution, origin: Array) -> Solution:
-    """The coarse placement that a refined solution began from, on the map where that was found.
+    """The coarse placement that a refined solution started from, registered on the map where it was found there.
 
     Raises:
         OrthoSwarmError: the solution has no state, as that of a vehicle that stood at one spot.
     """
     if solution.state is None:
-        raise OrthoSwarmError(f"{solution.vehicle} stays where its receiver says; there is no other coarse placement")
+        raise OrthoSwarmError(f"{solution.vehicle} lies where its receiver says; there is no other coarse placement")
     states = solution.state if isinstance(solution.state, list) else [solution.state]
     if not all(isinstance(state, VehicleState) for state in states):
-        raise OrthoSwarmError(f"nothing is known of how {solution.vehicle} was refined; refine it again")
+        raise OrthoSwarmError(f"{solution.vehicle} was refined by another refiner; refine it again")
     parts = []
     for state in states:
         shift = np.asarray(getattr(state, "map_shift", np.zeros(2)))
@@ -95,7 +94,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     flight = open_flight(frames, grid, origin, read_frame, start) if enough else None
     if flight is None:
         if len(frames) > active().strategy.sparse_most:
-            raise OrthoSwarmError("its pictures cannot be followed from one to the next; they wait for the refinement")
+            raise OrthoSwarmError("its pictures overlap too little to be placed in flight; the refinement places them")
         flight = open_sparse_flight(frames, grid, origin, read_frame)
         one_way = leads_one_way(flight.records.position, flight.leg)
     else:
@@ -135,12 +134,16 @@ def _hold_drift(flight: Flight) -> None:
 
 
 def _check(flight: Flight) -> None:
-    """Refuse what a few pictures can make of themselves but no camera can be."""
+    """Refuse an adjustment whose lens, height or attitudes are impossible.
+
+    Raises:
+        OrthoSwarmError: they are.
+    """
     config, cameras, records = active().strategy, flight.cameras(), flight.records
     if float(np.median(observations_per_camera(flight))) < active().flight.held_observations:
-        raise OrthoSwarmError("its pictures show too little that one can be laid beside the other")
+        raise OrthoSwarmError("its pictures have too few points in common")
     if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
-        raise OrthoSwarmError("its pictures do not hold together yet")
+        raise OrthoSwarmError("its pictures cannot be adjusted yet")
     focal = float(cameras.lens[0, 0])
     height = float(np.median(cameras.position[:, 2]))
     begun = flight.calibration.height_m
@@ -153,7 +156,7 @@ def _check(flight: Flight) -> None:
         or abs(np.log(max(height, 0.1) / begun)) > config.odd_height_change
         or tilt_off
     ):
-        raise OrthoSwarmError("its pictures do not hold together yet; they stay as they were recorded")
+        raise OrthoSwarmError("its pictures cannot be adjusted yet; they are drawn where its receiver says")
 
 
 def _shifted(state: VehicleState, shift: Array) -> VehicleState:
@@ -164,7 +167,7 @@ def _shifted(state: VehicleState, shift: Array) -> VehicleState:
 
 
 def _scatter(fit: CoarseFit) -> float:
-    """How far windows that agree lie from the correction that was taken, metres."""
+    """Median distance of the agreeing windows' shifts from the correction, metres."""
     off = [
         np.hypot(*(np.asarray(m.shift) - fit.correction[(m.first + m.last) // 2]))
         for m, ok in zip(fit.matches, fit.inlier, strict=True)

@@ -1,4 +1,4 @@
-"""The second pass of a vehicle: beside its neighbours, with fresh ties, its own errors, and denser ground."""
+"""The second pass of a vehicle: held neighbours, new tie points, sigmas, denser ground."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -33,13 +33,18 @@ def second_pass(
     basemap: MapWindow | None,
     origin: Array,
 ) -> VehicleState:
-    """One vehicle again: common level, links into held neighbours, fresh ties; then denser ground."""
+    """Adjust one vehicle again on the common level, tied to held neighbours and to the map; then densify its ground.
+
+    Args:
+        item: the vehicle, its neighbours (held as they are), metres to add to its level.
+        basemap: the map on the area's grid, or None. origin: float64 (2,) of the local frame.
+    """
     state, others, correction = item
-    state = deepcopy(state)  # neighbours see this vehicle as its solo pass left it, in whatever order they are run
+    state = deepcopy(state)  # its neighbours are tied to the result of the first pass, in whatever order they run
     watch = Stopwatch()
     flight = state.flight
     state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
-    # The pictures were let go since: few of those that were followed are enough, and must be decoded again.
+    # Pictures are not kept between the passes; decoding a spaced subset again is enough.
     pictures = None if flight.sparse else spaced_pictures(flight, state.surface)
     held = held_cameras(state, others)
     if held is not None:
@@ -68,7 +73,7 @@ def second_pass(
 
 
 def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: LoadedMap | None) -> None:
-    """The frames' sigmas and that of the field of view, with what the map's ties tell of errors beside them."""
+    """Set the sigmas of the frames and of the field of view, systematic offsets of the map's ties included."""
     flight = state.flight
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
@@ -79,7 +84,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     if not lies_on_map(state):
-        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours are no better than oneself
+        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours add no accuracy
     elif not state.on_map:
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))
@@ -100,7 +105,7 @@ def _denser_ground(
     ground: LoadedMap | None,
     pictures: NDArray[np.bool_] | None,
 ) -> None:
-    """Ground points for drawing: between the tracks, and where only oblique views show it, from the map."""
+    """Add ground points for drawing: between the tracks and, where views are oblique only, from the map."""
     flight = state.flight
     points, sigmas, state.high = dense_points(flight, state.surface)
     state.dense = points, sigmas

@@ -1,8 +1,9 @@
 """The default refiner: one vehicle is the unit, a batch is a loop over vehicles.
 
-First pass of each vehicle by itself -> vehicles that the map does not show are registered on neighbours that it does
+First pass of each vehicle by itself -> vehicles that were not found on the map are registered on neighbours that were
 -> second pass on a common level with neighbours held -> one terrain.
-The map's lean is voted over the roofs of all vehicles for the report; tie points lie on the ground and do not lean.
+The relief displacement of the map's roofs (its lean) is voted over all vehicles for the report; tie points lie on the
+ground and are not displaced.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class SwarmRefiner:
-    """One vehicle as soon as it completes (placement.Refiner): solo, then again with its neighbours held.
+    """The default refiner of an area (placement.Refiner): each vehicle by itself, then again with its neighbours held.
 
     Attributes:
         epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
@@ -57,7 +58,7 @@ class SwarmRefiner:
     options: Options = field(default_factory=Options)
 
     def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Place one vehicle's frames; neighbours (earlier results of this refiner) are held as they are.
+        """Refine one vehicle's frames; neighbours (earlier results of this refiner) are held as they are.
 
         Raises:
             OrthoSwarmError: if nothing can be made of the frames.
@@ -82,47 +83,49 @@ class SwarmRefiner:
         parts = split_units({frames[0].vehicle: frames})
         own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
         others = [state for n in neighbours for state in states_of(n)]
-        return self._beside(own, others, basemap)
+        return self._second_pass(own, others, basemap)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Place a vehicle again beside neighbours that were not there, or not yet so good, when it was refined.
+        """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.
 
-        Its second pass is repeated on their common level, and what was not found on the map is laid beside those that
-        were. Pictures beside its refined ones (late ones, those of another camera) follow them.
+        Its second pass is repeated on their common level; a block that was not found on the map is registered on
+        neighbours that were. Its other pictures (late ones, those of another camera) move with the refined ones.
 
         Args:
             solution: an earlier result of this refiner; it stays as it is. neighbours: the same of others, held.
             basemap: the map, or None.
 
         Returns:
-            The new one; the same one where there is nothing to solve.
+            The new solution; the same object where it has no neighbours.
         """
         own = deepcopy(states_of(solution))
         others = [state for n in neighbours for state in states_of(n)]
         if not own or not any(neighbours_of(state, others) for state in own):
             return solution
-        said = {warning for state in own for warning in findings(state)}
-        now = self._beside(own, others, basemap)
-        there = {p.frame.image for p in now.placed}
-        extra = [p for p in solution.placed if p.frame.image not in there]
-        own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]  # what was left out stays out
+        outdated = {warning for state in own for warning in findings(state)}
+        now = self._second_pass(own, others, basemap)
+        refined = {p.frame.image for p in now.placed}
+        extra = [p for p in solution.placed if p.frame.image not in refined]
+        own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]
         return replace(
             now,
             placed=[*own_frames, *move_with_neighbours(extra, solution.placed, now.placed)],
             dropped=dict(solution.dropped),
-            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in said)])),
+            warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in outdated)])),
         )
 
-    def _beside(self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None) -> Solution:
+    def _second_pass(
+        self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None
+    ) -> Solution:
         """The second pass of a vehicle's units, with others held as they are."""
         own = lay_lost_beside(own, others, self.epsg, self.origin, serial)
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
         done = list(own)
-        for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # what carries before what is carried
-            beside = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
-            item = (own[k], beside, float(network.correction_m[k]) - anchor)
+        for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # carried blocks last
+            neighbours = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
+            item = (own[k], neighbours, float(network.correction_m[k]) - anchor)
             done[k] = second_pass(item, basemap=basemap, origin=self.origin)
         distortion = map_distortion_sigma([*done, *others])
         for state in done:
@@ -166,12 +169,12 @@ class SwarmRefiner:
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
         fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
-        left = [_left(units[k], why, grid) for k, why in lost.items()]
+        left = [_unrefined(units[k], why, grid) for k, why in lost.items()]
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
 def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
-    """A vehicle that stays where its receiver says: nothing was flown, so nothing tells the scale of its pictures."""
+    """A vehicle placed as recorded: it did not move, so that its pictures have no scale of their own."""
     fov = float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan")
     sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
     legs = [Leg(vehicle, 0, len(placed) - 1, "failed", 0.0, sigma)] if placed else []
@@ -184,24 +187,24 @@ def states_of(solution: Solution) -> list[VehicleState]:
     return [] if state is None else list(state) if isinstance(state, list) else [state]
 
 
-def _left(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
-    """A vehicle that could not be refined, as it was recorded; the others are worth having all the same."""
+def _unrefined(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
+    """A vehicle that could not be refined, placed as recorded."""
     placed = recorded_cameras(frames, grid).placed
-    said = f"it could not be refined ({why}); it stays where its receiver says"
-    return replace(_as_recorded(frames[0].vehicle, placed), warnings=[said])
+    warning = f"it could not be refined ({why}); it lies where its receiver says"
+    return replace(_as_recorded(frames[0].vehicle, placed), warnings=[warning])
 
 
 def lay_lost_beside(
     states: list[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
 ) -> list[VehicleState]:
-    """Vehicles that were not found on the map, beside those that were; then those beside them, and so on.
+    """Register vehicles that were not found on the map on neighbours that were; then others on these, and so on.
 
     Args:
         states: vehicles to place. others: more that may carry them, as they are.
         epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
 
     Returns:
-        The states in order, those that could be laid beside others `carried`.
+        The states in order, those that were registered on neighbours `carried`.
     """
     out = list(states)
     lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
@@ -227,7 +230,7 @@ def _second_passes(
     run: Run,
     progress: Progress | None,
 ) -> list[VehicleState]:
-    """All vehicles again, on a common level, each with its neighbours held as the solo pass left them."""
+    """All vehicles again, on a common level, each with its neighbours held as the first pass left them."""
     states = lay_lost_beside(states, [], epsg, origin, run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task = partial(second_pass, basemap=basemap, origin=origin)
@@ -239,14 +242,14 @@ def _second_passes(
         if progress:
             progress("joint", done + 1, len(states))
     carried = [k for k, s in enumerate(states) if lies_on_map(s) and not s.on_map]
-    # Beside neighbours that are done: their pictures hold it, and it cannot be better than they are.
+    # After the mapped ones: their refined pictures hold it, and its accuracy is theirs at best.
     items = [(states[k], neighbours_of(states[k], out), float(network.correction_m[k])) for k in carried]
     for done, (k, state) in enumerate(zip(carried, run(task, items), strict=True)):
         out[k] = state
         if progress:
             progress("joint", len(mapped) + done + 1, len(states))
     mapped += carried
-    # Without a map nobody is right: each vehicle is fitted to those before it, so that seams close without a dance.
+    # Without a map no vehicle is the reference: each is tied to those before it, or all would move at each pass.
     before: list[VehicleState] = []
     for k in sorted(set(range(len(states))) - set(mapped)):
         (out[k],) = run(task, [(states[k], neighbours_of(states[k], before), float(network.correction_m[k]))])
@@ -257,7 +260,7 @@ def _second_passes(
 
 
 def _level(states: Sequence[VehicleState]) -> None:
-    """Lift or lower whole vehicles, cameras and ground together, by what is left between their levels."""
+    """Shift cameras and ground of each vehicle in height so that the vehicles' levels agree."""
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     for state, correction in zip(states, network.correction_m, strict=True):
         adj = state.flight.adjustment

@@ -1,4 +1,4 @@
-"""What vehicles of an area have in common: who sees whom, the lean of the map, one terrain."""
+"""What vehicles of an area share: which are neighbours, the lean of the map, one terrain."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
-    """The other vehicles whose paths come within sight of this one's."""
+    """The other vehicles whose flight paths come near enough for common ground."""
     own = state.flight.adjustment.cameras.position
     reach = 1.5 * float(np.median(own[:, 2]))
     low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
@@ -54,7 +54,7 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
 def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None) -> tuple[Terrain | None, list[str]]:
     """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
 
-    A given shape of the ground is brought to their level; where the points contradict it, a warning says so.
+    A given height model is shifted to their level; where the points contradict it, a warning says so.
     """
     if not states:
         return None, []
@@ -76,7 +76,7 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     tops = np.concatenate([seen_from_above(s) for s in states])
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
     drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
-    return drawn, _doubts(given, fit is None, off, states) if given is not None else []
+    return drawn, _dem_warnings(given, fit is None, off, states) if given is not None else []
 
 
 def map_distortion_sigma(states: Sequence[VehicleState]) -> float:
@@ -121,8 +121,8 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     return Terrain(float(low[0]), float(low[1]), step, z)
 
 
-def _doubts(given: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
-    """What has to be said of a height model."""
+def _dem_warnings(given: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
+    """Warnings about a given height model."""
     name = given.model.path.name
     if unused:
         return [

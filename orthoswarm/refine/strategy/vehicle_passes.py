@@ -1,4 +1,4 @@
-"""The two passes of one vehicle: by itself, then on the common level beside neighbours that are held."""
+"""The first pass of one vehicle: its block adjusted without a map, then registered on the map."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -45,14 +45,14 @@ class Options:
 
     Attributes:
         fov_start_rad: field of view to start from where the tags hint at none.
-        dem: shape of the ground from outside, None to find it from the pictures.
+        dem: given height model of the ground, None to find the ground from the pictures.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
     dem: HeightModel | None = None
 
     def ground(self, origin: Array) -> GroundModel:
-        """What is known of the ground before a picture is looked at, in the frame with this origin."""
+        """The ground before any picture is used, in the local frame: level, or the given height model."""
         if self.dem is None:
             return GroundModel()
         return GroundModel(dem=LocalDem(self.dem, (float(origin[0]), float(origin[1]))))
@@ -85,9 +85,14 @@ def followed(
     options: Options,
     learned: bool = True,
 ) -> VehicleState | None:
-    """Refine one vehicle by itself; None where its pictures cannot be followed, or what was followed does not hold.
+    """Refine one vehicle by itself, by corners tracked from picture to picture.
 
-    learned: where edges do not find it on the map, ask learned matching at once (else see `look_again`).
+    Args:
+        learned: where correlation of edges does not find it on the map, try learned matching in this process (else the
+            caller does, see `look_again`).
+
+    Returns:
+        None where the pictures cannot be tracked or the adjustment of the tracks fails; they are then matched in pairs.
     """
     watch = Stopwatch()
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
@@ -102,7 +107,7 @@ def followed(
         if not config.narrowest_fov_deg < field_of_view_deg(flight.adjustment, flight) < config.widest_fov_deg:
             return None  # the recorded height that is behind such a lens cannot be right
         if len(frames) < active().flight.few_photos and distorts_strongly(flight):
-            return None  # few corners cannot hold all parameters of such a lens; matched pairs of photos can
+            return None  # too few corners for all parameters of such a lens; pairs of photos give more
         return from_flight(flight, surface, origin, basemap, watch, learned)
     except AdjustmentError:
         return None
@@ -124,7 +129,7 @@ def from_flight(
     watch: Stopwatch,
     learned: bool = True,
 ) -> VehicleState:
-    """The state of a vehicle that is adjusted without a map, and its way onto the map where there is one."""
+    """Sigmas of a vehicle that is adjusted without a map, and its registration where there is a map."""
     adj = flight.adjustment
     belief = surface.height_prior(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
@@ -152,12 +157,16 @@ def from_flight(
 
 
 def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
-    """The adjustment without a map, its ground fitted as soon as the points allow (surface: what is known of it)."""
+    """Adjust a followed flight without a map and fit its ground; returns the ground.
+
+    Args:
+        flight: its adjustment is changed. surface: what is known of the ground before, None for level ground.
+    """
     surface = surface or GroundModel()
     begun, config = flight.adjustment.copy(), active().strategy
     found = _relative(flight, surface, config.schedule)
     if ran_away(flight):
-        # A few wrong tracks, far off, threw it out of the valley before it could tell that they are wrong.
+        # Wrong tracks with large residuals have full weight in the first steps of the wide schedule.
         flight.adjustment = begun.copy()
         found = _relative(flight, surface, config.near_schedule)
     if ran_away(flight):
@@ -202,35 +211,35 @@ def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -
 
 
 def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
-    """Go on without the recorded heights where the pictures contradict them.
+    """Drop recorded heights that the pictures contradict; keep them where the pictures alone determine no height.
 
-    They must do so still when the adjustment is at rest, and it must come to rest without the heights, too: few
-    pictures of a camera that is held level tell little of the focal length, and without heights run anywhere.
+    The contradiction must remain once the adjustment has converged, and the adjustment must also converge without the
+    heights: few pictures of a levelled camera over flat ground hardly determine the focal length, which then drifts.
     """
     config = active().strategy
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
     surface, _ = _steps(flight, surface, config.rest_steps)
-    believed, calibration, was = flight.adjustment.copy(), flight.calibration, surface
+    with_heights, calibration, ground_with_heights = flight.adjustment.copy(), flight.calibration, surface
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
     for _ in range(config.free_rounds):
         surface, focal_px = _steps(flight, surface, config.free_steps)
-        at_rest = np.ptp(np.log(focal_px[-3:])) < config.at_rest_share
-        if at_rest:
+        converged = np.ptp(np.log(focal_px[-3:])) < config.at_rest_share
+        if converged:
             break
-    said = float(np.median(flight.records.position[flight.records.has_height, 2]))
-    seen = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
-    if not at_rest or abs(seen - said) < config.agreeing_share * said:
-        flight.adjustment, flight.calibration = believed, calibration
-        return was
-    flight.warnings.append(contradiction(flight.frames[0].vehicle, said, seen))
+    recorded_m = float(np.median(flight.records.position[flight.records.has_height, 2]))
+    solved_m = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
+    if not converged or abs(solved_m - recorded_m) < config.agreeing_share * recorded_m:
+        flight.adjustment, flight.calibration = with_heights, calibration
+        return ground_with_heights
+    flight.warnings.append(contradiction(flight.frames[0].vehicle, recorded_m, solved_m))
     return surface
 
 
 def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundModel, list[float]]:
-    """So many steps near the end, with the focal length after each."""
+    """Take steps at the final robust scale; the ground, and the focal length in pixels after each step."""
     focal_px = []
     for _ in range(count):
         flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points))
@@ -240,9 +249,9 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
 
 
 def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
-    """Where learned matching finds a flight that edges did not find on the map.
+    """The coarse registration of a flight by learned matching, None where that finds nothing.
 
-    PyTorch and the network stay in memory, 400 MB: so one process looks for all flights, one after the other.
+    PyTorch and the network take 400 MB of a process's memory: one process serves all flights, one after the other.
     """
     watch = Stopwatch()
     fit = second_look(state.flight, basemap, origin)
@@ -255,7 +264,7 @@ def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> Coarse
 def placed_again(
     item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
 ) -> VehicleState:
-    """A flight that edges did not find, after `look_again`: registered where that found it."""
+    """A flight after `look_again`, registered where that found it and tie points confirm it."""
     state, fit = item
     watch = Stopwatch()
     _second_look_onto_map(state, fit, basemap, origin, watch)
@@ -267,7 +276,7 @@ def placed_again(
 def _second_look_onto_map(
     state: VehicleState, fit: CoarseFit | None, basemap: MapWindow | None, origin: Array, watch: Stopwatch
 ) -> None:
-    """Register a flight where learned matching found it, if tie points confirm that."""
+    """Register a flight at the place that learned matching found, if tie points confirm it."""
     state.unfound = False
     if fit is not None and basemap is not None:
         _onto_map(state, [fit], basemap, origin, watch)
@@ -276,20 +285,20 @@ def _second_look_onto_map(
 def _onto_map(
     state: VehicleState, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, watch: Stopwatch
 ) -> bool:
-    """Register a flight where its tie points confirm a guess; it stays as it was where they confirm none.
+    """Register a flight at the first coarse registration that tie points confirm.
 
-    It also stays where the map would ask for another field of view than its pictures. Returns whether a guess was
-    confirmed.
+    The flight stays as it was where none is confirmed, or where the confirmed one would need another field of view than
+    its pictures alone gave. Returns whether one was confirmed.
     """
     flight = state.flight
-    before, alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
+    before, ground_alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
     found = confirmed(flight, fits, basemap, origin, state.surface)
     watch.lap("coarse registration")
     if found is None:
         return False
     settled = settle(flight, found.ground, found.matches, state.surface)
     alone_deg, now_deg = (field_of_view_deg(a, flight) for a in (before, flight.adjustment))
-    config, known_deg = active().strategy, float(np.hypot(sigma, level_sigma_deg(flight, alone)))
+    config, known_deg = active().strategy, float(np.hypot(sigma, level_sigma_deg(flight, ground_alone)))
     if abs(now_deg - alone_deg) > max(config.map_fov_sigmas * known_deg, config.map_fov_deg):
         flight.adjustment = before
         flight.warnings.append(
@@ -310,12 +319,14 @@ def _onto_map(
 
 
 def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
-    """How far the field of view may be off by what the adjustment takes for granted.
+    """Sigma of the field of view, degrees, by what the adjustment does not model.
 
-    The takeoff spot need not be at the ground's middle level: over flat ground straight down only f / h is observable;
-    the more relief, the less the level is known. Recorded heights may be wrong: as far as they disagree with the
-    pictures. Photos without heights tell it a little, on one straight way not at all. A lens that was found together
-    with other vehicles is held, and known as well as it was then; one that distorts strongly is not quite as modelled.
+    - The takeoff point is not at the ground's median level. In nadir views of flat ground only f / h is observable, so
+      the error of the level is one of f; it grows with the relief.
+    - Recorded heights may be wrong, by as much as the pictures disagree with them.
+    - Without heights only relief and tilt determine f; on one straight leg nothing does.
+    - A lens that was solved with other vehicles is held, and has the sigma of that solution.
+    - A lens that distorts strongly has tangential distortion, too, which is not modelled.
     """
     config = active().strategy
     unknown = flight.sparse or not flight.records.has_height.any()
