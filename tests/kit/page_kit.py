@@ -85,7 +85,9 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     station = Station()
     station.gets = {
         "/api/vehicles": list(rows), "/api/layers": [], "/api/jobs": [], "/api/completions": [], "/api/finds": [],
-        "/api/legs": {"type": "FeatureCollection", "features": []}, "/healthz": {"status": "ok", "problems": []},
+        "/api/legs": {"type": "FeatureCollection", "features": []},
+        "/api/coverage": {"state": "no area", "seen_share": None},
+        "/healthz": {"status": "ok", "problems": []},
     }  # fmt: skip
 
     class Handler(BaseHTTPRequestHandler):

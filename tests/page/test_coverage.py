@@ -1,0 +1,68 @@
+"""The list of gaps: a press goes there; flying them plans first, and uploads only what was confirmed."""
+
+from tests.kit.page_kit import opened, standing, vehicle
+
+RING = [[8.560, 47.400], [8.561, 47.400], [8.561, 47.401], [8.560, 47.401], [8.560, 47.400]]
+SHARES = {"seen_share": 0.9, "poor_share": 0.04, "missed_share": 0.05, "planned_share": 0.01}
+COVERAGE = {
+    "state": "in flight", "version": 3, **SHARES, "recorded": SHARES, "pictures": {"placed": 60, "recorded": 12},
+    "offers": [{"vehicle": "v2", "legs": 3, "length_m": 900.0}], "warnings": [],
+    "gaps": [
+        {"area_m2": 3200.0, "cause": "not triggered", "detail": "", "confidence": 0.95, "vehicle": "v1",
+         "lat_deg": 47.4005, "lon_deg": 8.5605, "polygon": {"type": "Polygon", "coordinates": [RING]}},
+    ],
+    "missing_pictures": [
+        {"vehicle": "v1", "image": f"event {k}", "after": "a.jpg", "cause": "pictures not arrived", "confidence": 0.95}
+        for k in (7, 8)
+    ],
+}  # fmt: skip
+PLAN = {
+    "id": "plan-1", "names": {"v1": "v1"}, "warnings": ["a warning of the plan"],
+    "vehicles": [{"id": "v1", "length_m": 400.0, "time_s": 90.0, "photos": 20, "sorties": 1, "flights": [{}]}],
+}  # fmt: skip
+
+
+def _answer(method, path, body):
+    if path == "/api/coverage/flight":
+        return 201, PLAN
+    if path.endswith("/upload"):
+        return 200, {"id": body["id"], "vehicle": "v1", "command": "upload", "outcome": "done", "reason": ""}
+    return 200, {"checks": []}
+
+
+def _posts(station) -> list[str]:
+    return [path for method, path, _ in station.heard if method == "POST"]
+
+
+def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
+    with standing(vehicle(1, armed=False)) as station:
+        station.gets |= {
+            "/api/coverage": COVERAGE, "/api/plans/plan-1/map": {"features": []},
+            "/api/coverage/vehicles": [
+                {"id": "v1", "battery": None, "minutes": None, "busy": ""},
+                {"id": "v2", "battery": 0.7, "minutes": 9.0, "busy": "it is still flying; bring it home first"},
+            ],
+        }  # fmt: skip
+        station.answer = _answer
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            words = page.locator(".coverage")
+            page.wait_for_function("document.querySelector('.gaps button')?.textContent.includes('not triggered')")
+            assert "90.0 %" in words.inner_text() and "3 legs" in words.inner_text()
+            assert "2 pictures not arrived (event 7)" in words.inner_text()
+            page.locator(".gaps button").click()
+            assert abs(page.evaluate("orthoswarm.map.getCenter().lng") - 8.5605) < 1e-3
+            page.click("text=Fly the gaps…")
+            page.wait_for_selector(".gap-vehicles li >> nth=1")
+            assert page.locator(".gap-vehicles input[type=checkbox]").nth(1).is_disabled()
+            page.click("dialog[open] button:text-is('Plan')")
+            assert "Enter how many minutes" in page.locator("dialog[open]").inner_text()
+            assert _posts(station) == []
+            page.locator(".gap-vehicles input[type=number]").fill("12")
+            page.click("dialog[open] button:text-is('Plan')")
+            page.wait_for_selector("text=a warning of the plan")
+            assert _posts(station) == ["/api/coverage/flight"]
+            assert station.heard[-1][2] == {"vehicles": {"v1": 12}}
+            page.click("text=Upload, then check and start…")
+            page.wait_for_selector("#preflight-title >> visible=true")
+            assert _posts(station)[1].endswith("/v1/upload") and not any(p.endswith("/start") for p in _posts(station))
