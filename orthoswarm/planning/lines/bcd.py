@@ -154,11 +154,15 @@ def _by_cell(lines: list[list[Array]], parts: list[Geometry]) -> list[list[list[
     return [lines for lines in found if lines]
 
 
+_EXACT_CELLS = 8
+"""So many cells are ordered exactly: 0.02 s."""
+
+
 def order_cells(ways: Array) -> list[int]:
     """A short row through all cells: 4 * cell + way to fly it, from each cell's exit to the next one's entry.
 
-    Nearest neighbours from every cell, the best row improved by moving cells; which of its four ways each cell is
-    flown follows exactly, by dynamic programming over the row.
+    Few cells are ordered exactly (Held and Karp 1962). Of many: nearest neighbours from every cell, the best row
+    improved by moving cells; which of its four ways each cell is flown follows exactly, by dynamic programming over it.
 
     Args:
         ways: float64 (4 n, 4 n), from exit of cell and way to entry of cell and way, metres.
@@ -166,9 +170,35 @@ def order_cells(ways: Array) -> list[int]:
     n = len(ways) // 4
     if n == 1:
         return [0]
+    if n <= _EXACT_CELLS:
+        return _shortest_order(ways)
     first = np.arange(n) if n <= 60 else np.linspace(0, n - 1, 60).astype(int)
     row, code = _best_row(np.ascontiguousarray(ways), first)
     return [4 * int(cell) + int(way) for cell, way in zip(row, code)]
+
+
+def _shortest_order(ways: Array) -> list[int]:
+    """The shortest way through all cells: dynamic programming over sets of cells, the last one and how it is flown."""
+    n = len(ways) // 4
+    length = np.full((1 << n, 4 * n), np.inf)
+    came_from = np.full((1 << n, 4 * n), -1)
+    for cell in range(n):
+        length[1 << cell, 4 * cell : 4 * cell + 4] = 0.0
+    for flown in range(1, 1 << n):
+        through = length[flown][:, None] + ways
+        last, best = through.argmin(axis=0), through.min(axis=0)
+        for cell in range(n):
+            if not flown >> cell & 1:
+                to, own = flown | 1 << cell, slice(4 * cell, 4 * cell + 4)
+                shorter = best[own] < length[to, own]
+                length[to, own] = np.where(shorter, best[own], length[to, own])
+                came_from[to, own] = np.where(shorter, last[own], came_from[to, own])
+    flown, state = (1 << n) - 1, int(length[-1].argmin())
+    order = [state]
+    while came_from[flown, state] >= 0:
+        flown, state = flown & ~(1 << state // 4), int(came_from[flown, state])
+        order.append(state)
+    return order[::-1]
 
 
 @kernel
