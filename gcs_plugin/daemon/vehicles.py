@@ -421,7 +421,8 @@ class VehicleLinks:
             now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
-            self._events.publish("vehicle", **fresh | {"id": row["id"], "silent_s": row["silent_s"]})
+            always = {key: row[key] for key in ("id", "name", "silent_s")}
+            self._events.publish("vehicle", **fresh | always)
 
     def _give_up_silent(self) -> None:
         """A vehicle that has been silent for long in the middle of its mission is refined as far as it came."""
