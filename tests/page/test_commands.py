@@ -165,10 +165,10 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             page.click("#tab-plan")
             page.click("text=Check and start")
             page.wait_for_selector(".checks section")
-            words = page.inner_text(".preflight")
+            words = page.inner_text("dialog[aria-labelledby=preflight-title]")
             for said in ("Falcon", "plan-1", "80 m", "5:12", "0 % left, the mission needs about 40 %"):
                 assert said in words
-            start = page.locator(".preflight .primary")
+            start = page.locator("dialog[aria-labelledby=preflight-title] .primary")
             assert start.is_disabled()
             boxes = page.locator(".checks input")
             assert boxes.count() == 2
@@ -176,5 +176,5 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             assert start.is_disabled()
             boxes.nth(1).check()
             start.click()
-            page.wait_for_selector(".preflight", state="hidden")
+            page.wait_for_selector("dialog[aria-labelledby=preflight-title]", state="hidden")
             assert station.commands("start")[0]["override"] == {"v7": ["battery", "gps"]}
