@@ -1,7 +1,6 @@
 """The demonstration's course: city, plan, flight, map, refinement at each completion, and the accuracy at the end."""
 
 import json
-import multiprocessing
 import multiprocessing.process
 import multiprocessing.resource_tracker
 import shutil
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, Setting, write_world
 from gcs_plugin.demo.simulator import simulate
+from orthoswarm.compute.workers import spawn_context
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def run_demo(
     """
     _clear(out)
     began = time.monotonic()
-    context = multiprocessing.get_context("spawn")
+    context = spawn_context()
     ours, theirs = context.Pipe()
     process = context.Process(target=simulate, args=(setting, theirs), name="simulator", daemon=True)
     _start(process)

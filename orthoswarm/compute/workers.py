@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
 
@@ -29,6 +30,18 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+
+
+def spawn_context() -> SpawnContext:
+    """How worker processes are started: spawned, since forking a process with threads can hang.
+
+    OpenCV puts its own folder, which holds a module `typing`, first on the path while it is being imported, and a
+    process that another thread spawns at that moment inherits that path and ends at its first import. So OpenCV is
+    imported before any is started.
+    """
+    import cv2  # noqa: F401
+
+    return multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +98,7 @@ class Serial:
 class Processes:
     """Several processes on this machine; the calling process is one of them.
 
-    The others start with the first map. They are spawned, not forked: forking a process with threads can hang.
+    The others start with the first map, see `spawn_context`.
 
     Args:
         count: how many items are worked on at once, the calling process included (2 starts one more process).
@@ -150,8 +163,7 @@ class Processes:
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
             single_threaded()
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.count - 1, mp_context=context, initializer=_prepare)
+            self._pool = ProcessPoolExecutor(self.count - 1, mp_context=spawn_context(), initializer=_prepare)
         return self._pool
 
     def _account(self, future: "Future[_Outcome[Result]]") -> Result:

@@ -140,3 +140,19 @@ def test_workers_end_with_a_parent_that_was_killed():
         parent.kill()
         # Workers hold the other end of this pipe: it ends with the last of them, and never if they wait on.
         assert parent.communicate(timeout=60) == ("", None)
+
+
+def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():
+    """While OpenCV is being imported its folder, which holds a `typing`, is on the path that a spawned process gets."""
+    code = (
+        "import sys, threading\n"
+        "from orthoswarm.compute.workers import spawn_context\n"
+        "thread = threading.Thread(target=__import__, args=('cv2',))\n"
+        "thread.start()\n"
+        "context = spawn_context()\n"
+        "paths = [p for p in sys.path if p.rstrip('/').endswith('cv2')]\n"
+        "assert 'cv2' in sys.modules and not paths, paths\n"
+    )
+    for _ in range(3):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr

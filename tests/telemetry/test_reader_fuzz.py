@@ -150,7 +150,12 @@ def file_parser(name: str):
             assert str(reason)
 
     def poses(path: Path) -> None:
-        pose_csv.read_pose_csv(path)
+        from orthoswarm.model.errors import InputError
+
+        try:
+            pose_csv.read_pose_csv(path)
+        except InputError as reason:  # another program's table, of a projection that it does not name
+            assert str(reason)
 
     return {"photo": photo, "log": log, "table": table, "poses": poses}[name]
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from gcs_plugin.daemon.jobs.process_usage import used_by
-from orthoswarm.compute.workers import Usage, single_threaded
+from orthoswarm.compute.workers import Usage, single_threaded, spawn_context
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
 Result = TypeVar("Result")
@@ -63,7 +63,7 @@ class WorkerPool:
                 raise OrthoSwarmError("the daemon is stopping; start it again")
             if self._pool is None:
                 single_threaded()
-                context = multiprocessing.get_context("spawn")
+                context = spawn_context()
                 self._pool = ProcessPoolExecutor(
                     self.count, mp_context=context, initializer=_prepare, initargs=(self._nice,)
                 )
