@@ -85,6 +85,7 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     station = Station()
     station.gets = {
         "/api/vehicles": list(rows), "/api/layers": [], "/api/jobs": [], "/api/completions": [], "/api/finds": [],
+        "/api/traffic": [],
         "/api/legs": {"type": "FeatureCollection", "features": []},
         "/api/coverage": {"state": "no area", "seen_share": None},
         "/healthz": {"status": "ok", "problems": []},
