@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import cv2  # noqa: F401  before any thread: two that import it at once find it half made
+
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
