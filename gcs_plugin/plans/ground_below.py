@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.area import Area
@@ -41,7 +42,9 @@ class GroundBelow:
         """
         points = np.concatenate([shapely.get_coordinates(area.ground), starts])
         bounds = BoundingBox.around_points(points, _AROUND_M)
-        known = HeightModel.open(dem, area.grid.epsg, bounds, np.empty((0, 3))).window(bounds, 4_000_000)
+        known = HeightModel.open(dem, area.grid.epsg, bounds, np.empty((0, 3))).window(
+            bounds, active().raster.dem_most_nodes
+        )
         terrain = known.terrain
         rows, columns = terrain.z.shape
         east = terrain.west + terrain.step_m * np.arange(columns)

@@ -16,6 +16,8 @@ from orthoswarm.config.initial import InitialConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
+from orthoswarm.config.radiometry import RadiometryConfig
+from orthoswarm.config.raster import RasterConfig
 from orthoswarm.config.records import RecordsConfig
 from orthoswarm.config.registration import RegistrationConfig
 from orthoswarm.config.strategy import StrategyConfig
@@ -39,6 +41,8 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
+    radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)

@@ -18,6 +18,14 @@ class ComputeConfig:
     cluster_poll_s: float = 1.0
     """How often the cluster's workers are counted while a result is awaited, seconds (chosen)."""
     cluster_patience_s: float = 120.0
-    """A cluster without workers is given up after so many seconds: machines restart within that(chosen)."""
+    """A cluster without workers is given up after so many seconds: machines restart within that (chosen)."""
     canvas_mb: float = 48.0
     """Memory that a canvas keeps of its tiles, megabytes; tiles beyond it are on disk (chosen)."""
+    tile_store_mb: float = 64.0
+    """Memory that a drawing task keeps of the tiles that it writes, megabytes (chosen)."""
+    pictures_per_task: int = 64
+    """Pictures that a drawing task reads, or copies to previews (chosen: its overhead is small then)."""
+    ratios_at_once: int = 65_536
+    """Places whose colours are compared at once (chosen for memory)."""
+    map_pixels_at_once: int = 8_000_000
+    """Pixels of a map read at once (chosen for memory)."""

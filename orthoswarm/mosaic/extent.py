@@ -6,17 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
-
-RECORDED_SIGMA_M = 1.0
-"""One sigma of the heights that a vehicle records over its takeoff level."""
-LEVEL_SIGMA_M = 0.2
-"""How well the level of solved ground is known, one sigma."""
-DATUM_LIMIT_M = 3.0
-"""The refiner holds heights near the takeoff level; what says that it lies farther off is not believed."""
 
 
 def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> BoundingBox:
@@ -64,12 +58,13 @@ def from_takeoff(
     """
     if terrain is None or not placed:
         return placed, level
+    config = active().mosaic
     relief = float(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed])).std())
     recorded = [p.camera.position[2] - p.frame.fix.height_m for p in placed if p.frame.fix.height_m is not None]
-    zeros = [(level, LEVEL_SIGMA_M**2 + relief**2)]
+    zeros = [(level, config.ground_level_sigma_m**2 + relief**2)]
     if recorded:
-        zeros.append((float(np.median(recorded)), RECORDED_SIGMA_M**2))
-    zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= DATUM_LIMIT_M]
+        zeros.append((float(np.median(recorded)), config.recorded_height_sigma_m**2))
+    zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= config.takeoff_level_limit_m]
     if not zeros:
         return placed, level
     weight = np.array([1.0 / variance for _, variance in zeros])
@@ -93,6 +88,6 @@ def partial_cover(basemap: MapWindow, placed: Sequence[PlacedFrame]) -> list[str
     west, south, east, north = basemap.bounds
     xy = np.array([p.camera.nadir for p in placed])
     inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
-    if inside.mean() > 0.98:
+    if inside.mean() > active().mosaic.map_cover_share:
         return []
     return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]

@@ -7,17 +7,21 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
 
-MAX_OFF_NADIR_RAD = np.radians(75.0)
-"""Ground seen at a flatter angle is left out: there a pixel is smeared over more than 15 times its size at nadir."""
-LEAST_DESCENT = float(np.cos(MAX_OFF_NADIR_RAD))
-"""What a ray goes down per unit of depth at that angle at least: a straight line that cuts off the horizon."""
-MAX_MAGNIFICATION = 16.0
-"""A frame whose pixel at nadir is this many times the map's is no picture of this flight (an altitude gone wrong)."""
+
+def tan_limit() -> float:
+    """Tangent of the greatest angle off nadir at which ground is drawn."""
+    return float(np.tan(np.radians(active().mosaic.most_off_nadir_deg)))
+
+
+def least_descent() -> float:
+    """What a ray goes down per unit of depth at that angle at least: a straight line that cuts off the horizon."""
+    return float(np.cos(np.radians(active().mosaic.most_off_nadir_deg)))
 
 
 def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
@@ -69,13 +73,13 @@ def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> st
         return "its pose is not a number"
     if height <= 0:
         return f"its camera is not above the ground (height {height:.1f} m)"
-    if height > MAX_MAGNIFICATION * gsd_m * focal_px:
+    if height > active().mosaic.most_magnification * gsd_m * focal_px:
         times = height / (gsd_m * focal_px)
         return (
             f"from {height:.0f} m above the ground its pixels are {times:.0f} times as large as the map's: "
             "its height is wrong, or the map's pixel (--gsd) too small"
         )
-    if steepest < LEAST_DESCENT:
+    if steepest < least_descent():
         return "it looks at the horizon or above, and not at the ground"
     return None
 
@@ -110,7 +114,7 @@ def _border(lens: Lens, per_side: int, inset_px: float) -> Array:
 def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) -> Array:
     """The ground that a camera sees on a level plane, a closed polygon float64 (K, 2), K = 0 if none.
 
-    Without distortion it is exact and convex, clipped where the view is flatter than MAX_OFF_NADIR_RAD allows
+    Without distortion it is exact and convex, clipped where the view is flatter than `most_off_nadir_deg`
     (along a straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border is
     densified, 8 points a side, and the polygon may be slightly concave.
 
@@ -122,7 +126,7 @@ def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) ->
     height = float(camera.position[2]) - ground_z_m
     xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ camera.rotation.T
-    rays = _clip(rays, LEAST_DESCENT)
+    rays = _clip(rays, least_descent())
     if len(rays) < 3 or height <= 0:
         return np.empty((0, 2))
     return np.asarray(camera.position[:2] + rays[:, :2] * (height / -rays[:, 2:]))
@@ -145,7 +149,7 @@ def _clip(rays: Array, least: float) -> Array:
 
 def reach(camera: Camera, ground_z_m: float = 0.0) -> float:
     """Greatest distance from the nadir point at which the ground is drawn, metres."""
-    return float(np.tan(MAX_OFF_NADIR_RAD)) * (float(camera.position[2]) - ground_z_m)
+    return tan_limit() * (float(camera.position[2]) - ground_z_m)
 
 
 def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> Array:
@@ -154,17 +158,18 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
     West > east where a camera sees nothing.
     """
     boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(cameras), 1))
+    least = least_descent()
     for lens, index in _by_lens(cameras).items():
         position = np.stack([cameras[i].position for i in index]).astype(float)
         rays = _corners(lens) @ np.stack([cameras[i].rotation for i in index]).transpose(0, 2, 1)
-        level = (-rays[..., 2] >= LEAST_DESCENT).all(1)
-        descent = np.maximum(-rays[..., 2:], LEAST_DESCENT)
+        level = (-rays[..., 2] >= least).all(1)
+        descent = np.maximum(-rays[..., 2:], least)
         for z in (z_low, z_high):
             height = position[:, 2] - z
             ground = position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
             low, high, seen = ground.min(1), ground.max(1), level & (height > 0)
             for j in np.nonzero(~level & (height > 0))[0]:
-                clipped = _clip(rays[j], LEAST_DESCENT)
+                clipped = _clip(rays[j], least)
                 if len(clipped) >= 3:
                     cut = position[j, :2] + clipped[:, :2] * (height[j] / -clipped[:, 2:])
                     low[j], high[j], seen[j] = cut.min(0), cut.max(0), True

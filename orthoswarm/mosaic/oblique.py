@@ -9,13 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame
-
-STRAY_RAD = float(np.radians(35.0))
-"""More than a fixed camera is tilted when its vehicle accelerates (28 degrees were seen)."""
-DOWN_RAD = float(np.radians(15.0))
-"""A flight whose usual tilt is below this looks straight down."""
-_FEW = 1.0 / 3.0
 
 
 def tilts(placed: Sequence[PlacedFrame]) -> NDArray[np.float64]:
@@ -29,14 +24,16 @@ def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
 
     A vehicle with more than a third of oblique pictures took them on purpose, and keeps them.
     """
+    config = active().mosaic
+    oblique_rad, nadir_rad = float(np.radians(config.oblique_deg)), float(np.radians(config.nadir_deg))
     tilt = tilts(placed)
     members: dict[str, list[int]] = {}
     for i, p in enumerate(placed):
         members.setdefault(p.frame.vehicle, []).append(i)
     out = {}
     for index in members.values():
-        off = tilt[index] > STRAY_RAD
-        if off.any() and off.mean() <= _FEW and np.median(tilt[index]) < DOWN_RAD:
+        off = tilt[index] > oblique_rad
+        if off.any() and off.mean() <= config.oblique_share and np.median(tilt[index]) < nadir_rad:
             for i in np.array(index)[off].tolist():
                 out[placed[i].frame.image] = (
                     f"it looks {np.degrees(tilt[i]):.0f} degrees away from straight down, the others of its vehicle "

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.footprint import LEAST_DESCENT, footprint_boxes
+from orthoswarm.mosaic.footprint import footprint_boxes, least_descent
 from orthoswarm.mosaic.render_arrays import Shots, heights, project
 from orthoswarm.mosaic.seam_labels import label_tile
 from orthoswarm.mosaic.visible_ground import by_tile
@@ -25,15 +26,6 @@ Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
 _TILE = 512
-_CELLS_ACROSS = 64
-_MAX_CELLS = 2_000_000
-_AT_ONCE = 65_536
-_DARK, _BRIGHT = 8.0, 247.0
-"""Means beyond these levels are (partly) clipped and say nothing about a gain."""
-_ASIDE = 0.35
-"""How far beside a seam, towards each frame's nadir, colours are compared as well; a share of the way there."""
-_PER_FRAME = 48
-"""Samples a frame at most, beside those of consecutive frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +82,8 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) ->
         return np.zeros((1, 1), np.int32), GroundGrid(0, 0.0, 0.0, 1.0, 1, 1)
     side = float(np.median(boxes[:, 2:] - boxes[:, :2]))
     box = BoundingBox.around(boxes)
-    cell = max(side / _CELLS_ACROSS, float(np.sqrt(box.width * box.height / _MAX_CELLS)), 1e-3)
+    config = active().radiometry
+    cell = max(side / config.label_cells, float(np.sqrt(box.width * box.height / config.label_most_cells)), 1e-3)
     grid = GroundGrid.around(0, box, cell)
     labels = np.zeros((grid.height, grid.width), np.int32)
     for (r, c), ids in by_tile(cameras, grid, _TILE, terrain).items():
@@ -126,7 +119,7 @@ def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.in
         by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
     rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
     height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
-    descent = np.where(rays[..., 2:] < -LEAST_DESCENT, -rays[..., 2:], np.nan)
+    descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
     ground = shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
 
     same = np.nonzero(vehicle[1:] == vehicle[:-1])[0]
@@ -140,12 +133,12 @@ def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.in
 def _towards(seams: _Meetings, frame: Ints, shots: Shots) -> _Meetings:
     """The same places, moved towards the nadirs of one of the two frames."""
     nadir = shots.position[frame, :2]
-    return _Meetings(seams.a, seams.b, seams.ground + _ASIDE * (nadir - seams.ground))
+    return _Meetings(seams.a, seams.b, seams.ground + active().radiometry.beside_seam * (nadir - seams.ground))
 
 
 def _thinned(meetings: _Meetings, frames: int) -> _Meetings:
     """Every k-th place, so that there are not more than some a frame."""
-    step = max(1, -(-len(meetings.a) // (_PER_FRAME // 3 * frames)))
+    step = max(1, -(-len(meetings.a) // (active().radiometry.ratios_per_picture // 3 * frames)))
     return _Meetings(meetings.a[::step], meetings.b[::step], meetings.ground[::step])
 
 
@@ -156,20 +149,21 @@ def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain)
     seen = np.zeros((count, 2, 4), np.float32)
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
-    for first in range(0, count, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    config, at_once = active().radiometry, active().compute.ratios_at_once
+    for first in range(0, count, at_once):
+        some = slice(first, first + at_once)
         ground = np.nan_to_num(meetings.ground[some])
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
             meetings.a[some], meetings.b[some], place, position, rotation, shots.lens, shots.size, small,
-            ratio[some], usable[some], seen[some],
+            config.dark_level, config.bright_level, ratio[some], usable[some], seen[some],
         )  # fmt: skip
     usable &= np.asarray(np.isfinite(meetings.ground).all(axis=1))
     return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable])
 
 
 @kernel
-def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable, seen):  # type: ignore[no-untyped-def]
+def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen):  # type: ignore[no-untyped-def]
     rows, columns = small.shape[1], small.shape[2]
     for m in range(len(a)):
         clear = 0
@@ -187,7 +181,7 @@ def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable, 
                 top = small[k, i, j, channel] * (1.0 - fx) + small[k, i, j + 1, channel] * fx
                 low = small[k, i + 1, j, channel] * (1.0 - fx) + small[k, i + 1, j + 1, channel] * fx
                 value = top * (1.0 - fy) + low * fy
-                good = good and value > _DARK and value < _BRIGHT
+                good = good and value > dark and value < bright
                 ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
             half = 0.5 * size[k, 0]
             seen[m, side, 0] = (u + 0.5) / half - 1.0

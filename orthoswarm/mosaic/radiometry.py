@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.lens_arrays import F, U, V
 from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
@@ -29,25 +30,8 @@ Field = NDArray[np.float32]
 """Factors of a frame: float32 (3, 6), for red, green and blue the coefficients of 1, x, y, x^2, xy, y^2; x and y are
 the place in the picture from its centre, half the picture's width being 1."""
 
-_SAMPLE_SIGMA = 0.15
-"""Log ratio of two thumbnails at one place: parallax, shadows, moving things (two suburbs, once solved: half within
-0.05, 90 % within 0.19)."""
-_VEHICLE_SIGMA, _FRAME_SIGMA = 0.30, 0.06
-"""Priors of the log gains of vehicles (other exposure) and of frames (automatic exposure within a flight)."""
-_LENS_SIGMAS = (0.05, 0.05, 0.15, 0.05, 0.15)
-"""Priors of x, y, x^2, xy, y^2 of a vehicle's lens; chosen: corners may be darker by a fifth or so."""
-_VIEW_SIGMAS = (0.15, 0.15, 0.10, 0.10, 0.10)
-"""Priors of e, n, e^2, en, n^2 of the view direction's tangents; chosen (two suburbs: 0.14 to 0.22 a tangent found)."""
-_SLOPE_SIGMA = 0.04
-"""Prior of a frame's own slopes; chosen (two suburbs: 0.02 to 0.03 found)."""
-_HUE_SHARE = 0.35
-"""How much less than brightness hue may vary, but for a vehicle's white balance; chosen by looking at four sets."""
 _BRIGHTNESS_HUE = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Red, green, blue to brightness and two differences of hue, an orthonormal change of axes."""
-_CLIP = float(np.log(1.8))
-"""Greatest log factor: what would need more is another cause (burnt out, cloud shadow)."""
-_ROUNDS, _STEPS, _ENOUGH = 4, 25, 1e-3
-_NODES = 7
 _COMMON, _OWN = 11, 3
 """Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain and two slopes."""
 
@@ -78,7 +62,7 @@ def estimate_fields(
         held: image -> field of frames that are drawn already and stay as they are.
 
     Returns:
-        image -> field for every frame; factors lie within 1/1.8 to 1.8.
+        image -> field for every frame; factors lie within `greatest_factor` and its inverse.
     """
     held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
@@ -102,7 +86,8 @@ def estimate_fields(
     if not fixed.any() and area.sum() > 0:
         middle = log[some].mean(1)
         log -= (area[:, None] * middle).sum(0) / area.sum()
-    fields = _as_polynomials(np.exp(np.clip(log, -_CLIP, _CLIP)), x, y)
+    limit = float(np.log(active().radiometry.greatest_factor))
+    fields = _as_polynomials(np.exp(np.clip(log, -limit, limit)), x, y)
     return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
 
 
@@ -122,12 +107,13 @@ def _solve(
     colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Unknowns of vehicles (V, 11, 3) and of frames (N, 3, 3), by conjugate gradients within reweighting rounds."""
-    prior_v = np.array([_VEHICLE_SIGMA, *_LENS_SIGMAS, *_VIEW_SIGMAS]) ** -2.0
-    prior_f = np.array([_FRAME_SIGMA, _SLOPE_SIGMA, _SLOPE_SIGMA]) ** -2.0
+    config = active().radiometry
+    prior_v = np.array([config.vehicle_sigma, *config.lens_sigmas, *config.view_sigmas]) ** -2.0
+    prior_f = np.array([config.picture_sigma, config.slope_sigma, config.slope_sigma]) ** -2.0
     prior = np.concatenate([np.tile(prior_v, vehicles), np.tile(prior_f, len(vehicle))])[:, None] * np.ones(3)
     of_hue = np.ones(len(prior), bool)
     of_hue[: vehicles * _COMMON : _COMMON] = False
-    prior[of_hue, 1:] /= _HUE_SHARE**2
+    prior[of_hue, 1:] /= config.hue_share**2
     measured = colors.ratio @ _BRIGHTNESS_HUE.T
     x = np.zeros((len(prior), 3))
     free = (~fixed).astype(np.float64)
@@ -143,10 +129,10 @@ def _solve(
         _backward(*sample, weighted, out)
         return out
 
-    for _ in range(_ROUNDS):
+    for _ in range(config.reweightings):
         residual = differences(x) + measured
-        error2 = np.square(residual).mean(1) / _SAMPLE_SIGMA**2
-        weight = ((1.0 + error2 / 9.0) ** -2 / _SAMPLE_SIGMA**2)[:, None]
+        error2 = np.square(residual).mean(1) / config.ratio_sigma**2
+        weight = ((1.0 + error2 / config.robust_sigmas**2) ** -2 / config.ratio_sigma**2)[:, None]
         diagonal = np.zeros(len(prior))
         _diagonal(*sample, weight[:, 0], diagonal)
         scale = 1.0 / (diagonal[:, None] + prior)
@@ -154,8 +140,8 @@ def _solve(
         left = -(gathered(weight * residual) + prior * x)
         step, z = np.zeros_like(x), scale * left
         towards, product = z.copy(), (left * z).sum(0)
-        enough = _ENOUGH**2 * product
-        for _ in range(_STEPS):
+        enough = config.solver_tolerance**2 * product
+        for _ in range(config.solver_steps):
             image = gathered(weight * differences(towards)) + prior * towards
             curve = (towards * image).sum(0)
             alpha = product / np.where(curve > 0.0, curve, 1.0)
@@ -238,10 +224,11 @@ def _diagonal(frame, place, vehicle, free, vehicles, weight, out):  # type: igno
 
 
 def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
-    """Places in the pictures (N, 49) at which fields are fitted."""
-    across = np.linspace(-1.0, 1.0, _NODES)
-    x = np.tile(across, _NODES)
-    y = np.repeat(across, _NODES)[None, :] * (size[:, 1] / size[:, 0])[:, None]
+    """Places in the pictures (N, nodes^2) at which fields are fitted."""
+    count = active().radiometry.nodes
+    across = np.linspace(-1.0, 1.0, count)
+    x = np.tile(across, count)
+    y = np.repeat(across, count)[None, :] * (size[:, 1] / size[:, 0])[:, None]
     return np.broadcast_to(x, y.shape), y
 
 

@@ -14,7 +14,6 @@ from orthoswarm.compute.jit import kernel
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.footprint import MAX_OFF_NADIR_RAD
 from orthoswarm.mosaic.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
 Array = NDArray[np.float64]
@@ -155,7 +154,3 @@ def project(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
         return -1e9, -1e9
     s = lens[F] * (1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3])))
     return s * px + lens[U], s * py + lens[V]
-
-
-TAN2_LIMIT = float(np.tan(MAX_OFF_NADIR_RAD) ** 2)
-"""Squared distance from the nadir point per squared height beyond which the ground is not drawn."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
+from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -42,11 +43,15 @@ class Place:
 
     def store(self) -> TileStore:
         """The tiles, mapped in small number: tasks walk from tile to tile."""
-        return TileStore(self.folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
+        return self._store(self.folder)
 
     def other_pictures(self) -> TileStore:
         """Beside them tiles of what the other picture shows near each seam."""
-        return TileStore(self.folder / "seams", tile_px=self.tile_px, dtype=np.int32, memory_mb=64.0)
+        return self._store(self.folder / "seams")
+
+    def _store(self, folder: Path) -> TileStore:
+        memory_mb = active().compute.tile_store_mb
+        return TileStore(folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=memory_mb)
 
     def corner(self, key: Key) -> tuple[float, float]:
         """West and north of a tile."""

@@ -47,7 +47,7 @@ from orthoswarm.mosaic.render_passes import (
     sample_pass,
 )
 from orthoswarm.mosaic.seams.previews import PreviewFile, unwritten
-from orthoswarm.mosaic.seams.seam_tiles import BORDER_PX, SeamCells, cell_size_px
+from orthoswarm.mosaic.seams.seam_tiles import SeamCells, cell_size_px
 from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
 
@@ -59,10 +59,8 @@ take arguments as it needs them (workers.Workers.map does), since all of them at
 Progress = Callable[[int, int], None]
 Blend = Literal["none", "seam"]
 
-_FRAMES_PER_TASK = 64
 _STAGING = "staging"
 _UNCHANGED = uniform(np.ones(3))
-_COARSE_CELLS = 1_000_000
 
 
 def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable[Any]:
@@ -225,8 +223,9 @@ def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, 
 def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
     """The pictures in groups, with what is needed to draw them."""
     pictures = list(_by_picture(jobs))
-    for start in range(0, len(pictures), _FRAMES_PER_TASK):
-        some = pictures[start : start + _FRAMES_PER_TASK]
+    size = active().compute.pictures_per_task
+    for start in range(0, len(pictures), size):
+        some = pictures[start : start + size]
         own: list[list[int]] = [
             [i for _, shares in some for n, i in shares if n == number] for number in range(len(jobs))
         ]
@@ -331,7 +330,7 @@ class _Job:
         rows = np.array([previews.row[self.frames[i].frame.image] for i in index], np.int32)
         missing = np.nonzero(unwritten(previews.path, rows))[0]
         pictures = [(self.frames[int(index[m])].frame.path, int(rows[m])) for m in missing]
-        n = _FRAMES_PER_TASK
+        n = active().compute.pictures_per_task
         tasks = (PreviewTask(previews.path, pictures[k : k + n], read) for k in range(0, len(pictures), n))
         for _ in self.run(preview_pass, tasks):
             pass
@@ -343,7 +342,7 @@ class _Job:
         rows = np.array([self.seams.previews.row[image] for image in images], np.int32)
         tone = np.array([self.gains.get(image, _UNCHANGED).mean(0) for image in images], np.float32).reshape(-1, 6)
         west, south, east, north = self.canvas.tile_bounds(key)
-        border = BORDER_PX * self.canvas.grid.gsd_m
+        border = active().mosaic.border_px * self.canvas.grid.gsd_m
         terrain = crop(self.terrain, BoundingBox(west - border, south - border, east + border, north + border))
         return SeamCells(self.seams.previews.path, rows, tone, self.cell_px, terrain)
 
@@ -398,8 +397,8 @@ class _Job:
     def seen_m2(self) -> float:
         """Ground that the usable frames see, measured on coarse cells."""
         grid, t = self.canvas.grid, self.canvas.tile_px
-        factor = 1
-        while factor < 64 and grid.width * grid.height > factor * factor * _COARSE_CELLS:
+        factor, most = 1, active().mosaic.completeness_cells
+        while factor < 64 and grid.width * grid.height > factor * factor * most:
             factor *= 2
         coarse = GroundGrid(
             grid.epsg,

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.render_arrays import STEP, TAN2_LIMIT, Shots, height_at, project
+from orthoswarm.mosaic.render_arrays import STEP, Shots, height_at, project
 
 Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]
@@ -79,10 +80,10 @@ def _claim(best, label, r0, r1, c0, c1, mark, x, y, gsd):  # type: ignore[no-unt
 
 
 @kernel
-def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattice, flat, gsd):  # type: ignore[no-untyped-def]
+def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattice, flat, gsd, tan2):  # type: ignore[no-untyped-def]
     """The same for a frame that sees part of the block: pixel by pixel where it would be nearer."""
     worst = np.float32(0.0)
-    limit = np.float32(TAN2_LIMIT)
+    limit = np.float32(tan2)
     step = np.float32(gsd)
     z = np.float64(lattice[0, 0])
     for r in range(r0, r1):
@@ -104,7 +105,7 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
 
 
 @kernel
-def _label(best, label, position, rotation, lens, marks, lattice, gsd):  # type: ignore[no-untyped-def]
+def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  # type: ignore[no-untyped-def]
     """Solve a tile: lower best (squared metres) and set label to a frame's mark wherever it is the nearest."""
     rows, columns = best.shape
     n = len(marks)
@@ -135,11 +136,24 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd):  # type:
                     max(y1 - position[k, 1], position[k, 1] - y0),
                 )
                 rise = position[k, 2] - z1
-                if seen == _INSIDE and rise > 0.0 and far_x * far_x + far_y * far_y <= TAN2_LIMIT * rise * rise:
+                if seen == _INSIDE and rise > 0.0 and far_x * far_x + far_y * far_y <= tan2 * rise * rise:
                     worst = _claim(best, label, r0, r1, c0, c1, marks[k], position[k, 0], position[k, 1], gsd)
                 else:
                     worst = _contest(
-                        best, label, r0, r1, c0, c1, marks[k], position[k], rotation[k], lens[k], lattice, flat, gsd
+                        best,
+                        label,
+                        r0,
+                        r1,
+                        c0,
+                        c1,
+                        marks[k],
+                        position[k],
+                        rotation[k],
+                        lens[k],
+                        lattice,
+                        flat,
+                        gsd,
+                        tan2,
                     )
 
 
@@ -160,13 +174,14 @@ def label_tile(
         gsd_m: ground pixel.
     """
     position, rotation = shots.about(west, north)
+    limit = tan_limit() ** 2
     for weak in (False, True):
         index = np.nonzero(shots.weak == weak)[0]
         if len(index) == 0:
             continue
         # what has a label is nearer than anything can be, and stays
         best = np.where(label == 0, np.float32(np.inf), np.float32(-1.0))
-        _label(best, label, position[index], rotation[index], shots.lens[index], marks[index], lattice, gsd_m)
+        _label(best, label, position[index], rotation[index], shots.lens[index], marks[index], lattice, gsd_m, limit)
 
 
 @kernel

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -23,10 +24,6 @@ Mask = NDArray[np.bool_]
 
 # GDAL keeps 5 % of the machine's memory in blocks otherwise, in every process; it reads this at its first block.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
-
-_FLAT_PX = 15
-_READ_AT_ONCE = 8_000_000
-_STRETCH_PERCENT = (0.5, 99.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +143,7 @@ class RasterMap:
         """A grid in bands of rows for which not too many pixels are read at once: maps need not have overviews."""
         t = self._open(self._level(grid)).transform
         read = grid.width * (grid.gsd_m / t.a) * (grid.gsd_m / -t.e)
-        rows = max(1, int(_READ_AT_ONCE / max(read, 1.0)))
+        rows = max(1, int(active().compute.map_pixels_at_once / max(read, 1.0)))
         return [
             replace(grid, north=grid.north - top * grid.gsd_m, height=min(rows, grid.height - top))
             for top in range(0, grid.height, rows)
@@ -229,7 +226,7 @@ class RasterMap:
         for i, band in enumerate(data):
             values = band[valid]
             if values.size:
-                low[i], high[i] = np.percentile(values.astype(np.float64), _STRETCH_PERCENT)
+                low[i], high[i] = np.percentile(values.astype(np.float64), active().raster.stretch_percent)
             if not high[i] > low[i]:
                 high[i] = low[i] + 1.0
         return _Stretch(low, high)
@@ -336,12 +333,13 @@ def _blank(values: NDArray[Any]) -> Mask:
     """Where a map without a mask is plain black or plain white over a patch: a collar, which only has false edges."""
     import cv2
 
-    box = np.ones((_FLAT_PX, _FLAT_PX), np.uint8)
-    wider = np.ones((_FLAT_PX + 4, _FLAT_PX + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
+    side = active().raster.collar_px
+    box = np.ones((side, side), np.uint8)
+    wider = np.ones((side + 4, side + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
     out = np.zeros(values.shape[1:], bool)
     for value in (0, 255) if values.dtype == np.uint8 else (0,):
         flat = (values == value).all(axis=0)
-        if flat.sum() >= _FLAT_PX**2:
+        if flat.sum() >= side**2:
             core = cv2.erode(flat.astype(np.uint8), box, borderValue=1)
             out |= cv2.dilate(core, wider, borderValue=0).astype(bool)
     return out

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
@@ -18,13 +19,6 @@ Array = NDArray[np.float64]
 _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
            "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 0.3048006096012192,
            "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
-_MOST_NODES = 4_000_000
-_FINEST_M = 2.0
-
-MOST_BURIED = 0.05
-"""Part of the cameras that a DEM may bury: a few recorded heights can be wrong."""
-LEAST_COVER = 0.02
-"""A DEM with heights on less of the area than this is of another place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +72,9 @@ class HeightModel:
         Raises:
             InputError: if it cannot be read, has no CRS, no heights on the area, or buries cameras.
         """
-        ground = _window(path, epsg, bounds, _MOST_NODES)
+        ground = _window(path, epsg, bounds, active().raster.dem_most_nodes)
         cover = float(ground.known.mean())
-        if cover < LEAST_COVER:
+        if cover < active().raster.dem_least_cover:
             raise InputError(_no_cover(path, epsg, bounds, cover))
         at = np.asarray(cameras, float).reshape(-1, 3)
         at = at[ground.knows(at[:, :2])]
@@ -90,9 +84,13 @@ class HeightModel:
             _refuse_buried(path, below - zero, at[:, 2])
         return cls(Path(path).absolute(), epsg, zero, cover)
 
-    def window(self, bounds: BoundingBox, most_nodes: int = 250_000) -> KnownGround:
-        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many."""
-        return _window_over(self, bounds, most_nodes)
+    def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
+        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many.
+
+        Args:
+            bounds: west, south, east, north. most_nodes: None takes `dem_window_nodes` of the configuration.
+        """
+        return _window_over(self, bounds, most_nodes or active().raster.dem_window_nodes)
 
 
 @lru_cache(maxsize=6)
@@ -103,8 +101,7 @@ def _window_over(model: HeightModel, bounds: BoundingBox, most_nodes: int) -> Kn
 
 
 def _window(path: Path, epsg: int, bounds: BoundingBox, most_nodes: int) -> KnownGround:
-    area = bounds.width * bounds.height
-    z, left, low, step = _on_area(Path(path), epsg, bounds, None, max(_FINEST_M, float(np.sqrt(area / most_nodes))))
+    z, left, low, step = _on_area(Path(path), epsg, bounds, None, most_nodes)
     known = np.isfinite(z)
     z = _filled(z, known) if known.any() else np.zeros(z.shape)
     return KnownGround(Terrain(left, low, step, z.astype(np.float32)), known)
@@ -165,7 +162,7 @@ def _no_cover(path: Path, epsg: int, bounds: BoundingBox, cover: float) -> str:
 def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
     """Refuse ground (N,) above cameras (N,), both over takeoff; NaN where a camera's height is not known."""
     known = np.isfinite(cameras)
-    if known.any() and float((ground > cameras)[known].mean()) > MOST_BURIED:
+    if known.any() and float((ground > cameras)[known].mean()) > active().raster.dem_most_buried:
         raise InputError(
             f"by {Path(path).name} the ground lies above {float((ground > cameras)[known].mean()):.0%} of the cameras "
             f"(its heights below the flight span {ground.max() - ground.min():.0f} m); check that it is this area's "
@@ -191,7 +188,7 @@ def check_dem(path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) ->
 
 
 def _on_area(
-    path: Path, epsg: int, bounds: BoundingBox, step_m: float | None, finest_m: float = _FINEST_M
+    path: Path, epsg: int, bounds: BoundingBox, step_m: float | None, most_nodes: int | None = None
 ) -> tuple[Array, float, float, float]:
     """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step."""
     import rasterio
@@ -215,7 +212,7 @@ def _on_area(
             raise InputError(f"{name} is a picture ({dataset.count} bands of 8 bit), not heights; give a DEM by --dem")
         try:
             west, south, east, north = bounds
-            step = step_m or _own_step(dataset, epsg, bounds, finest_m)
+            step = step_m or _own_step(dataset, epsg, bounds, most_nodes)
             left, low = float(np.floor(west / step) * step), float(np.floor(south / step) * step)
             columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
             # a pixel about every node: its centre is the node
@@ -263,9 +260,12 @@ def _pixel_m(dataset: Any, epsg: int, bounds: BoundingBox) -> float:
     return 100.0 / float(np.sqrt(area)) if np.isfinite(area) and area > 0 else 1.0
 
 
-def _own_step(dataset: Any, epsg: int, bounds: BoundingBox, finest_m: float) -> float:
-    area = bounds.width * bounds.height
-    return float(max(finest_m, round(_pixel_m(dataset, epsg, bounds), 1), np.sqrt(area / _MOST_NODES)))
+def _own_step(dataset: Any, epsg: int, bounds: BoundingBox, most_nodes: int | None) -> float:
+    """Distance of nodes, metres: the DEM's own pixel within the configuration's limits and a number of nodes."""
+    config = active().raster
+    nodes = config.dem_most_nodes if most_nodes is None else min(most_nodes, config.dem_most_nodes)
+    spread = float(np.sqrt(bounds.width * bounds.height / nodes))
+    return float(max(config.dem_finest_m, round(_pixel_m(dataset, epsg, bounds), 1), spread))
 
 
 def _filled(z: Array, known: NDArray[np.bool_]) -> Array:

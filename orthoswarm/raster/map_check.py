@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
-
-_SIDE = 5
-_WINDOW_PX = 4.0
 
 
 class UnreadableMapError(InputError):
@@ -23,8 +21,9 @@ class UnreadableMapError(InputError):
 def sample_windows(bounds: BoundingBox, gsd_m: float) -> list[BoundingBox]:
     """Small windows of some pixels spread over bounds, few enough to be read in a fraction of a second."""
     west, south, east, north = bounds
-    half = 0.5 * _WINDOW_PX * gsd_m
-    share = (np.arange(_SIDE) + 0.5) / _SIDE
+    config = active().raster
+    half = 0.5 * config.check_window_px * gsd_m
+    share = (np.arange(config.check_side) + 0.5) / config.check_side
     return [
         BoundingBox(float(x), float(y), float(x), float(y)).grown(half)
         for y in north + share * (south - north)

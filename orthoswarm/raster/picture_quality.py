@@ -10,6 +10,8 @@ from orthoswarm.compute.jit import kernel
 
 _BLOCK_PX = 16
 _COLUMNS, _ROWS = 12, 9
+LEAST_SIDE_PX = _BLOCK_PX + 8
+"""Smaller pictures cannot be judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +36,10 @@ def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
     """Measure a picture, uint8 (rows, columns) or (rows, columns, 3 or 4), of which the second channel is used.
 
     Raises:
-        ValueError: if it is smaller than 24 pixels on a side.
+        ValueError: if it is smaller than LEAST_SIDE_PX on a side.
     """
     plane: NDArray[Any] = picture if picture.ndim == 2 else picture[..., 1]
-    if min(plane.shape) < _BLOCK_PX + 8:
+    if min(plane.shape) < LEAST_SIDE_PX:
         raise ValueError(f"a picture of {plane.shape[1]} x {plane.shape[0]} pixels is too small to be judged")
     fine, broad, mean, square, flat, bright = _sample(plane)
     return PictureQuality(

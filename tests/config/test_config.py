@@ -103,3 +103,29 @@ def test_the_report_says_what_was_changed(tmp_path, tmp_path_factory):
     assert main(["mosaic", str(folder / "photos"), *flags]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["config"] == {"records": {"theta_hat_deg": 80.0}}
+
+
+def drawn_share(tmp_path, tmp_path_factory, name, text):
+    """Share of the real-time map that is drawn, with a configuration, and what the report says was changed."""
+    import rasterio
+
+    from tests.kit.scenes import tiny_twin
+
+    folder = tiny_twin(tmp_path_factory, 1, every=10)
+    file = tmp_path / f"{name}.toml"
+    file.write_text(text)
+    out = tmp_path / name
+    flags = ["--until", "realtime", "--config", str(file), "--out", str(out), "--workers", "1", "--gsd", "1"]
+    assert main(["mosaic", str(folder / "photos"), *flags]) == 0
+    with rasterio.open(out / "realtime.tif") as raster:
+        area = float((raster.read(4) > 0).sum()) * raster.res[0] ** 2
+    return area, json.loads((out / "report.json").read_text())["config"]
+
+
+def test_an_override_of_the_drawing_draws_otherwise(tmp_path, tmp_path_factory):
+    """Ground that is seen farther than 20 degrees from straight down is left out when the file says so."""
+    usual, changed = drawn_share(tmp_path, tmp_path_factory, "usual", "")
+    assert usual > 0 and changed == {}
+    steep, changed = drawn_share(tmp_path, tmp_path_factory, "steep", "[mosaic]\nmost_off_nadir_deg = 20\n")
+    assert changed == {"mosaic": {"most_off_nadir_deg": 20}}
+    assert 0 < steep < 0.6 * usual

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.mosaic.footprint import LEAST_DESCENT
+from orthoswarm.mosaic.footprint import least_descent
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]
     for frame in placed:
         camera, lens = frame.camera, frame.camera.lens
         ray = at - camera.position
-        if -ray[2] < LEAST_DESCENT * float(np.linalg.norm(ray)) or float(ray @ camera.rotation[:, 2]) <= 0.0:
+        if -ray[2] < least_descent() * float(np.linalg.norm(ray)) or float(ray @ camera.rotation[:, 2]) <= 0.0:
             continue
         column, row = (float(v) for v in camera.project(at[None])[0])
         if 0.0 <= column < lens.width and 0.0 <= row < lens.height:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
+from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.render_arrays import TAN2_LIMIT, Shots, height_at, project
+from orthoswarm.mosaic.render_arrays import Shots, height_at, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
-from orthoswarm.mosaic.seams.previews import GLARE_LEVEL
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -24,10 +24,6 @@ SLOTS = 5
 """Candidates a cell: the cheapest ones."""
 BLOCK = 16
 """Cells a side of the blocks at whose corners contrasts are compared."""
-_WEAK = 1e6
-"""Cost of a picture that is to be used only where no other sees."""
-_SPREAD_TAN2 = 0.5
-"""Pictures more oblique than the best by this (squared tangent) are no candidates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +75,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArra
     unit = region.cell_px * region.gsd_m / max(height, 1.0)  # of an area cost against the cost of a cell's side
     sharpness = previews["sharpness"]
     blur = np.log(np.maximum(np.median(sharpness), 1e-3) / np.maximum(sharpness, 1e-3)) - config.blur_ignored_log
-    penalty = unit * config.blur_cost * np.maximum(blur, 0.0) + _WEAK * shots.weak
+    penalty = unit * config.blur_cost * np.maximum(blur, 0.0) + config.weak_cost * shots.weak
     usable = np.nonzero(previews["written"] > 0)[0]
     local = previews["contrast"] * np.maximum(tone[:, :1, None], 0.1)
     contrast = np.log(np.maximum(_smoothed(local), 0.5)).astype(np.float32)
@@ -108,6 +104,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArra
         *arrays, usable, penalty, haze, np.ascontiguousarray(previews["gray"]), tone, region.lattice, region.gsd_m,
         region.cell_px, unit * config.obliqueness_cost, cells.candidate, cells.cost, cells.level,
         np.ascontiguousarray(local, np.float32), cells.texture, unit * config.glare_cost,
+        config.glare_level, config.candidate_tan2, tan_limit() ** 2,
     )  # fmt: skip
     return cells
 
@@ -176,6 +173,9 @@ def _candidates(  # type: ignore[no-untyped-def]
     local,
     texture,
     glare,
+    glare_level,
+    spread,
+    tan2_limit,
 ):
     side = candidate.shape[0]
     step = cell * gsd
@@ -208,10 +208,10 @@ def _candidates(  # type: ignore[no-untyped-def]
                         fx = (c - b1 + 0.5) / BLOCK
                         z = height_at(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
                         dx, dy, rise = x - position[k, 0], y - position[k, 1], position[k, 2] - z
-                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * _SPREAD_TAN2))
+                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
                         tan2 = (dx * dx + dy * dy) / (rise * rise) if rise > 0.0 else np.inf
                         here = penalty[k] + weight * tan2
-                        if here < limit and tan2 <= TAN2_LIMIT:
+                        if here < limit and tan2 <= tan2_limit:
                             i, j = b0 // BLOCK, b1 // BLOCK
                             here += (haze[i, j, k] * (1.0 - fx) + haze[i, j + 1, k] * fx) * (1.0 - fy) + (
                                 haze[i + 1, j, k] * (1.0 - fx) + haze[i + 1, j + 1, k] * fx
@@ -226,7 +226,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                                 )
                                 if inside:
                                     g = _gray(gray[k], tone[k], u, v, size[k, 0], size[k, 1])
-                                    if g >= GLARE_LEVEL:
+                                    if g >= glare_level:
                                         here += glare
                                 if inside and here < limit:
                                     s = SLOTS - 1
@@ -241,7 +241,5 @@ def _candidates(  # type: ignore[no-untyped-def]
                                         i = min(int((v + 0.5) / size[k, 1] * local.shape[1]), local.shape[1] - 1)
                                         j = min(int((u + 0.5) / size[k, 0] * local.shape[2]), local.shape[2] - 1)
                                         texture[r, c] = local[k, i, j]
-                                    limit = min(
-                                        cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * _SPREAD_TAN2)
-                                    )
+                                    limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
                         worst = max(worst, limit)

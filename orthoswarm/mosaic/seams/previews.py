@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import StorageError
-from orthoswarm.raster.picture_quality import picture_quality
+from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
 
 Bytes = NDArray[np.uint8]
 
@@ -27,11 +28,6 @@ RECORD = np.dtype(
         ("written", np.uint32),
     ]
 )
-GLARE_LEVEL = 240
-"""Grey levels from here on are taken for glints of water or burnt-out ground."""
-_GLARE_SHARE = 0.05
-"""A block with a larger share of glare says nothing of haze: its contrast counts as 0."""
-_LEAST_SIDE_PX = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +78,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     """The record of a picture, uint8 (H, W, 3): an array of one element of dtype RECORD."""
     import cv2
 
+    config = active().mosaic
     record = np.zeros(1, RECORD)
     small = cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -89,10 +86,10 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     level = gray.astype(np.float32)
     mean = cv2.resize(level, blocks, interpolation=cv2.INTER_AREA)
     square = cv2.resize(level * level, blocks, interpolation=cv2.INTER_AREA)
-    glare = cv2.resize((gray >= GLARE_LEVEL).astype(np.float32), blocks, interpolation=cv2.INTER_AREA)
+    glare = cv2.resize((gray >= config.glare_level).astype(np.float32), blocks, interpolation=cv2.INTER_AREA)
     record["gray"][0] = gray
-    record["contrast"][0] = np.sqrt(np.maximum(square - mean * mean, 0.25)) * (glare <= _GLARE_SHARE)
-    sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= _LEAST_SIDE_PX else 0.0
+    record["contrast"][0] = np.sqrt(np.maximum(square - mean * mean, 0.25)) * (glare <= config.glare_share)
+    sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= LEAST_SIDE_PX else 0.0
     record["sharpness"] = max(sharp, 1e-3)
     record["written"] = 1
     return record

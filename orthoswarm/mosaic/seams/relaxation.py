@@ -18,9 +18,8 @@ Floats = NDArray[np.float32]
 
 NONE, FOREIGN = -1, -2
 """Labels of cells that no picture sees, and of a neighbour's cells whose picture is no candidate here."""
-_SCHEDULE = ((8, 0), (4, 2), (2, 1), (1, 0))
-"""Sides and offsets of the blocks that are moved, in cells."""
 _MOST_LABELS = 8
+"""Room for the labels in and around a block; a block of 8 cells seldom has more than four."""
 
 
 def relax(cells: Cells, fixed: Ints, standing_m: Floats) -> Ints:
@@ -34,12 +33,12 @@ def relax(cells: Cells, fixed: Ints, standing_m: Floats) -> Ints:
     config = active().mosaic
     label = np.where(fixed == NONE, cells.candidate[..., 0], fixed).astype(np.int32)
     held = fixed != NONE
-    over = (np.float32(config.height_cost) * np.clip(standing_m, 0.0, 10.0)).astype(np.float32)
+    over = (np.float32(config.height_cost) * np.clip(standing_m, 0.0, config.height_most_m)).astype(np.float32)
     costs = np.array([config.seam_cost, config.difference_most], np.float32)
     scale = (1.0 / (config.difference_scale * (1.0 + np.square(cells.texture / config.texture_level)))).astype(
         np.float32
     )
-    for side, offset in _SCHEDULE:
+    for side, offset in zip(config.block_sides, config.block_offsets, strict=True):
         _sweep(label, held, cells.candidate, cells.cost, cells.level, scale, over, costs, side, offset)
     return label
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.render_arrays import Shots, heights
 from orthoswarm.mosaic.seams.cell_candidates import Region, cell_candidates
@@ -16,10 +17,6 @@ from orthoswarm.mosaic.seams.relaxation import FOREIGN, NONE, relax, to_pixels
 
 Ints = NDArray[np.int32]
 
-BORDER_PX = 32
-"""Pixels around a tile that its seams are chosen together with, so that they go on well in the next tile."""
-_LEAST_CELL_PX, _MOST_CELL_PX = 4, 8
-
 
 @dataclass(frozen=True, slots=True)
 class SeamCells:
@@ -28,7 +25,7 @@ class SeamCells:
     Attributes:
         previews: file of the pictures' previews. rows: int32 (N,), the candidates' records there.
         tone: float32 (N, 6), factors of their brightness, see cell_candidates.
-        cell_px: side of a cell. terrain: the ground of the tile and BORDER_PX around it.
+        cell_px: side of a cell. terrain: the ground of the tile and `border_px` around it.
     """
 
     previews: Path
@@ -39,14 +36,15 @@ class SeamCells:
 
 
 def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
-    """Side of the cells, pixels of the map (4 or 8): about a pixel of the previews.
+    """Side of the cells, pixels of the map (within `cell_px` of the configuration): about a pixel of the previews.
 
     Args:
         picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
     """
     wanted = picture_width / COLUMNS * picture_gsd_m / gsd_m
     size = 2 ** round(float(np.log2(max(wanted, 1.0))))
-    return int(min(max(size, _LEAST_CELL_PX), _MOST_CELL_PX))
+    least, most = active().mosaic.cell_px
+    return int(min(max(size, least), most))
 
 
 def seam_labels(
@@ -64,19 +62,20 @@ def seam_labels(
     pixels = np.zeros(shape, np.int32)
     if len(ids) == 0:
         return pixels
-    cell, side_px = seams.cell_px, store.tile_px + 2 * BORDER_PX
-    left, top = west - BORDER_PX * gsd_m, north + BORDER_PX * gsd_m
+    cell, border = seams.cell_px, active().mosaic.border_px
+    side_px = store.tile_px + 2 * border
+    left, top = west - border * gsd_m, north + border * gsd_m
     lattice = heights(seams.terrain, left, top, gsd_m, side_px)
     region = Region(left, top, gsd_m, cell, side_px // cell, lattice)
     cells = cell_candidates(region, shots, seams.tone, read_previews(seams.previews, seams.rows))
     label = relax(cells, _settled(store, key, cell, ids), _standing(seams.terrain, region))
-    to_pixels(label, cells.candidate, cell, BORDER_PX // cell, pixels)
+    to_pixels(label, cells.candidate, cell, border // cell, pixels)
     return pixels
 
 
 def _settled(store: TileStore, key: Key, cell: int, ids: Ints) -> Ints:
     """Labels of the cells around a tile that belong to neighbours that are settled, NONE elsewhere."""
-    around = labels_around(store, key, BORDER_PX)[cell // 2 :: cell, cell // 2 :: cell] - 1
+    around = labels_around(store, key, active().mosaic.border_px)[cell // 2 :: cell, cell // 2 :: cell] - 1
     place = np.searchsorted(ids, around).clip(0, len(ids) - 1)
     fixed = np.where(ids[place] == around, place, FOREIGN)
     return np.where(around < 0, NONE, fixed).astype(np.int32)

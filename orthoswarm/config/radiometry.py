@@ -1,0 +1,56 @@
+"""Radiometric balancing of the pictures. Sigmas are of natural logarithms of colour factors (0.05 is 5 %)."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RadiometryConfig:
+    """Radiometric balancing of the pictures."""
+
+    # Observations: colour ratios of two pictures at the same ground
+    ratio_sigma: float = 0.15
+    """Log ratio of two thumbnails at one place: parallax, shadows, moving things (two suburbs, once solved: half within
+    0.05, 90 % within 0.19)."""
+    robust_sigmas: float = 3.0
+    """Scale of the Geman-McClure kernel on these ratios, sigmas (chosen; not measured)."""
+    dark_level: float = 8.0
+    """Thumbnail levels from 0 to here are partly clipped and say nothing about a gain (chosen)."""
+    bright_level: float = 247.0
+    """The same for levels from here to 255 (chosen)."""
+    beside_seam: float = 0.35
+    """How far beside a seam, towards each picture's nadir, colours are compared as well: a share of the way to the
+    nadir (chosen; not measured)."""
+    ratios_per_picture: int = 48
+    """Most ratios a picture at seams and beside them, those of consecutive pictures not counted (chosen for cost)."""
+    label_cells: int = 64
+    """Cells across a picture on which the seams for this comparison are found (chosen for cost)."""
+    label_most_cells: int = 2_000_000
+    """Most of these cells in a map; they grow beyond it (chosen for memory)."""
+
+    # Priors of the unknowns
+    vehicle_sigma: float = 0.30
+    """Log gain of a vehicle's camera: another exposure or white balance (chosen; not measured)."""
+    picture_sigma: float = 0.06
+    """Log gain of a picture: automatic exposure within a flight (chosen; not measured)."""
+    lens_sigmas: tuple[float, float, float, float, float] = (0.05, 0.05, 0.15, 0.05, 0.15)
+    """x, y, x^2, xy, y^2 of a vehicle's vignetting, half the picture's width being 1; chosen: corners may be darker by
+    a fifth or so."""
+    view_sigmas: tuple[float, float, float, float, float] = (0.15, 0.15, 0.10, 0.10, 0.10)
+    """e, n, e^2, en, n^2 of the view direction's tangents; chosen (two suburbs: 0.14 to 0.22 a tangent found)."""
+    slope_sigma: float = 0.04
+    """A picture's own slopes; chosen (two suburbs: 0.02 to 0.03 found)."""
+    hue_share: float = 0.35
+    """How much less than brightness hue may vary, but for a vehicle's white balance; chosen by looking at four sets."""
+    greatest_factor: float = 1.8
+    """Greatest factor, and the least is its inverse: what would need more has another cause (burnt out, cloud shadow;
+    chosen)."""
+
+    # Solution
+    reweightings: int = 4
+    """Rounds of reweighting (chosen; not measured)."""
+    solver_steps: int = 25
+    """Most steps of conjugate gradients a round (chosen; not measured)."""
+    solver_tolerance: float = 1e-3
+    """Preconditioned residual, as a share of the first one, at which a round ends (chosen; not measured)."""
+    nodes: int = 7
+    """Nodes along each side of a picture to which its quadratic polynomial is fitted (chosen)."""

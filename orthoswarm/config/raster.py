@@ -1,0 +1,33 @@
+"""Maps and height models that are read, and measures of a picture's quality."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RasterConfig:
+    """Maps and height models that are read."""
+
+    # Maps
+    collar_px: int = 15
+    """Plain black or plain white squares of at least this side, pixels, in a map without a mask are its collar and no
+    ground (chosen; not measured)."""
+    stretch_percent: tuple[float, float] = (0.5, 99.5)
+    """Percentiles of a map of more than 8 bits that become 0 and 255 (chosen; usual in GIS: 2 and 98, which clips
+    roofs)."""
+    check_side: int = 5
+    """Windows a side of the lattice at which a map's pixels are read before the work begins (chosen for its time)."""
+    check_window_px: float = 4.0
+    """Side of these windows, pixels (chosen for its time)."""
+
+    # Height models
+    dem_finest_m: float = 2.0
+    """Finest distance of the nodes on which a height model is read, metres: buildings that lean in it are averaged
+    (chosen; not measured)."""
+    dem_most_nodes: int = 4_000_000
+    """Most nodes read from a height model as a whole (chosen for memory)."""
+    dem_window_nodes: int = 250_000
+    """Most nodes of a window of it (chosen for memory)."""
+    dem_most_buried: float = 0.05
+    """Share of the cameras that a height model may bury: a few recorded heights can be wrong (chosen)."""
+    dem_least_cover: float = 0.02
+    """A height model with heights on a smaller share of the area than this is of another place (chosen)."""
