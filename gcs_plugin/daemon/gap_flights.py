@@ -1,7 +1,6 @@
 """Flights over what was missed: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -84,8 +83,7 @@ class GapFlights:
         if unknown:
             if not figures:
                 raise InputError(f"the lens of {', '.join(unknown)} is not known yet; wait until its legs are placed")
-            width, height = float(figures["footprint_m"][0]), float(figures["altitude_m"])
-            found.append(math.degrees(2.0 * math.atan(0.5 * width / height)))
+            found.append(float(figures["fov_min_deg"]))
             notes.append(f"no picture of {', '.join(unknown)} is placed: the field of view of the plan is assumed")
         return min(found), float(altitude), notes
 

@@ -229,7 +229,7 @@ def plan_into(request: PlanRequest) -> dict[str, Any]:
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
     plan, area = make_plan(request)
-    figures = report(plan, request.autopilot)
+    figures = report(plan, request.autopilot, request.fov_min_deg)
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilot))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"

@@ -1,6 +1,6 @@
-"""The ground below a plan, from a height model: what its highest point means for spacing, clearance and pixel size."""
+"""The ground below a plan, read from a height model."""
 
-from dataclasses import dataclass
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,78 +10,62 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
-from orthoswarm.planning.area.area import Area
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.model.plan import Plan
+from orthoswarm.planning.relief_plan import GroundBelow
+from orthoswarm.planning.sorties.ground_check import LEAST_ABOVE_GROUND_M
 from orthoswarm.raster.height_model import HeightModel
 
-LEAST_ABOVE_GROUND_M = 20.0
-_LEVEL_STARTS_M = 2.0
 _AROUND_M = 50.0
 
 
-@dataclass(frozen=True, slots=True)
-class GroundBelow:
-    """Heights of the ground over the lowest takeoff, metres.
+def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: NDArray[np.float64]) -> GroundBelow:
+    """The ground below what is to be flown, over that of the lowest start.
 
-    Attributes:
-        low_m: lowest ground of the area; high_m: highest. way_m: highest ground of the area and the ways to it.
+    Args:
+        dem: a GeoTIFF with a CRS. wanted: area or lines, grid metres. grid: of it. starts: takeoff points (n, 2), grid
+            metres, at least one.
+
+    Raises:
+        InputError: the model cannot be read, or has no heights there.
     """
-
-    low_m: float
-    high_m: float
-    way_m: float
-
-    @classmethod
-    def read(cls, dem: Path, area: Area, starts: NDArray[np.float64]) -> "GroundBelow":
-        """Read a height model below an area.
-
-        Args:
-            dem: a GeoTIFF with a CRS. area: with its grid. starts: takeoff points (n, 2), grid metres, at least one.
-
-        Raises:
-            InputError: the model cannot be read or has gaps there, or starts lie at different heights.
-        """
-        points = np.concatenate([shapely.get_coordinates(area.ground), starts])
-        bounds = BoundingBox.around_points(points, _AROUND_M)
-        known = HeightModel.open(dem, area.grid.epsg, bounds, np.empty((0, 3))).window(
-            bounds, active().raster.dem_most_nodes
+    points = np.concatenate([shapely.get_coordinates(wanted), starts])
+    bounds = BoundingBox.around_points(points, _AROUND_M)
+    found = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3))).window(bounds, active().raster.dem_most_nodes)
+    terrain = found.terrain
+    rows, columns = terrain.z.shape
+    east = terrain.west + terrain.step_m * np.arange(columns)
+    north = terrain.south + terrain.step_m * np.arange(rows)
+    nodes = np.stack(np.meshgrid(east, north), -1)
+    # One step around the outline, too: a small area may lie between nodes.
+    within = shapely.contains_xy(wanted.buffer(terrain.step_m), nodes[..., 0], nodes[..., 1])
+    hull = shapely.MultiPoint(points).convex_hull.buffer(terrain.step_m)
+    way = shapely.contains_xy(hull, nodes[..., 0], nodes[..., 1])
+    if not found.known[way | within].all():
+        raise InputError(
+            f"{dem} has no heights on a part of the area or of the ways to it; give a height model without holes there"
         )
-        terrain = known.terrain
-        rows, columns = terrain.z.shape
-        east = terrain.west + terrain.step_m * np.arange(columns)
-        north = terrain.south + terrain.step_m * np.arange(rows)
-        nodes = np.stack(np.meshgrid(east, north), -1)
-        # One step around the outline, too: a small area may lie between nodes.
-        within = shapely.contains_xy(area.ground.buffer(terrain.step_m), nodes[..., 0], nodes[..., 1])
-        hull = shapely.MultiPoint(points).convex_hull.buffer(_AROUND_M)
-        way = shapely.contains_xy(hull, nodes[..., 0], nodes[..., 1])
-        if not known.known[within].all():
-            raise InputError(f"{dem} has no heights on a part of the area; give a height model without holes there")
-        level = terrain.height(starts)
-        if float(np.ptp(level)) > _LEVEL_STARTS_M:
-            raise InputError(
-                f"the starts lie {np.ptp(level):.1f} m apart in height, and heights of a mission count from takeoff; "
-                "start all vehicles at one level"
-            )
-        z = terrain.z - float(level.min())
-        return cls(float(z[within].min()), float(z[within].max()), float(z[way].max()))
+    z = terrain.z - np.float32(terrain.height(starts).min())
+    ground = Terrain(terrain.west, terrain.south, terrain.step_m, z)
+    return GroundBelow(ground, float(z[within].min()), float(z[within].max()), float(z[way].max()))
 
-    def check(self, altitude_m: float) -> None:
-        """Refuse legs and ways lower than 20 m above the ground.
 
-        Raises:
-            InputError: the altitude is too low.
-        """
-        if altitude_m - self.way_m < LEAST_ABOVE_GROUND_M:
-            least = np.ceil(self.way_m + LEAST_ABOVE_GROUND_M)
-            raise InputError(
-                f"at {altitude_m:g} m above takeoff the flight would be {altitude_m - self.way_m:.0f} m above the "
-                f"highest ground; give --altitude {least:.0f} or more, so that {LEAST_ABOVE_GROUND_M:g} m are kept"
-            )
-
-    def note(self, altitude_m: float) -> str:
-        """The range of heights over ground, in words."""
-        least, most = altitude_m - self.high_m, altitude_m - self.low_m
-        return (
-            f"the ground of the area lies {self.low_m:.0f} to {self.high_m:.0f} m over takeoff: lines are spaced for "
-            f"{least:.0f} m above ground; pixels are up to {most / least:.2f} times as large over the lowest"
-        )
+def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
+    """What to know about a plan over a height model, in words."""
+    over = plan.over_ground
+    if over is None:
+        return []
+    how = (
+        f"legs follow the ground at {over.nominal_m:g} m"
+        if over.follows
+        else f"all legs are flown {plan.altitude_m:.0f} m above the lowest takeoff"
+    )
+    back = math.ceil(ground.way_m + LEAST_ABOVE_GROUND_M)
+    return [
+        f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
+        f"{over.least_m:.0f} to {over.most_m:.0f} m above ground; side overlap {100 * over.side_overlap[0]:.0f} % or "
+        f"more on 95 % of the legs, forward overlap at least {100 * over.forward_overlap:.0f} %",
+        f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, PX4 "
+        f"RTL_RETURN_ALT) to {back} m or more",
+    ]

@@ -10,7 +10,7 @@ from typing import Any
 
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.plan import Plan, Sortie, VehiclePlan
+from orthoswarm.model.plan import OverGround, Plan, Sortie, VehiclePlan
 from orthoswarm.planning.area.area import Area
 
 MISSION_SUFFIXES = (".plan", ".waypoints")
@@ -35,9 +35,10 @@ def mission_files(plan: Plan, autopilot: Autopilot) -> dict[str, str]:
     return texts
 
 
-def report(plan: Plan, autopilot: Autopilot) -> dict[str, Any]:
+def report(plan: Plan, autopilot: Autopilot, fov_min_deg: float) -> dict[str, Any]:
     """The plan's figures as JSON: per vehicle and altogether."""
     return {
+        "fov_min_deg": fov_min_deg,
         "method": plan.method,
         "covered_share": plan.covered_share,
         "complete": plan.covered_share is None or plan.covered_share >= 0.999,
@@ -53,9 +54,23 @@ def report(plan: Plan, autopilot: Autopilot) -> dict[str, Any]:
         "autopilot": autopilot,
         "end": plan.end,
         "separation": plan.separation,
+        "over_ground": None if plan.over_ground is None else _over_ground(plan.over_ground),
         "vehicles": [_vehicle(vehicle) for vehicle in plan.vehicles],
         "gaps": [{"lat_deg": g.lat_deg, "lon_deg": g.lon_deg, "area_m2": g.area_m2} for g in plan.gaps],
         "warnings": list(plan.warnings),
+    }
+
+
+def _over_ground(over: OverGround) -> dict[str, Any]:
+    return {
+        "follows": over.follows,
+        "nominal_m": over.nominal_m,
+        "above_ground_m": [round(over.least_m, 2), round(over.most_m, 2)],
+        "ground_pixels": [round(over.least_m / over.nominal_m, 4), round(over.most_m / over.nominal_m, 4)],
+        "way_least_m": round(over.way_least_m, 2),
+        "top_above_takeoff_m": round(over.top_m, 2),
+        "side_overlap": [round(share, 4) for share in over.side_overlap],
+        "forward_overlap": round(over.forward_overlap, 4),
     }
 
 

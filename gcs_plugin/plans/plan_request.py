@@ -12,7 +12,7 @@ import shapely
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
-from gcs_plugin.plans.ground_below import GroundBelow
+from gcs_plugin.plans.ground_below import read_ground, relief_notes
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import End, Plan
@@ -21,15 +21,20 @@ from orthoswarm.planning.area.shape_files import Polygon, Ring
 from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
+from orthoswarm.planning.relief_plan import Relief, plan_over_relief
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
+from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion
 
 MOST_ITEMS: Final[dict[Autopilot, int]] = {"ardupilot": 650, "px4": 1900}
 """Mission items that an autopilot stores (ArduPilot: measured; PX4: its dataman's table)."""
 METHODS: Final = ("columns", "bcd", "tmstc")
+RELIEFS: Final = ("auto", "follow", "level")
 ENDS: Final = ("rtl", "land", "hover")
 _MOST_LAYERS: Final = 12.0
+_TOLERANCE: Final = 0.1
+"""Of the height above ground, as a share of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,8 +43,8 @@ class PlanRequest:
 
     Attributes:
         area: file of a polygon to cover, or of a line to follow. no_fly: files of further no-fly zones.
-        vehicles: how many. altitude_m: height of the lines above takeoff. fov_min_deg: theta-hat, the smallest
-            horizontal field of view in the swarm.
+        vehicles: how many. altitude_m: height of the lines above takeoff, with a `dem` above the ground.
+        fov_min_deg: theta-hat, the smallest horizontal field of view in the swarm.
         method: how lines are laid. autopilot: whose dialect. end: what follows the last line.
         starts: takeoff points (latitude, longitude) in degrees; none: where each vehicle's first line begins.
         speed_m_s: ground speed, None for the default. run_in_m: straight flight before a leg's first picture.
@@ -52,7 +57,8 @@ class PlanRequest:
         follow: follow the lines of a file that has polygons, too.
         gaps: the area is a file of gaps as `orthoswarm coverage` writes it. fly_not_arrived: fly gaps, too, whose
             pictures were taken but have not arrived.
-        dem: height model of the ground; lines are then spaced for the highest ground of the area.
+        dem: height model of the ground, None for level ground at takeoff. relief: legs follow the ground, lie at one
+            level, or whichever is done sooner. height_tolerance_m: of the height above ground, None for a tenth of it.
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
     """
 
@@ -81,6 +87,8 @@ class PlanRequest:
     gaps: bool = False
     fly_not_arrived: bool = False
     dem: Path | None = None
+    relief: Relief = "auto"
+    height_tolerance_m: float | None = None
     wind_m_s: float = 0.0
     wind_from_deg: float = 0.0
 
@@ -126,57 +134,84 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     Raises:
         InputError: a file or a value is of no use.
     """
-    fov = math.radians(request.fov_min_deg)
-    foot = footprint(request.altitude_m, fov, request.aspect, request.side_overlap, request.forward_overlap)
     options = request.flight_options()
     options.check()
-    foot = foot.turned(options.motion.crab_rad)
     progress("area")
     if request.gaps:
-        if request.dem is not None:
-            raise InputError("--dem works for a polygon to cover; leave it out with --gaps")
-        return _gap_plan(request, foot, options, progress)
+        return _gap_plan(request, options, progress)
     shapes, no_fly = read_shapes(request.area)
     no_fly += _no_fly_rings(request.no_fly)
     if shapes.polygons and not request.follow:
         area = make_area(shapes.polygons, no_fly)
-        ground = None if request.dem is None else _ground_below(request, request.dem, area)
-        if ground is not None:
-            above = request.altitude_m - ground.high_m
-            foot = footprint(above, fov, request.aspect, request.side_overlap, request.forward_overlap)
-            foot = foot.turned(options.motion.crab_rad)
-        plan = plan_area(area, request.vehicles, request.altitude_m, foot, request.method, options, progress)
-        if ground is not None:
-            plan = replace(plan, warnings=(*plan.warnings, ground.note(request.altitude_m)))
-        return plan, area
-    if request.dem is not None:
-        raise InputError("--dem works for a polygon to cover; leave it out along given lines")
+
+        def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
+            return plan_area(area, request.vehicles, above_m, foot, request.method, options, progress, heights)
+
+        return _over_ground(request, cover, area.ground, area.grid), area
     if not shapes.lines:
         what = "line" if shapes.polygons else "polygon and no line"
         raise InputError(f"{request.area} holds no {what}; draw one in it")
     zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
-    return plan_lines(shapes.lines, request.vehicles, request.altitude_m, foot, zones, options, progress), zones
+    points = np.concatenate(shapes.lines)
+    grid = LocalGrid(area_epsg(points[:, 0], points[:, 1])) if zones is None else zones.grid
+    paths = shapely.MultiLineString([grid.to_grid(line[:, 0], line[:, 1]) for line in shapes.lines])
+
+    def follow(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
+        return plan_lines(shapes.lines, request.vehicles, above_m, foot, zones, options, progress, heights)
+
+    return _over_ground(request, follow, paths, grid), zones
 
 
-def _ground_below(request: PlanRequest, dem: Path, area: Area) -> GroundBelow:
-    """The ground below a plan, checked for clearance."""
+def _over_ground(
+    request: PlanRequest,
+    make: Callable[[float, Footprint, FlightHeights | None], Plan],
+    wanted: shapely.Geometry,
+    grid: LocalGrid,
+) -> Plan:
+    """The plan over the height model of a request, or over level ground without one.
+
+    Args:
+        request: as given. make: plans with a footprint and the height that it belongs to.
+        wanted: what is to be flown over, metres of the grid.
+
+    Raises:
+        InputError: the height model cannot be used, there is no start, or as `make`.
+    """
+    if request.dem is None:
+        return make(request.altitude_m, _footprint(request, request.altitude_m), None)
+    _footprint(request, request.altitude_m)  # refuses what means nothing before the model is read
     if not request.starts:
         raise InputError("give --start with --dem: heights of a mission count from the takeoff point")
     starts = np.array(request.starts, float)
-    ground = GroundBelow.read(dem, area, area.grid.to_grid(starts[:, 0], starts[:, 1]))
-    ground.check(request.altitude_m)
-    return ground
+    ground = read_ground(request.dem, wanted, grid, grid.to_grid(starts[:, 0], starts[:, 1]))
+    tolerance_m = request.height_tolerance_m
+    if tolerance_m is None:
+        tolerance_m = _TOLERANCE * request.altitude_m
+    plan = plan_over_relief(
+        make, lambda above_m: _footprint(request, above_m), ground, request.altitude_m, tolerance_m, request.relief
+    )
+    return replace(plan, warnings=(*plan.warnings, *relief_notes(plan, ground)))
 
 
-def _gap_plan(
-    request: PlanRequest, foot: Footprint, options: Options, progress: Callable[[str], None]
-) -> tuple[Plan, Area]:
+def _footprint(request: PlanRequest, above_m: float) -> Footprint:
+    """Footprint of theta-hat at a height above level ground, turned by the wind's crab angle."""
+    fov = math.radians(request.fov_min_deg)
+    foot = footprint(above_m, fov, request.aspect, request.side_overlap, request.forward_overlap)
+    return foot.turned(request.flight_options().motion.crab_rad)
+
+
+def _gap_plan(request: PlanRequest, options: Options, progress: Callable[[str], None]) -> tuple[Plan, Area]:
     """A plan over the gaps of a coverage, and the ground that it aims at."""
     if request.endurance_min is None and not request.endurances_min:
         raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")
     no_fly = _no_fly_rings(request.no_fly)
-    target = gap_area(read_gaps(request.area), no_fly, foot, request.fly_not_arrived)
-    plan = plan_gaps(target.area, request.vehicles, request.altitude_m, foot, options, progress)
+    nominal = _footprint(request, request.altitude_m)
+    target = gap_area(read_gaps(request.area), no_fly, nominal, request.fly_not_arrived)
+
+    def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
+        return plan_gaps(target.area, request.vehicles, above_m, foot, options, progress, heights)
+
+    plan = _over_ground(request, cover, target.area.ground, target.area.grid)
     return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area
 
 

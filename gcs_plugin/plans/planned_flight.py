@@ -24,8 +24,7 @@ def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
         figures = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         features = json.loads((folder / "all.geojson").read_text(encoding="utf-8"))["features"]
         width, height = (float(side) for side in figures["footprint_m"])
-        flat = math.degrees(2.0 * math.atan(0.5 * width / float(figures["altitude_m"])))
-        fov = math.radians(float(figures.get("fov_min_deg", flat)))  # a plan from the web page does not state it
+        fov = math.radians(float(figures["fov_min_deg"]))
         # A leg over hills has several points; only its ends matter here.
         lines = [f["geometry"]["coordinates"] for f in features if f["properties"].get("kind") == "leg"]
         ends = np.array([[line[0][:2], line[-1][:2]] for line in lines], float).reshape(-1, 2, 2)

@@ -21,12 +21,16 @@ class Waypoint:
         height_m: height above the takeoff point, metres.
         camera: True at a leg's first point (pictures by distance begin as soon as it is reached), False at a leg's
             last point (they stop), None where nothing changes.
+        above_ground_m: nominal height above the ground where heights follow it, else None.
+        between: the point lies on a straight way and was put in for its height alone.
     """
 
     lat_deg: float
     lon_deg: float
     height_m: float
     camera: bool | None = None
+    above_ground_m: float | None = None
+    between: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,7 @@ class Sortie:
 
     @property
     def legs(self) -> tuple[tuple[Waypoint, Waypoint], ...]:
-        """First and last waypoint of each leg; a leg is straight, so nothing lies between them."""
+        """First and last waypoint of each leg; between them lie at most points for the height, on a straight line."""
         starts = [w for w in self.waypoints if w.camera is True]
         ends = [w for w in self.waypoints if w.camera is False]
         return tuple(zip(starts, ends, strict=True))
@@ -124,13 +128,37 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
+class OverGround:
+    """How a plan lies over a height model, metres above the ground straight below.
+
+    Attributes:
+        follows: legs keep a constant height above the ground; else all legs lie at one height.
+        nominal_m: height above the ground that was asked for.
+        least_m: lowest point of the legs; most_m: highest.
+        way_least_m: lowest point of the flights but for takeoff and landing.
+        top_m: highest point of the flights, above their takeoff.
+        side_overlap: of neighbouring lines: the 5th percentile along the legs, and the median.
+        forward_overlap: of consecutive pictures at the lowest point of the legs.
+    """
+
+    follows: bool
+    nominal_m: float
+    least_m: float
+    most_m: float
+    way_least_m: float
+    top_m: float
+    side_overlap: tuple[float, float]
+    forward_overlap: float
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """Missions for a swarm over one area, or along given lines.
 
     Attributes:
         method: "columns", "bcd", "tmstc", or "lines" where a given polyline is followed.
         vehicles: what each vehicle flies, by number.
-        altitude_m: height of the legs above takeoff, metres.
+        altitude_m: height of the legs above takeoff, metres; above the ground where they follow it.
         speed_m_s: planned ground speed, metres per second.
         trigger_m: distance between pictures on a leg, metres.
         spacing_m: largest distance between neighbouring lines, metres.
@@ -142,6 +170,7 @@ class Plan:
         gaps: what is missed, largest first.
         separation: how vehicles are kept apart, in words.
         warnings: what the user should know.
+        over_ground: how it lies over the height model, None without one.
     """
 
     method: str
@@ -158,6 +187,7 @@ class Plan:
     gaps: tuple[Gap, ...]
     separation: str
     warnings: tuple[str, ...]
+    over_ground: OverGround | None = None
 
     @property
     def makespan_s(self) -> float:

@@ -1,7 +1,7 @@
 """From an area, or given lines, to a plan for a swarm (paper III.A)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
-from orthoswarm.model.plan import Gap, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.model.plan import Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
 from orthoswarm.planning.area.area import Area
 from orthoswarm.planning.area.shape_files import Ring
 from orthoswarm.planning.lines import planned_coverage
@@ -20,8 +20,10 @@ from orthoswarm.planning.lines.sweep_lines import Field, stretches
 from orthoswarm.planning.lines.visiting_order import shorten
 from orthoswarm.planning.sorties.assignment import Crew, Options, Work
 from orthoswarm.planning.sorties.deconfliction import Separation, Slot
+from orthoswarm.planning.sorties.flight_heights import FlightHeights, LevelHeights
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
+from orthoswarm.planning.sorties.ground_check import leg_paths, over_ground, swaths
 
 __all__ = ["METHODS", "Method", "Options", "plan_area", "plan_gaps", "plan_lines"]
 
@@ -34,6 +36,39 @@ _QUICKEST_S = 0.5
 _WORTH = 0.99  # a later candidate must be better by this: the first ones are in the method's own, tidier order
 
 
+@dataclass(frozen=True)
+class _Over:
+    """What a plan's flights lie over.
+
+    Attributes:
+        above_m: height above level ground at which `foot` was made. foot: footprint of the narrowest camera.
+        heights: of the flights.
+    """
+
+    above_m: float
+    foot: Footprint
+    heights: FlightHeights
+
+    def missed(self, wanted: planned_coverage.Geometry, slots: list[list[Slot]]) -> planned_coverage.Geometry:
+        """What of the wanted ground no picture is certain to see, a shapely geometry."""
+        flights = [s.flight for row in slots for s in row]
+        if self.heights.ground is None:
+            flown = np.concatenate([_legs_of(flight) for flight in flights])
+            return planned_coverage.missed(wanted, flown, self.foot.width_m, self.foot.reach_m)
+        paths = [path for flight in flights for path in leg_paths(flight)]
+        return wanted.difference(shapely.union_all(swaths(paths, self.heights.ground, self.foot, self.above_m)))
+
+    def checked(self, slots: list[list[Slot]]) -> OverGround | None:
+        """How the flights lie over the height model, None without one.
+
+        Raises:
+            InputError: lower than 20 m above it.
+        """
+        if self.heights.ground is None:
+            return None
+        return over_ground([s.flight for row in slots for s in row], self.heights, self.foot, self.above_m)
+
+
 def plan_area(
     area: Area,
     vehicles: int,
@@ -42,33 +77,36 @@ def plan_area(
     method: Method = "bcd",
     options: Options | None = None,
     progress: Progress = lambda _: None,
+    heights: FlightHeights | None = None,
 ) -> Plan:
     """Missions that cover an area.
 
     Args:
         area: ground and no-fly zones.
         vehicles: how many.
-        altitude_m: height of the legs above takeoff, metres.
+        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
+            was made.
         foot: footprint of the narrowest camera at that height.
         method: how lines are laid and ordered.
         options: the rest.
-        progress: told in a word what is being done.
+        progress: called with what is being done.
+        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: more vehicles than lines, a start in a no-fly zone, an endurance too short for the area.
     """
     options = options or Options()
     options.check()
+    over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
-    crew = Crew(vehicles, altitude_m, foot, area.grid, router, options)
+    crew = Crew(vehicles, over.heights, foot, area.grid, router, options)
     progress("lines")
     best = _best_work(area, crew, foot, method, options.motion, router, min(foot.reach_m, 2.0 * clearance))
     progress("separation")
     slots = crew.schedule(best)
     progress("coverage")
-    flown = np.concatenate([_legs_of(s.flight) for row in slots for s in row])
-    left = planned_coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
+    left = over.missed(area.ground, slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
     warnings = _warnings(slots, best, foot, options)
@@ -77,7 +115,7 @@ def plan_area(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
         )
-    return _plan(method, slots, altitude_m, foot, area.grid, options, warnings, (area.size_m2, seen, gaps))
+    return _plan(method, slots, over, area.grid, options, warnings, (area.size_m2, seen, gaps))
 
 
 def _best_work(
@@ -109,22 +147,26 @@ def plan_gaps(
     foot: Footprint,
     options: Options | None = None,
     progress: Progress = lambda _: None,
+    heights: FlightHeights | None = None,
 ) -> Plan:
     """Missions that cover separate pieces of ground, each by the shortest parallel legs that see it.
 
     Args:
         area: the pieces, grown by the margin that they need, and no-fly zones.
         vehicles: how many there are; fewer are used where there are fewer legs.
-        altitude_m: height of the legs above takeoff, metres.
+        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
+            was made.
         foot: footprint of the narrowest camera at that height.
         options: the rest.
         progress: called with what is being done.
+        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no piece can be reached, a start in a no-fly zone, an endurance too short.
     """
     options = options or Options()
     options.check()
+    over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
     progress("lines")
@@ -133,13 +175,12 @@ def plan_gaps(
     if not len(legs):
         raise InputError("all of the gaps lie within the clearance of no-fly zones; reduce the clearance")
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
-    crew = Crew(min(vehicles, most), altitude_m, foot, area.grid, router, options)
+    crew = Crew(min(vehicles, most), over.heights, foot, area.grid, router, options)
     work = crew.share(shorten(legs, router, None if crew.starts is None else crew.starts[0]), True)
     progress("separation")
     slots = crew.schedule(work)
     progress("coverage")
-    flown = np.concatenate([_legs_of(s.flight) for row in slots for s in row])
-    left = planned_coverage.missed(area.ground, flown, foot.width_m, foot.reach_m)
+    left = over.missed(area.ground, slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     warnings = _warnings(slots, work, foot, options)
     if most < vehicles:
@@ -147,7 +188,7 @@ def plan_gaps(
     if gaps:
         warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
     share = 1.0 - float(left.area) / area.size_m2
-    return _plan("gaps", slots, altitude_m, foot, area.grid, options, warnings, (area.size_m2, share, gaps))
+    return _plan("gaps", slots, over, area.grid, options, warnings, (area.size_m2, share, gaps))
 
 
 def _gap_legs(piece: planned_coverage.Geometry, router: Router, foot: Footprint) -> Array:
@@ -168,6 +209,7 @@ def plan_lines(
     no_fly: Area | None = None,
     options: Options | None = None,
     progress: Progress = lambda _: None,
+    heights: FlightHeights | None = None,
 ) -> Plan:
     """Missions along given lines, with pictures on their straight stretches.
 
@@ -175,17 +217,20 @@ def plan_lines(
         lines: float64 (n, 2) each, latitude and longitude in degrees, flown in the order given. Stretches shorter
             than two trigger distances are flown without pictures: they are turns.
         vehicles: how many share the lines.
-        altitude_m: height of the legs above takeoff, metres.
+        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
+            was made.
         foot: footprint of the narrowest camera at that height.
         no_fly: an area whose no-fly zones hold here, too.
         options: the rest.
-        progress: told in a word what is being done.
+        progress: called with what is being done.
+        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no stretch is long enough, more vehicles than stretches, or a line crosses a no-fly zone.
     """
     options = options or Options()
     options.check()
+    over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     points = np.concatenate(lines)
     grid = no_fly.grid if no_fly else LocalGrid(area_epsg(points[:, 0], points[:, 1]))
     paths = [grid.to_grid(line[:, 0], line[:, 1]) for line in lines]
@@ -206,12 +251,12 @@ def plan_lines(
             f"{vehicles} vehicles are more than the {most} straight stretches; use at most {most} vehicles"
         )
     progress("lines")
-    crew = Crew(vehicles, altitude_m, foot, grid, router, options)
+    crew = Crew(vehicles, over.heights, foot, grid, router, options)
     work = crew.share(legs, reorder=False)
     progress("separation")
     slots = crew.schedule(work)
     warnings = _warnings(slots, work, foot, options)
-    return _plan("lines", slots, altitude_m, foot, grid, options, warnings, (None, None, ()))
+    return _plan("lines", slots, over, grid, options, warnings, (None, None, ()))
 
 
 def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Options) -> list[str]:
@@ -249,17 +294,23 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
     flight = slot.flight
     home = grid.to_geographic(flight.home)
     marks = {1: True, -1: False, 0: None}
+    places = grid.to_geographic(flight.points[:, :2])
     waypoints = tuple(
-        Waypoint(float(lat), float(lon), float(height), marks[int(mark)])
-        for (lat, lon), height, mark in zip(
-            grid.to_geographic(flight.points[:, :2]), flight.points[:, 2], flight.camera, strict=True
+        Waypoint(
+            float(places[k, 0]),
+            float(places[k, 1]),
+            float(flight.points[k, 2] - flight.home_z_m),
+            marks[int(flight.camera[k])],
+            None if np.isnan(flight.above_m[k]) else float(flight.above_m[k]),
+            bool(flight.between[k]),
         )
+        for k in range(len(places))
     )
     length = np.hypot(*np.diff(_legs_of(flight), axis=1)[:, 0].T)
     return Sortie(
         home_lat_deg=float(home[0]),
         home_lon_deg=float(home[1]),
-        takeoff_height_m=flight.climb_m,
+        takeoff_height_m=flight.climb_m - flight.home_z_m,
         waypoints=waypoints,
         start_s=slot.start_s,
         time_s=flight.time_s(motion),
@@ -272,14 +323,14 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
 def _plan(
     method: str,
     slots: list[list[Slot]],
-    altitude_m: float,
-    foot: Footprint,
+    over: _Over,
     grid: LocalGrid,
     options: Options,
     warnings: list[str],
     covered: tuple[float | None, float | None, tuple[Gap, ...]],
 ) -> Plan:
     area_m2, share, gaps = covered
+    foot, level_m = over.foot, over.heights.above_m if over.heights.follows else over.heights.at(np.zeros(2), 0.0)
     made = tuple(
         VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion) for s in row))
         for number, row in enumerate(slots, start=1)
@@ -287,7 +338,7 @@ def _plan(
     return Plan(
         method=method,
         vehicles=made,
-        altitude_m=altitude_m,
+        altitude_m=level_m,
         speed_m_s=options.motion.speed_m_s,
         trigger_m=foot.trigger_m,
         spacing_m=foot.spacing_m,
@@ -297,8 +348,9 @@ def _plan(
         area_m2=area_m2,
         covered_share=share,
         gaps=gaps,
-        separation=_separation_text(slots, altitude_m, options.separation),
+        separation=_separation_text(slots, level_m, options.separation),
         warnings=tuple(warnings),
+        over_ground=over.checked(slots),
     )
 
 

@@ -263,7 +263,7 @@ def test_the_geojson_holds_area_zones_legs_and_ways(concave):
 
 def test_the_report_has_the_promised_keys_and_adds_up(concave):
     _, plan = concave
-    figures = json.loads(json.dumps(report(plan, "px4"), allow_nan=False))
+    figures = json.loads(json.dumps(report(plan, "px4", 60.0), allow_nan=False))
     assert {"covered_share", "makespan_s", "vehicles"} <= figures.keys()
     for vehicle in figures["vehicles"]:
         assert {"id", "length_m", "turns", "time_s", "sorties", "photos"} <= vehicle.keys()

@@ -1,7 +1,9 @@
-"""`orthoswarm plan --dem`: spacing for the highest ground, and 20 m above it."""
+"""`orthoswarm plan --dem`: legs over hills, spaced for what pictures see there, and never lower than 20 m."""
 
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,19 +11,24 @@ import rasterio
 from rasterio.transform import from_origin
 
 from gcs_plugin.cli.main import main
+from gcs_plugin.mission.mission_files import parse_mission
 from tests.kit.flown_area import CORNER, EPSG, FlownArea
 
+Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-@pytest.fixture
-def hill(tmp_path: Path) -> Path:
-    """Ground at 300 m with a ridge of 40 m along the middle of the area."""
-    east = np.arange(-300, 900, 5.0) + 2.5
-    row = 300.0 + 40.0 * np.exp(-(((east - 200.0) / 80.0) ** 2))
-    path = tmp_path / "dem.tif"
-    size = {"width": len(east), "height": 240, "count": 1, "dtype": "float32"}
+
+def _hill(height_m: float, wide_m: float = 80.0) -> Height:
+    """Heights of a hill in the middle of the area, over east and north from its corner."""
+    return lambda e, n: 300.0 + height_m * np.exp(-((e - 200.0) ** 2 + (n - 200.0) ** 2) / wide_m**2)
+
+
+def _dem(path: Path, height: Height) -> Path:
+    at = np.arange(-300, 900, 5.0) + 2.5
+    z = height(at[None, :], at[::-1, None]).astype(np.float32)
+    size = {"width": len(at), "height": len(at), "count": 1, "dtype": "float32"}
     transform = from_origin(CORNER[0] - 300.0, CORNER[1] + 900.0, 5.0, 5.0)
     with rasterio.open(path, "w", driver="GTiff", crs=f"EPSG:{EPSG}", transform=transform, **size) as file:
-        file.write(np.repeat(row[None], 240, 0).astype(np.float32), 1)
+        file.write(z, 1)
     return path
 
 
@@ -33,24 +40,85 @@ def _arguments(tmp_path: Path, altitude: float, *more: object) -> list[str]:
     return [*map(str, given), "--start", start, "--json", *map(str, more)]
 
 
-def test_lines_are_spaced_for_the_highest_ground(
-    tmp_path: Path, hill: Path, capsys: pytest.CaptureFixture[str]
+def _planned(tmp_path: Path, capsys: pytest.CaptureFixture[str], altitude: float, *more: object) -> dict[str, Any]:
+    assert main(_arguments(tmp_path, altitude, *more)) == 0
+    out: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return out
+
+
+def _above_ground(folder: Path, height: Height) -> Iterator[tuple[float, float]]:
+    """Lowest and highest point above the ground of each leg, sampled every metre along the written missions."""
+    grid = FlownArea().grid
+    for feature in json.loads((folder / "all.geojson").read_text())["features"]:
+        if feature["properties"]["kind"] != "leg":
+            continue
+        lon, lat, z = np.array(feature["geometry"]["coordinates"]).T
+        points = grid.to_grid(lat, lon)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        at = np.arange(0.0, along[-1], 1.0)
+        east, north = (np.interp(at, along, points[:, axis]) - CORNER[axis] for axis in range(2))
+        above = np.interp(at, along, z) - (height(east, north) - 300.0)
+        yield float(above.min()), float(above.max())
+
+
+def test_legs_follow_the_ground_within_the_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hill = _hill(60.0)
+    out = _planned(tmp_path, capsys, 80, "--dem", _dem(tmp_path / "dem.tif", hill), "--height-tolerance", 6)
+    assert out["over_ground"]["follows"] and out["complete"]
+    # The model is sampled every 5 m and bilinear between.
+    assert all(low > 73.5 and high < 86.5 for low, high in _above_ground(tmp_path / "p", hill))
+    assert out["over_ground"]["above_ground_m"] == pytest.approx([74.0, 86.0], abs=1.5)
+    assert out["over_ground"]["way_least_m"] >= 73.0
+
+
+def test_an_area_that_is_flat_within_the_tolerance_is_flown_at_one_height(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(_arguments(tmp_path, 100, "--dem", hill)) == 0
-    out = json.loads(capsys.readouterr().out)
-    assert out["footprint_m"][0] == pytest.approx(2 * 60.0 * np.tan(np.radians(30.0)), rel=0.02)
-    assert out["altitude_m"] == 100 and any("over takeoff" in w for w in out["warnings"])
+    out = _planned(tmp_path, capsys, 80, "--dem", _dem(tmp_path / "dem.tif", _hill(10.0)))
+    assert not out["over_ground"]["follows"]
+    assert out["altitude_m"] == pytest.approx(85.0, abs=0.5)  # 80 m over the middle of 0 and 10 m
+    assert out["footprint_m"][0] == pytest.approx(2 * 75.0 * np.tan(np.radians(30.0)), rel=0.02)
 
 
-def test_less_than_20_m_above_the_ground_is_refused(
-    tmp_path: Path, hill: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(_arguments(tmp_path, 55, "--dem", hill)) == 2
-    assert "--altitude 60" in capsys.readouterr().err
+def test_the_kind_that_is_done_sooner_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(30.0, 150.0))
+    auto, follow, level = (
+        _planned(tmp_path, capsys, 80, "--dem", dem, "--relief", kind) for kind in ("auto", "follow", "level")
+    )
+    assert follow["over_ground"]["follows"] and not level["over_ground"]["follows"]
+    assert auto["makespan_s"] == min(follow["makespan_s"], level["makespan_s"])
+    # Both keep the pixels at most as large as the tolerance allows.
+    assert max(follow["over_ground"]["ground_pixels"][1], level["over_ground"]["ground_pixels"][1]) < 1.11
 
 
-def test_a_start_is_needed(tmp_path: Path, hill: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = _arguments(tmp_path, 100, "--dem", hill)
-    given = [*given[: given.index("--start")], "--dem", str(hill)]
-    assert main(given) == 2
+def test_steep_ground_is_seen_from_lines_that_lie_closer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(100.0))
+    hilly = _planned(tmp_path, capsys, 80, "--dem", dem, "--relief", "follow", "--side-overlap", 0.05)
+    assert hilly["covered_share"] >= 0.999
+
+
+def test_less_than_20_m_above_the_ground_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(40.0))
+    assert main(_arguments(tmp_path, 40, "--dem", dem, "--relief", "level")) == 2
+    assert "--altitude" in capsys.readouterr().err
+    assert main(_arguments(tmp_path, 21, "--dem", dem, "--relief", "follow")) == 2
+    assert "20 m" in capsys.readouterr().err
+
+
+def test_a_mission_holds_the_heights_over_its_own_takeoff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Takeoff from the hill: the mission's heights count from there."""
+    flown, hill = FlownArea(), _hill(60.0)
+    top = ",".join(f"{v:.7f}" for v in flown.grid.to_geographic(CORNER + np.array([200.0, 200.0])))
+    given = _arguments(tmp_path, 80, "--dem", _dem(tmp_path / "dem.tif", hill), "--relief", "follow", "--vehicles", 1)
+    given[given.index("--start") + 1] = top
+    assert main(given) == 0
+    items = parse_mission((tmp_path / "p" / "v1.waypoints").read_text()).items
+    assert items[0].alt_m == pytest.approx(80.0, abs=0.5)
+    assert min(i.alt_m for i in items if i.has_position) < 40.0  # the foot of the hill lies 60 m lower
+
+
+def test_a_start_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(40.0))
+    given = _arguments(tmp_path, 100)
+    assert main([*given[: given.index("--start")], "--dem", str(dem)]) == 2
     assert "--start" in capsys.readouterr().err

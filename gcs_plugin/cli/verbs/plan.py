@@ -27,14 +27,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--map", type=Path, metavar="OUT", help="take the field of view from this map, as solved, two sigma narrower")
     add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
-    add("--altitude", type=float, required=True, metavar="M", help="height of the lines above takeoff, metres")
+    add(
+        "--altitude",
+        type=float,
+        required=True,
+        metavar="M",
+        help="height of the lines above takeoff, with --dem above the ground",
+    )
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
     add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
     add("--json", action="store_true", help="one JSON document on stdout")
-    dem_help = "height model of the ground: lines spaced for the highest ground, at least 20 m above it (needs --start)"
-    add("--dem", type=Path, metavar="FILE", help=dem_help)
+    add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
+    relief_help = "with --dem: legs follow the ground, lie at one level, or whichever is done sooner (default auto)"
+    add("--relief", choices=["auto", "follow", "level"], default="auto", help=relief_help)
+    tolerance_help = "of the height above ground (default: a tenth of --altitude)"
+    add("--height-tolerance", type=float, metavar="M", help=tolerance_help)
     flight = parser.add_argument_group("flight")
     start_help = "takeoff point; give it again for more (default: at each vehicle's first line; for example -33.9,18.4)"
     flight.add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
@@ -80,8 +89,7 @@ def run(args: argparse.Namespace) -> int:
     _say("files")
     from gcs_plugin.plans.plan_picture import draw
 
-    figures = report(plan, args.autopilot)
-    figures["fov_min_deg"] = request.fov_min_deg
+    figures = report(plan, args.autopilot, request.fov_min_deg)
     files: dict[str, str | bytes] = dict(mission_files(plan, args.autopilot))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
@@ -110,6 +118,8 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         gaps=args.gaps is not None,
         fly_not_arrived=args.fly_not_arrived,
         dem=args.dem,
+        relief=args.relief,
+        height_tolerance_m=args.height_tolerance,
         vehicles=args.vehicles,
         altitude_m=args.altitude,
         fov_min_deg=args.fov_min if args.map is None else _solved_fov(args.map),

@@ -15,6 +15,7 @@ from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.visiting_order import shorten
 from orthoswarm.planning.sorties.deconfliction import Maker, Separation, Slot, separate
+from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_path import Flight, make_flight
 from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.planning.sorties.workload_split import Limits, Row, cut, share, sorties
@@ -125,13 +126,13 @@ class Crew:
     """
 
     def __init__(
-        self, vehicles: int, altitude_m: float, foot: Footprint, grid: LocalGrid, router: Router, options: Options
+        self, vehicles: int, heights: FlightHeights, foot: Footprint, grid: LocalGrid, router: Router, options: Options
     ) -> None:
         if not 1 <= vehicles <= MOST_VEHICLES:
             raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")
         options.check()
         self.vehicles = vehicles
-        self._altitude_m, self._foot, self._router, self._options = altitude_m, foot, router, options
+        self._heights, self._foot, self._router, self._options = heights, foot, router, options
         self._returns = options.end != "hover"
         self.starts: Array | None = None
         if options.starts:
@@ -147,9 +148,12 @@ class Crew:
     def _flight_limits(self) -> Limits:
         motion, apart = self._options.motion, self._options.separation
         above = apart.layers * apart.height_m  # whatever layer the schedule gives
-        fixed = (self._altitude_m + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
+        climb = self._heights.above_m
+        if self.starts is not None:
+            climb = max(self._heights.at(home, 0.0) - self._heights.ground_at(home) for home in self.starts)
+        fixed = (climb + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
         if self._returns:
-            fixed += (self._altitude_m + above) / motion.descent_m_s + above / motion.climb_m_s
+            fixed += (climb + above) / motion.descent_m_s + above / motion.climb_m_s
         most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)))
         return Limits(self._endurances_s, fixed, apart.swap_s, most_legs)
 
@@ -204,7 +208,7 @@ class Crew:
 
     def _flight(self, legs: Array, home: Array, out_m: float, home_m: float) -> Flight:
         run_in = self._options.run_in_m
-        return make_flight(legs, home, self._altitude_m, self._router, self._returns, out_m, home_m, run_in)
+        return make_flight(legs, home, self._heights, self._router, self._returns, out_m, home_m, run_in)
 
     @property
     def _least_leg_m(self) -> float:

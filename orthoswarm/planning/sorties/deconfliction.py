@@ -79,7 +79,7 @@ def _sampled(flight: Flight, motion: Motion, pad_m: float) -> _Track:
     times = motion.times(track)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     places = np.stack([np.interp(moments, times, track[:, axis]) for axis in range(3)], axis=1)
-    flying = np.flatnonzero(places[:, 2] > _GROUND_M)
+    flying = np.flatnonzero(places[:, 2] > flight.home_z_m + _GROUND_M)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
     return _Track(flight.home, int(flying[0]), places, np.hypot(*(places[:, :2] - flight.home).T) < pad_m)
 

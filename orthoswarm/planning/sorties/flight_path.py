@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.planning.lines.detours import Router
+from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, length, turns
 
 Array = NDArray[np.float64]
@@ -21,9 +22,13 @@ class Flight:
     Attributes:
         home: float64 (2,), where it takes off.
         climb_m: height to climb to at home.
-        points: float64 (n, 3), waypoints: easting, northing, height above takeoff.
+        points: float64 (n, 3), waypoints: easting, northing, height (see `flight_heights`).
         camera: int8 (n,): 1 at a leg's first point, -1 at its last, else 0.
         returns: the last point is above home, and the vehicle comes down there.
+        home_z_m: height of the ground at home.
+        above_m: float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the
+            ground.
+        between: bool (n,), points on a straight way, put in for their height alone.
     """
 
     home: Array
@@ -31,11 +36,14 @@ class Flight:
     points: Array
     camera: NDArray[np.int8]
     returns: bool
+    home_z_m: float
+    above_m: Array
+    between: NDArray[np.bool_]
 
     def track(self) -> Array:
         """The whole path from the ground on, (n, 3)."""
-        up = [[*self.home, 0.0], [*self.home, self.climb_m]]
-        down = [[*self.home, 0.0]] if self.returns else np.empty((0, 3))
+        up = [[*self.home, self.home_z_m], [*self.home, self.climb_m]]
+        down = [[*self.home, self.home_z_m]] if self.returns else np.empty((0, 3))
         return np.concatenate([up, self.points, down])
 
     def time_s(self, motion: Motion) -> float:
@@ -61,7 +69,7 @@ class Flight:
 def make_flight(
     legs: Array,
     home: Array,
-    altitude_m: float,
+    heights: FlightHeights,
     router: Router,
     returns: bool,
     out_m: float = 0.0,
@@ -73,7 +81,7 @@ def make_flight(
     Args:
         legs: float64 (n, 2, 2) in flying order.
         home: float64 (2,).
-        altitude_m: height of the legs and of the ways between them.
+        heights: of the legs and of the ways between them.
         router: finds ways around obstacles.
         returns: fly back above home at the end.
         out_m: how much higher the way out is.
@@ -81,34 +89,64 @@ def make_flight(
         run_in_m: length of a straight, in line with the leg, before its first picture; left out where an obstacle or
             the start lies in the way, and where the vehicle comes straight on.
     """
-    points: list[Array] = []
-    camera: list[int] = []
+    flat: list[tuple[Array, float, int]] = []  # place, height above that of legs, camera mark
 
-    def add(path: Array, height: float, mark: int = 0) -> None:
-        for point in path:
-            points.append(np.array([*point, height]))
-            camera.append(mark)
+    def add(path: Array, more_m: float, mark: int = 0) -> None:
+        flat.extend((point, more_m, mark) for point in path)
 
     far = float(np.hypot(*(legs[0, 0] - home))) > _SAME_M
-    climb = altitude_m + (out_m if far else 0.0)
     if far:
         entry = _entry(legs[0], home, router, run_in_m)
-        add(router.path(home, entry[0])[1:-1], climb)
+        add(router.path(home, entry[0])[1:-1], out_m)
         if out_m > 0.0:
-            add(entry[:1], climb)
-        add(entry[:-1], altitude_m)
+            add(entry[:1], out_m)
+        add(entry[:-1], 0.0)
     for k, (start, end) in enumerate(legs):
         if k:
             entry = _entry(legs[k], legs[k - 1, 1], router, run_in_m)
-            add(router.path(legs[k - 1, 1], entry[0])[1:-1], altitude_m)
-            add(entry[:-1], altitude_m)
-        add(start[None], altitude_m, 1)
-        add(end[None], altitude_m, -1)
+            add(router.path(legs[k - 1, 1], entry[0])[1:-1], 0.0)
+            add(entry[:-1], 0.0)
+        add(start[None], 0.0, 1)
+        add(end[None], 0.0, -1)
     if returns:
         if home_m > 0.0:
-            add(legs[-1:, 1], altitude_m + home_m)
-        add(router.path(legs[-1, 1], home)[1:], altitude_m + home_m)
-    return Flight(home, climb, np.array(points), np.array(camera, np.int8), returns)
+            add(legs[-1:, 1], home_m)
+        add(router.path(legs[-1, 1], home)[1:], home_m)
+    climb = heights.at(home, out_m if far else 0.0)
+    return _raised(flat, np.array([*home, climb]), heights, returns)
+
+
+def _raised(flat: list[tuple[Array, float, int]], start: Array, heights: FlightHeights, returns: bool) -> Flight:
+    """A flight from places on the map: heights, and the points that they need between the places.
+
+    Args:
+        flat: place, height above that of legs, and camera mark of each waypoint. start: float64 (3,), above home.
+        heights: as flown. returns: see `Flight`.
+    """
+    points: list[Array] = []
+    mores: list[float] = []
+    camera: list[int] = []
+    between: list[bool] = []
+    here = start
+    for place, more, mark in flat:
+        way = heights.between(here, place, more)
+        points.extend(way)
+        mores += [more] * len(way)
+        camera += [0] * (len(way) - 1) + [mark]
+        between += [True] * (len(way) - 1) + [False]
+        here = way[-1]
+    above = np.array(mores) + heights.above_m if heights.follows else np.full(len(points), np.nan)
+    home = start[:2]
+    return Flight(
+        home,
+        float(start[2]),
+        np.array(points),
+        np.array(camera, np.int8),
+        returns,
+        heights.ground_at(home),
+        above,
+        np.array(between, bool),
+    )
 
 
 def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:

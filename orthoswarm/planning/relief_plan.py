@@ -1,0 +1,106 @@
+"""A plan over a height model: legs at constant height above ground, or all at one height, whichever is done sooner."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.placement import Terrain
+from orthoswarm.model.plan import Plan
+from orthoswarm.planning.lines import planned_coverage
+from orthoswarm.planning.lines.line_spacing import Footprint
+from orthoswarm.planning.sorties.flight_heights import FlightHeights, GroundHeights, LevelHeights
+from orthoswarm.planning.sorties.ground_check import LEAST_ABOVE_GROUND_M
+
+Relief = Literal["auto", "follow", "level"]
+MakePlan = Callable[[float, Footprint, FlightHeights], Plan]
+"""Plans with a footprint, the height above level ground that it belongs to, and the flights' heights."""
+
+_CLOSER = 0.93
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class GroundBelow:
+    """The ground below a plan, metres over the lowest takeoff.
+
+    Attributes:
+        terrain: its heights. low_m: lowest ground of the area; high_m: highest.
+        way_m: highest ground of the area and of the ways to it.
+    """
+
+    terrain: Terrain
+    low_m: float
+    high_m: float
+    way_m: float
+
+
+def plan_over_relief(
+    make: MakePlan,
+    lens: Callable[[float], Footprint],
+    ground: GroundBelow,
+    above_m: float,
+    tolerance_m: float,
+    relief: Relief = "auto",
+) -> Plan:
+    """The plan that is done sooner, among those whose ground pixels are as fine as `above_m + tolerance_m` gives.
+
+    Legs that follow the ground stay within the tolerance of `above_m` over it. Legs at one height are as high as the
+    pixels of the lowest ground allow, and lie as close as the highest ground asks for; where the area is flat within
+    the tolerance they are always the faster ones.
+
+    Args:
+        make: plans. lens: footprint of the narrowest camera from a height above level ground.
+        ground: below the area and the ways to it. above_m: height of legs above ground. tolerance_m: of that height.
+        relief: "follow" or "level" for one kind only.
+
+    Raises:
+        InputError: lower than 20 m above the ground, or as `make`.
+    """
+    if not 0.0 < tolerance_m <= 0.5 * above_m:
+        raise InputError(
+            f"the tolerance of the height above ground is {tolerance_m:g} m; give more than 0 and at most half of "
+            "--altitude"
+        )
+    level_m = min(0.5 * (ground.low_m + ground.high_m) + above_m, ground.low_m + above_m + tolerance_m)
+    level_fits = level_m - max(ground.high_m, ground.way_m) >= LEAST_ABOVE_GROUND_M
+    flat = ground.high_m - ground.low_m <= 2.0 * tolerance_m
+    if relief == "level" and not level_fits:
+        raise InputError(
+            f"at one height, {level_m:.0f} m above takeoff, the flight would be {level_m - ground.way_m:.0f} m above "
+            f"the highest ground, and {LEAST_ABOVE_GROUND_M:g} m must be kept; let the legs follow the ground, or give "
+            f"--altitude {np.ceil(above_m + LEAST_ABOVE_GROUND_M - level_m + ground.way_m):.0f} or more"
+        )
+    plans = []
+    if relief == "follow" or (relief == "auto" and not (flat and level_fits)):
+        least_m = above_m - tolerance_m
+        if least_m < LEAST_ABOVE_GROUND_M:
+            raise InputError(
+                f"{above_m:g} m above ground, less a tolerance of {tolerance_m:g} m, are less than the "
+                f"{LEAST_ABOVE_GROUND_M:g} m that must be kept; give a larger --altitude"
+            )
+        plans.append(_closely_enough(make, lens, GroundHeights(ground.terrain, above_m, tolerance_m), least_m))
+    if relief != "follow" and level_fits:
+        heights = LevelHeights(level_m, ground.terrain, above_m)
+        plans.append(_closely_enough(make, lens, heights, level_m - ground.high_m))
+    return min(plans, key=lambda plan: (not _complete(plan), plan.makespan_s))
+
+
+def _closely_enough(make: MakePlan, lens: Callable[[float], Footprint], heights: FlightHeights, least_m: float) -> Plan:
+    """A plan with lines as close as the slopes ask for: across a slope pictures are narrower than over a level."""
+    best: Plan | None = None
+    for closer in _CLOSER ** np.arange(_ROUNDS):
+        above_m = float(closer) * least_m
+        plan = make(above_m, lens(above_m), heights)
+        if best is None or (plan.covered_share or 1.0) > (best.covered_share or 1.0):
+            best = plan
+        if _complete(plan):
+            break
+    assert best is not None
+    return best
+
+
+def _complete(plan: Plan) -> bool:
+    return plan.covered_share is None or plan.covered_share >= planned_coverage.COMPLETE

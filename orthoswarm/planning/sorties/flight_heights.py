@@ -1,0 +1,108 @@
+"""How high a path is flown: at one height, or at a constant height above the ground within a tolerance.
+
+Heights here are metres over one level for all vehicles: takeoff without a height model, the zero of the model with one.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import Terrain
+
+Array = NDArray[np.float64]
+
+_SAME_M = 0.01
+_FINEST_M, _COARSEST_M = 1.0, 10.0
+
+
+@dataclass(frozen=True)
+class LevelHeights:
+    """All legs at one height.
+
+    Attributes:
+        z_m: height of the legs.
+        ground: heights of the ground, None where only the height above takeoff counts.
+        nominal_m: height above the ground that was asked for, None for z_m.
+        follows: False, as heights do not follow the ground.
+    """
+
+    z_m: float
+    ground: Terrain | None = None
+    nominal_m: float | None = None
+    follows: bool = False
+
+    @property
+    def above_m(self) -> float:
+        """Nominal height of legs above the ground, or above takeoff without ground."""
+        return self.z_m if self.nominal_m is None else self.nominal_m
+
+    def ground_at(self, place: Array) -> float:
+        """Height of the ground at a place (2,), 0 without a height model."""
+        return 0.0 if self.ground is None else float(self.ground.height(place))
+
+    def at(self, place: Array, more_m: float) -> float:
+        """Height of a flight over a place (2,), so many metres higher than legs."""
+        return self.z_m + more_m
+
+    def between(self, start: Array, end: Array, more_m: float) -> Array:
+        """The way from `start` (3,) straight to `end` (2,): float64 (1, 3), its end."""
+        return np.array([[*end, self.at(end, more_m)]])
+
+
+@dataclass(frozen=True)
+class GroundHeights:
+    """A constant height above the ground within a tolerance, on straight pieces as long as that allows.
+
+    Attributes:
+        ground: heights of the ground. above_m: height above it. tolerance_m: largest difference from it.
+        follows: True, as heights follow the ground.
+    """
+
+    ground: Terrain
+    above_m: float
+    tolerance_m: float
+    follows: bool = True
+    _known: dict[tuple[float, ...], Array] = field(default_factory=dict, repr=False, compare=False)
+
+    def ground_at(self, place: Array) -> float:
+        """Height of the ground at a place (2,)."""
+        return float(self.ground.height(place))
+
+    def at(self, place: Array, more_m: float) -> float:
+        """Height of a flight over a place (2,), so many metres higher than legs."""
+        return self.ground_at(place) + self.above_m + more_m
+
+    def between(self, start: Array, end: Array, more_m: float) -> Array:
+        """The way from `start` (3,) straight to `end` (2,), float64 (n, 3): points put in for the height, and the end.
+
+        Each piece is as long as it stays within the tolerance (a greedy walk along the corridor).
+        """
+        key = (*start.tolist(), *end.tolist(), more_m)
+        if key not in self._known:
+            self._known[key] = self._walk(start, end, more_m)
+        return self._known[key]
+
+    def _walk(self, start: Array, end: Array, more_m: float) -> Array:
+        length = float(np.hypot(*(end - start[:2])))
+        if length < _SAME_M:
+            return np.array([[*end, self.at(end, more_m)]])
+        step = float(np.clip(0.5 * self.ground.step_m, _FINEST_M, _COARSEST_M))
+        share = np.linspace(0.0, 1.0, int(np.ceil(length / step)) + 1)
+        places = start[:2] + share[:, None] * (end - start[:2])
+        wanted = np.asarray(self.ground.height(places), np.float64) + self.above_m + more_m
+        low, high = wanted - self.tolerance_m, wanted + self.tolerance_m
+        found, here, z = [], 0, float(start[2])
+        while here < len(share) - 1:
+            run = share[here + 1 :] - share[here]
+            least = np.maximum.accumulate((low[here + 1 :] - z) / run)
+            most = np.minimum.accumulate((high[here + 1 :] - z) / run)
+            reached = int(np.argmax(least > most)) - 1 if (least > most).any() else len(run) - 1
+            slope = float(np.clip((wanted[here + 1 + reached] - z) / run[reached], least[reached], most[reached]))
+            z += slope * float(run[reached])
+            here += reached + 1
+            found.append([*places[here], z])
+        return np.array(found)
+
+
+FlightHeights = LevelHeights | GroundHeights
