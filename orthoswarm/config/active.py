@@ -13,6 +13,7 @@ from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.features import FeaturesConfig
 from orthoswarm.config.flight import FlightConfig
 from orthoswarm.config.initial import InitialConfig
+from orthoswarm.config.late import LateConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
@@ -39,6 +40,7 @@ class Config:
     flight: FlightConfig = field(default_factory=FlightConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    late: LateConfig = field(default_factory=LateConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)

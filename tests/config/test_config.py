@@ -129,3 +129,26 @@ def test_an_override_of_the_drawing_draws_otherwise(tmp_path, tmp_path_factory):
     steep, changed = drawn_share(tmp_path, tmp_path_factory, "steep", "[mosaic]\nmost_off_nadir_deg = 20\n")
     assert changed == {"mosaic": {"most_off_nadir_deg": 20}}
     assert 0 < steep < 0.6 * usual
+
+
+def states_of_legs(tmp_path, tmp_path_factory, name, text):
+    """States of the legs after a refinement with a configuration, and what the report says was changed."""
+    from tests.kit.scenes import tiny_twin
+
+    folder = tiny_twin(tmp_path_factory, 1)
+    file = tmp_path / f"{name}.toml"
+    file.write_text(text)
+    out = tmp_path / name
+    flags = ["--basemap", str(folder / "basemap.tif"), "--config", str(file), "--out", str(out), "--workers", "1"]
+    assert main(["mosaic", str(folder / "photos"), *flags, "--gsd", "1"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    return {leg["state"] for leg in report["legs"]}, report["config"]
+
+
+def test_an_override_of_the_registration_registers_otherwise(tmp_path, tmp_path_factory):
+    """With a limit of evidence that nothing can pass the flight is not taken to lie on the map."""
+    states, changed = states_of_legs(tmp_path, tmp_path_factory, "usual", "")
+    assert "matched" in states and changed == {}
+    states, changed = states_of_legs(tmp_path, tmp_path_factory, "strict", "[registration]\nfalse_matches = 1e-300\n")
+    assert changed == {"registration": {"false_matches": 1e-300}}
+    assert states == {"failed"}

@@ -24,18 +24,6 @@ from orthoswarm.refine.surface.vehicle_ground import GroundModel
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-TIE_HALF_M, NEAR_M = 10.0, 5.0
-"""Half a patch that is compared with the map; how far it is sought once the flight lies on the map."""
-FEWEST_FOR_PULL, MOST_FOR_PULL, PULL_REACH_M = 60, 300, 1.0
-TIE_SIGMA_M = 0.35
-TIE_SIGMA_LIMITS_M = (0.1, 1.0)
-FEWEST_TO_WEIGH = 20
-LINK_SIGMA_PX = 0.7
-FEWEST_ON_LINE, LEAST_ON_LINE = 6, 0.6
-"""So many matches of a leg, and this share of them, must agree on a line of shifts."""
-ON_LINE_M, OFF_LINE_M = 0.7, 0.7
-"""How near to the line they lie; a leg that is nowhere farther off than this finds its place by itself."""
-
 
 @dataclass(slots=True)
 class Settled:
@@ -58,7 +46,9 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
     """The map under a vehicle's pictures, with a margin for the search."""
     cameras = flight.cameras()
     height = float(np.median(cameras.position[:, 2]))
-    reach = 1.1 * height * float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0]) + 40.0
+    config = active().registration
+    diagonal = float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0])
+    reach = config.map_margin_share * height * diagonal + config.map_margin_m
     return LoadedMap.load(basemap, origin, BoundingBox.around_points(cameras.position[:, :2], reach), gsd_m)
 
 
@@ -68,7 +58,7 @@ def tie_round(
     ground: LoadedMap,
     cell_m: float,
     reach_m: float,
-    half_m: float = TIE_HALF_M,
+    half_m: float | None = None,
     pictures: NDArray[np.bool_] | None = None,
 ) -> MapMatches:
     """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`.
@@ -76,11 +66,14 @@ def tie_round(
     Ground is compared by its texture: strong edges belong to what leans and casts shadows. pictures: bool (N,), the
     ones to compare, None for all.
     """
+    config = active().registration
     adj = flight.adjustment
     seen = flight.best_views(pictures)
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    fewest = 2 if flight.sparse else 3
-    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > 0.4) & (np.abs(height) < 3.0)
+    fewest = config.tie_views_sparse if flight.sparse else config.tie_views
+    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > config.tie_view_weight)
+    usable &= np.abs(height) < config.tie_height_m
+    half_m = config.tie_half_m if half_m is None else half_m
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     return _ground_matches(flight, surface, ground, chosen, seen.camera, reach_m, half_m, texture_field)
@@ -96,8 +89,10 @@ def _ground_matches(
     half_m: float,
     field: Callable[[Floats], Floats],
 ) -> MapMatches:
+    config = active().registration
     adj = flight.adjustment
-    half, reach = max(8, round(half_m / ground.gsd_m)), max(4, round(reach_m / ground.gsd_m))
+    half = max(config.tie_half_px, round(half_m / ground.gsd_m))
+    reach = max(config.tie_reach_px, round(reach_m / ground.gsd_m))
     level = surface.height(adj.points[:, :2])
     return match_points(
         adj.cameras, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field
@@ -111,30 +106,36 @@ def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: 
     again. (Regressed over simulated cities with exact truth: 1.0 to 1.1 times this is what is left in the ties.) So
     taking it off extrapolates to no edges at all.
     """
-    some = matches.take(np.arange(0, len(matches.point), max(1, -(-len(matches.point) // MOST_FOR_PULL))))
+    config = active().registration
+    step = max(1, -(-len(matches.point) // config.edge_most))
+    some = matches.take(np.arange(0, len(matches.point), step))
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
-    edges = accepted(_ground_matches(flight, surface, ground, some.point, camera, reach_m, TIE_HALF_M, gradient_field))
+    half_m = config.tie_half_m
+    edges = accepted(_ground_matches(flight, surface, ground, some.point, camera, reach_m, half_m, gradient_field))
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
-    if len(away) < FEWEST_FOR_PULL:
+    if len(away) < config.edge_fewest:
         return np.zeros(2)
-    away = away[np.hypot(*(away - np.median(away, axis=0)).T) < PULL_REACH_M]
-    return np.asarray(away.mean(0)) if len(away) >= FEWEST_FOR_PULL else np.zeros(2)
+    away = away[np.hypot(*(away - np.median(away, axis=0)).T) < config.edge_reach_m]
+    return np.asarray(away.mean(0)) if len(away) >= config.edge_fewest else np.zeros(2)
 
 
-def accepted(matches: MapMatches, peak: float = 0.2, ratio: float = 0.75) -> MapMatches:
-    """Matches with a clear peak."""
-    return matches.take((matches.peak > peak) & (matches.ratio < ratio))
+def accepted(matches: MapMatches, ratio: float | None = None) -> MapMatches:
+    """Matches with a clear peak; ratio: largest ratio of the second peak to the first, None: as configured."""
+    config = active().registration
+    ratio = config.tie_ratio if ratio is None else ratio
+    return matches.take((matches.peak > config.tie_peak) & (matches.ratio < ratio))
 
 
 def mode_shift(shift: Array) -> Array:
-    """Most agreed shift (2,) of ties (Q, 2): most neighbours within 0.7 m, then reweighted."""
+    """Most agreed shift (2,) of ties (Q, 2): most neighbours within `mode_m`, then reweighted."""
+    config = active().registration
     if len(shift) == 0:
         return np.zeros(2)
     d2 = ((shift[:, None, :] - shift[None, :, :]) ** 2).sum(-1)
-    centre = shift[int((d2 < 0.7**2).sum(1).argmax())]
-    for scale in (0.5, 0.5, 0.35, 0.25, 0.25):
+    centre = shift[int((d2 < config.mode_m**2).sum(1).argmax())]
+    for scale in config.mode_scales_m:
         w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
         centre = (shift * w[:, None]).sum(0) / w.sum()
     return np.asarray(centre)
@@ -156,19 +157,20 @@ def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
 
 def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
     """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
+    config = active().registration
     out = np.tile(common, (len(leg), 1))
     for k in np.unique(leg[leg >= 0]):
         members = np.flatnonzero(leg == k)
         mine = leg[matches.camera] == k
-        if int(mine.sum()) < FEWEST_ON_LINE:
+        if int(mine.sum()) < config.line_fewest:
             continue
         t = matches.camera[mine] - members.mean()
         line, agree = _line(t, matches.shift[mine])
-        if int(agree.sum()) < max(FEWEST_ON_LINE, LEAST_ON_LINE * len(t)):
+        if int(agree.sum()) < max(config.line_fewest, config.line_least_share * len(t)):
             continue
         ends = np.clip(members - members.mean(), t[agree].min(), t[agree].max())
         own = line[0] + line[1] * ends[:, None]
-        if np.hypot(*(own - common).T).max() > OFF_LINE_M:
+        if np.hypot(*(own - common).T).max() > config.line_apart_m:
             out[members] = own
     between, within = np.flatnonzero(leg < 0), np.flatnonzero(leg >= 0)
     if len(between) and len(within):
@@ -178,13 +180,14 @@ def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) 
 
 def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
+    config = active().registration
     a = np.column_stack([np.ones(len(t)), t])
     line = np.array([mode_shift(shift), np.zeros(2)])
-    for scale in (4.0, 2.0, 1.0, 0.7, 0.5, 0.5):
+    for scale in config.line_scales_m:
         off = ((shift - a @ line) ** 2).sum(1)
         w = 1.0 / (1.0 + off / scale**2) ** 2
         line = np.linalg.solve((a * w[:, None]).T @ a + 1e-9 * np.eye(2), (a * w[:, None]).T @ shift)
-    return line, np.asarray(np.hypot(*(shift - a @ line).T) < ON_LINE_M)
+    return line, np.asarray(np.hypot(*(shift - a @ line).T) < config.line_agrees_m)
 
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
@@ -192,38 +195,45 @@ def as_ties(matches: MapMatches, points: Array) -> MapTies:
 
     What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map.
     """
-    return MapTies(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), TIE_SIGMA_M))
+    sigma = np.full(len(matches.point), active().registration.tie_sigma_m)
+    return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
 def weighed(ties: MapTies, residual: Array) -> MapTies:
     """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
-    if len(residual) < FEWEST_TO_WEIGH:
+    config = active().registration
+    if len(residual) < config.tie_fewest_for_sigma:
         return ties
-    sigma = float(np.clip(mad_sigma(residual), *TIE_SIGMA_LIMITS_M))
+    sigma = float(np.clip(mad_sigma(residual), *config.tie_sigma_limits_m))
     return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 
 def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Raised points found on the map, and their heights over the ground."""
+    config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    usable = (seen.camera >= 0) & (seen.count >= 6) & (seen.mean_weight > 0.5) & (height > 4.0) & (height < 40.0)
+    low, high = config.roof_heights_m
+    usable = (seen.camera >= 0) & (seen.count >= config.roof_views) & (seen.mean_weight > config.roof_view_weight)
+    usable &= (height > low) & (height < high)
     leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), 30.0)
-    half, reach = max(8, round(7.5 / ground.gsd_m)), max(8, round(11.0 / ground.gsd_m))
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.roof_cell_m)
+    half = max(config.tie_half_px, round(config.roof_half_m / ground.gsd_m))
+    reach = max(config.tie_half_px, round(config.roof_reach_m / ground.gsd_m))
     found = match_points(adj.cameras, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
-    found = accepted(found, 0.2, 0.85)
+    found = accepted(found, config.roof_ratio)
     return found, height[found.point]
 
 
-def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
+def add_links(flight: Flight, gsd_m: float) -> int:
     """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
+    config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
-    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
+    usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
     leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), cell_m)
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.link_cell_m)
     candidates = np.flatnonzero(flight.leg >= 0)
     if len(np.unique(flight.leg[candidates])) < 2:
         return 0
@@ -231,7 +241,7 @@ def add_links(flight: Flight, gsd_m: float, cell_m: float = 40.0) -> int:
         adj.cameras, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
     )
     if len(camera):
-        extend(flight, camera, point, uv, LINK_SIGMA_PX)
+        extend(flight, camera, point, uv, config.link_sigma_px)
     return len(camera)
 
 
@@ -251,8 +261,9 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
 
 def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMatches:
     """Tie points of a flight that lies on the map within some metres."""
-    reach = active().registration.first_tie_reach_m
-    return accepted(tie_round(flight, surface, ground, 25.0 if flight.sparse else 50.0, reach))
+    config = active().registration
+    cell_m = config.first_tie_cell_sparse_m if flight.sparse else config.first_tie_cell_m
+    return accepted(tie_round(flight, surface, ground, cell_m, config.first_tie_reach_m))
 
 
 def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
@@ -269,17 +280,18 @@ def settle(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: Grou
         matches: its first ties, which confirm that it lies there.
         surface: ground after the relative adjustment.
     """
+    config = active().registration
     matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
-    for k, c in enumerate((36.0, 9.0, 6.0, 6.0)):
-        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, c)
+    for k, c in enumerate(config.first_tie_scales):
+        _step(flight, surface, ties, c)
         if k in (1, 3):
             surface = refit_ground(flight, surface, as_smooth=k == 3)
     roofs = roof_round(flight, surface, ground)
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
-    flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 6.0)
+    _step(flight, surface, ties, config.tie_scales[1])
     surface = refit_ground(flight, surface, as_smooth=True)
-    surface, ties, matches = _second_round(flight, ground, surface, 3)
+    surface, ties, matches = _second_round(flight, ground, surface, config.second_steps)
     return Settled(surface, ties, matches, roofs, links)
 
 
@@ -294,9 +306,16 @@ def resettle(
 
     pictures: bool (N,), the ones to compare with the map, None for all.
     """
+    config = active().registration
     for _ in range(2):
-        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 6.0)
-    return _second_round(flight, ground, refit_ground(flight, surface), 4, pictures)
+        _step(flight, surface, ties, config.tie_scales[1])
+    return _second_round(flight, ground, refit_ground(flight, surface), config.renewed_steps, pictures)
+
+
+def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
+    """One Gauss-Newton step with tie points, heights held near the ground."""
+    prior = surface.height_prior(flight.adjustment.points)
+    flight.adjustment.step(active().registration.track_scale, prior, ties, tie_scale)
 
 
 def _second_round(
@@ -307,11 +326,13 @@ def _second_round(
     pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """Ties compared on the ground as it is now (fitted by the caller: the points moved, with their level, too)."""
-    matches = accepted(tie_round(flight, surface, ground, 15.0 if flight.sparse else 30.0, NEAR_M, pictures=pictures))
-    matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, NEAR_M))
+    config = active().registration
+    cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
+    matches = accepted(tie_round(flight, surface, ground, cell_m, reach_m, pictures=pictures))
+    matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, reach_m))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
-        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points), ties, 9.0 if k == 0 else 6.0)
+        _step(flight, surface, ties, config.tie_scales[min(k, 1)])
         if k in (0, 1):
             ties = weighed(ties, flight.adjustment.tie_residual)
         if k == rounds - 2:
@@ -322,11 +343,16 @@ def _second_round(
 def working_gsd(flight: Flight) -> float:
     """Pixel for comparing pictures with each other: about their own."""
     cameras = flight.cameras()
-    return 1.07 * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    return (
+        active().registration.picture_gsd_share * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    )
 
 
 def map_gsd(flight: Flight, basemap: MapWindow) -> float:
     """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
+    config = active().registration
     cameras = flight.cameras()
     picture = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
-    return float(np.clip(max(picture, basemap.native_gsd_m), 0.25, 2.0)) if picture < 0.4 else max(0.5, picture)
+    if picture < config.map_gsd_fine_m:
+        return float(np.clip(max(picture, basemap.native_gsd_m), *config.map_gsd_m))
+    return max(config.map_gsd_coarse_m, picture)

@@ -23,9 +23,6 @@ NOT_FOUND = (
     "no part of this flight was found on the map: it lies where its receiver says; check that the map shows this place"
 )
 CARRIED = "the map does not show what this flight saw; pictures of its neighbours carry it"
-FEWEST_SPARSE = 12
-LEG_AGREES_M, NEAR_M = 1.2, 5.0
-"""How near to its place on the map a tie of the last round agrees with it; how far it was searched."""
 
 
 @dataclass(slots=True)
@@ -124,7 +121,8 @@ def to_solution(
     stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
     cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
-    weak = observations_per_camera(flight) < (FEWEST_SPARSE if flight.sparse else active().flight.held_observations)
+    fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
+    weak = observations_per_camera(flight) < (fewest)
     placed = [
         PlacedFrame(frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
         for i, frame in enumerate(flight.frames)
@@ -180,16 +178,17 @@ def leg_states(state: VehicleState) -> list[Leg]:
     vehicle lies where its receiver says.
     """
     flight = state.flight
-    limit = active().registration.leg_by_chance
+    config = active().registration
     residual = flight.adjustment.tie_residual
     leg_of_tie = flight.leg[state.matches.camera]
     agrees = np.ones(len(leg_of_tie), bool)
     if len(residual) == len(leg_of_tie):
-        agrees = np.hypot(*residual.T) < LEG_AGREES_M
+        agrees = np.hypot(*residual.T) < config.leg_agrees_m
     count = int(flight.leg.max()) + 1 if len(flight.leg) else 0
     ties = [int((leg_of_tie == k).sum()) for k in range(count)]
     agree = [int((agrees & (leg_of_tie == k)).sum()) for k in range(count)]
-    matched = [state.on_map and agreement_probability(a, n, LEG_AGREES_M, NEAR_M) <= limit for a, n in zip(agree, ties)]
+    chance = [agreement_probability(a, n, config.leg_agrees_m, config.tie_reach_m) for a, n in zip(agree, ties)]
+    matched = [state.on_map and p <= config.leg_by_chance for p in chance]
     if state.on_map and not any(matched):
         matched = [2 * a > n for a, n in zip(agree, ties)] if sum(agree) else [True] * count
     other: LegState = "carried" if lies_on_map(state) else "failed"

@@ -6,21 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.orientation_correlation import Match, by_learning, register, stacked, strip_and_map
 
 Array = NDArray[np.float64]
-
-WINDOW = 25
-SPARSE_WINDOW = 3
-SECOND_LOOK_PICTURES = 16
-SECOND_LOOKS = 5
-REACHES_M = (60.0, 150.0)
-ACROSS_PX = 150
-"""A picture's width in pixels of the small mosaics."""
-CONSENSUS_M = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +36,10 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
 
     Windows of each leg near their records; where these are refuted all windows together; then windows farther off.
     """
-    cameras = flight.cameras()
-    width = flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
-    gsd = float(np.clip(width / ACROSS_PX, 0.2, 2.5))
+    config = active().registration
+    gsd = float(np.clip(_picture_width(flight) / config.strip_across_px, *config.strip_gsd_m))
     tiles = TiledMap(basemap, gsd)
-    near, far = REACHES_M
+    near, far = config.coarse_reach_m
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
         fit = find(reach_m, flight, tiles, origin, gsd)
         if fit is not None:
@@ -57,7 +48,7 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
 
 def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
     """One shift for the whole flight, from what all its windows say together (see `stacked`)."""
-    cameras, windows = flight.cameras(), _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    cameras, windows = flight.cameras(), _strips(flight)
     strips = [strip_and_map(cameras, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
     found = stacked([s for s in strips if s is not None])
     if found is None:
@@ -69,7 +60,7 @@ def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Ar
 
 def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
     cameras = flight.cameras()
-    windows = _windows(flight.leg, SPARSE_WINDOW if flight.sparse else WINDOW)
+    windows = _strips(flight)
     matches = [
         m
         for index in windows
@@ -81,14 +72,15 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
-def second_look(flight: Flight, basemap: MapWindow, origin: Array, reach_m: float = 30.0) -> CoarseFit | None:
+def second_look(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
     """Learned matching of a few strips where edges found no consensus; None if it finds none either."""
-    cameras = flight.cameras()
-    width = flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
-    gsd = float(np.clip(width / (2 * ACROSS_PX), 0.2, 0.6))
-    windows = _windows(flight.leg, SECOND_LOOK_PICTURES)
+    config = active().registration
+    cameras, reach_m = flight.cameras(), config.learned_reach_m
+    gsd = float(np.clip(_picture_width(flight) / config.learned_across_px, *config.learned_gsd_m))
+    windows = _windows(flight.leg, config.learned_pictures)
     basemap = TiledMap(basemap, gsd)
-    chosen = [windows[k] for k in np.unique(np.linspace(0, len(windows) - 1, SECOND_LOOKS).round().astype(int))]
+    spread = np.linspace(0, len(windows) - 1, config.learned_strips).round().astype(int)
+    chosen = [windows[k] for k in np.unique(spread)]
     matches = [
         m
         for index in chosen
@@ -121,6 +113,17 @@ def shift_cameras(flight: Flight, correction: Array) -> None:
                 adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
 
 
+def _picture_width(flight: Flight) -> float:
+    """Width of a picture on the ground, metres."""
+    cameras = flight.cameras()
+    return flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
+
+
+def _strips(flight: Flight) -> list[NDArray[np.int64]]:
+    config = active().registration
+    return _windows(flight.leg, config.strip_pictures_sparse if flight.sparse else config.strip_pictures)
+
+
 def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
     """Runs of about `size` pictures of one leg each; short legs are one window."""
     out: list[NDArray[np.int64]] = []
@@ -133,19 +136,20 @@ def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
 
 def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
     """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
+    config = active().registration
     t = np.array([0.5 * (m.first + m.last) for m in matches])
     s = np.array([m.shift for m in matches])
-    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), 0.02, 1.0)
+    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), config.consensus_least_weight, 1.0)
     n = len(matches)
     best, best_score = np.zeros(n, bool), -1.0
     for i in range(n):
         for j in range(i, n):
             slope = (s[j] - s[i]) / (t[j] - t[i]) if j > i and t[j] > t[i] else np.zeros(2)
-            if np.hypot(*slope) > 0.5:
+            if np.hypot(*slope) > config.consensus_slope_m:
                 continue
             error = np.hypot(*(s - s[i] - slope * (t - t[i])[:, None]).T)
-            inside = error < CONSENSUS_M
-            score = float((weight * inside * (1.0 - 0.5 * error / CONSENSUS_M)).sum())
+            inside = error < config.consensus_m
+            score = float((weight * inside * (1.0 - 0.5 * error / config.consensus_m)).sum())
             if score > best_score:
                 best, best_score = inside, score
     return best

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.absolute_orientation import TIE_HALF_M, first_ties, load_map, map_gsd, small_ties
+from orthoswarm.refine.registration.absolute_orientation import first_ties, load_map, map_gsd, small_ties
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
 from orthoswarm.refine.registration.map_evidence import false_matches_log10
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -46,15 +46,15 @@ def confirmed(
         basemap: the map. origin: float64 (2,) of the local frame. surface: ground below the flight.
     """
     before = flight.adjustment.copy()
-    values = active().registration
-    limit = np.log10(values.false_matches)
+    config = active().registration
+    limit = np.log10(config.false_matches)
     for fit in fits:
         shift_cameras(flight, fit.correction)
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         matches = first_ties(flight, surface, ground)
-        chance = _false_matches_log10(flight, matches, TIE_HALF_M)
+        chance = _false_matches_log10(flight, matches, config.tie_half_m)
         if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
-            half_m = values.evidence_small_half_m
+            half_m = config.evidence_small_half_m
             chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m)
         if chance <= limit:
             return ConfirmedFit(fit, ground, matches, float(10.0**chance))

@@ -25,18 +25,6 @@ from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-NEIGHBOURS = 4
-FEWEST = 25
-LEAST_SHARE = 0.4
-PRIOR_M, PRIOR_RAD = 5.0, 0.05
-"""How far a carried camera is trusted: loosely, it only keeps what the points do not tell."""
-CORNERS_M = 0.5
-"""How far corners stand above the terrain that they are taken to lie on, all alike (measured: 0.1 to 0.5 m)."""
-_WORKING_PX, _CORNERS, _BACK_PX, _AGREE_PX = 640, 300, 0.7, 1.5
-_LEAST_PX = 0.1
-_SCALES_PX = (20.0, 8.0, 3.0, 1.5, 1.0, 1.0)
-_ROUNDS = 3
-
 
 def lay_late(
     frames: Sequence[Frame], refined: Solution, epsg: int, read: Callable[[Frame], Gray]
@@ -90,13 +78,13 @@ def lay_late(
 
 def working_size(lens: Lens) -> tuple[int, int]:
     """Columns and rows in which a picture is compared."""
-    scale = min(1.0, _WORKING_PX / lens.width)
+    scale = min(1.0, active().late.work_width_px / lens.width)
     return max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
 
 
 def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFrame]:
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p in others]
-    return [others[i] for i in np.argsort(away, kind="stable")[:NEIGHBOURS]]
+    return [others[i] for i in np.argsort(away, kind="stable")[: active().late.neighbours]]
 
 
 def sights(one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrain: Terrain) -> tuple[Array, Array]:
@@ -109,6 +97,7 @@ def sights(one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrai
     Returns:
         Pixels (M, 2) of the first picture at full size, and the ground points (M, 3) that the other one gives them.
     """
+    config = active().late
     z = float(terrain.height(one.camera.nadir))
     mine, its = _reduced(one.camera.lens, gray), _reduced(other.camera.lens, known)
     here = replace(one.camera, lens=mine).homography(z)
@@ -118,13 +107,16 @@ def sights(one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrai
     warp = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
     turned = cv2.warpPerspective(known, move, (cols, rows), flags=warp)
     inside = cv2.warpPerspective(np.full_like(known, 255), move, (cols, rows), flags=warp & ~3)
-    corners = cv2.goodFeaturesToTrack(gray, _CORNERS, 0.005, 8.0, mask=cv2.erode(inside, np.ones((15, 15), np.uint8)))
+    inner = cv2.erode(inside, np.ones((config.border_px, config.border_px), np.uint8))
+    quality, distance = config.corner_quality, config.corner_distance_px
+    corners = cv2.goodFeaturesToTrack(gray, config.corners, quality, distance, mask=inner)
     nothing = np.empty((0, 2)), np.empty((0, 3))
     if corners is None:
         return nothing
-    moved, ok, _ = cv2.calcOpticalFlowPyrLK(gray, turned, corners, corners.copy(), winSize=(21, 21), maxLevel=4)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(turned, gray, moved, corners.copy(), winSize=(21, 21), maxLevel=4)
-    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.hypot(*(back - corners)[:, 0].T) < _BACK_PX)
+    window, levels = (config.flow_window_px, config.flow_window_px), config.flow_levels
+    moved, ok, _ = cv2.calcOpticalFlowPyrLK(gray, turned, corners, corners.copy(), winSize=window, maxLevel=levels)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(turned, gray, moved, corners.copy(), winSize=window, maxLevel=levels)
+    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.hypot(*(back - corners)[:, 0].T) < config.flow_back_px)
     if not good.any():
         return nothing
     found = cv2.perspectiveTransform(moved[good].astype(np.float64), move)[:, 0]
@@ -153,7 +145,7 @@ def _local(homography: Array, origin: Array, *, inverse: bool = True) -> Array:
 def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
     """Ground points (M, 3) of pixels (M, 2); NaN above the horizon."""
     z = np.full(len(uv), float(terrain.height(camera.nadir)))
-    for _ in range(_ROUNDS):
+    for _ in range(active().late.rounds):
         xy = camera.to_ground(uv, z)
         z = np.where(np.isfinite(xy).all(1), terrain.height(np.nan_to_num(xy)), z)
     return np.column_stack([xy, z])
@@ -161,19 +153,20 @@ def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
 
 def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Sequence[PlacedFrame]) -> PlacedFrame:
     """The frame with its camera fitted to what its neighbours see, the guess where they do not agree."""
-    if sum(len(uv) for uv, _ in seen) < FEWEST:
+    config = active().late
+    if sum(len(uv) for uv, _ in seen) < config.fewest:
         return guess
     uv, ground = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     camera = resected(guess.camera, uv, ground)
-    scale = max(1.0, guess.camera.lens.width / _WORKING_PX)
+    scale = max(1.0, guess.camera.lens.width / config.work_width_px)
     off = np.hypot(*(camera.project(ground) - uv).T) / scale
-    agree = off < _AGREE_PX
-    if agree.sum() < max(FEWEST, LEAST_SHARE * len(uv)):
+    agree = off < config.agrees_px
+    if agree.sum() < max(config.fewest, config.least_share * len(uv)):
         return guess
     source = np.repeat(np.arange(len(near)), [len(uv) for uv, _ in seen])[agree]
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     beside = float(np.median([p.sigma_m for p in near]))
-    leaning = CORNERS_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
+    leaning = config.corner_height_m * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
     own = (
         active().bundle.stated_sigma_factor
         * float(np.sqrt(len(near)))
@@ -190,11 +183,11 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
             those in which it was compared.
     """
     off = (camera.project(ground) - uv) / scale
-    noise = max(float(np.sqrt((off**2).mean())), _LEAST_PX)
+    noise = max(float(np.sqrt((off**2).mean())), active().late.least_noise_px)
     moved = [_moved(camera, step) for step in _STEPS]
     size = _STEPS.sum(1)
     jacobian = np.stack([(c.project(ground) - uv) / scale - off for c in moved], -1).reshape(-1, 6) / size
-    prior = np.diag(1.0 / np.array([PRIOR_M] * 3 + [PRIOR_RAD] * 3) ** 2)
+    prior = _prior()
     covariance = np.linalg.inv(jacobian.T @ jacobian / noise**2 + prior)
     middle, z = np.array([camera.lens.principal_point]), float(ground[:, 2].mean())
     centre = np.stack([(c.to_ground(middle, z) - camera.to_ground(middle, z))[0] for c in moved], -1) / size
@@ -206,12 +199,13 @@ def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
 
     Gauss-Newton on six numbers, with the camera itself as a loose prior.
     """
-    scale = max(1.0, camera.lens.width / _WORKING_PX)
-    prior = np.diag(1.0 / np.array([PRIOR_M] * 3 + [PRIOR_RAD] * 3) ** 2)
+    config = active().late
+    scale = max(1.0, camera.lens.width / config.work_width_px)
+    prior = _prior()
     total = np.zeros(6)
     now = camera
-    for c in _SCALES_PX:
-        for _ in range(_ROUNDS):
+    for c in config.scales_px:
+        for _ in range(config.rounds):
             off = (now.project(ground) - uv) / scale
             off = np.where(np.isfinite(off), off, 1e3)
             weight = (c * c / (c * c + (off**2).sum(1))) ** 2
@@ -224,6 +218,12 @@ def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
             total = total - np.linalg.solve(normal, right)
             now = _moved(camera, total)
     return now
+
+
+def _prior() -> Array:
+    """Weights (6, 6) of the start's position and attitude: loose, for what points do not determine."""
+    config = active().late
+    return np.diag(1.0 / np.array([config.position_sigma_m] * 3 + [config.attitude_sigma_rad] * 3) ** 2)
 
 
 _STEPS = np.diag([1e-3] * 3 + [1e-5] * 3)

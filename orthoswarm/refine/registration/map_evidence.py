@@ -16,10 +16,6 @@ from orthoswarm.config import active
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-FEWEST = 4
-"""Ties of a group: fewer agree with themselves alone."""
-_MOST_PAIRS = 400
-
 
 def false_matches_log10(ground: Array, shift: Array, order: Array, leg: Ints, reach_m: float, patch_m: float) -> float:
     """Decimal logarithm of the expected number of false matches behind the best agreement of tie points.
@@ -33,13 +29,13 @@ def false_matches_log10(ground: Array, shift: Array, order: Array, leg: Ints, re
         order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between legs.
         reach_m: how far each was searched, to each side. patch_m: side of what was compared.
     """
+    config = active().registration
     alone = _one_a_patch(ground, patch_m)
     shift, order, leg = shift[alone], order[alone], leg[alone]
     groups = [(shift, np.zeros(len(shift)))]
     groups += [(shift[leg == k], order[leg == k]) for k in np.unique(leg[leg >= 0])]
-    groups = [g for g in groups if len(g[0]) >= FEWEST]
-    tolerances = active().registration.evidence_tolerances_m
-    best = min((_group(s, t, reach_m, tolerances) for s, t in groups), default=0.0)
+    groups = [g for g in groups if len(g[0]) >= config.evidence_fewest]
+    best = min((_group(s, t, reach_m, config.evidence_tolerances_m) for s, t in groups), default=0.0)
     return best + float(np.log10(max(len(groups), 1)))
 
 
@@ -55,7 +51,7 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
         i, j = np.triu_indices(count, 1)
         apart = along[j] != along[i]
         i, j = i[apart], j[apart]
-        step = -(-len(i) // _MOST_PAIRS)
+        step = -(-len(i) // active().registration.evidence_pairs)
         i, j = i[::step], j[::step]
         slope = (shift[j] - shift[i]) / (along[j] - along[i])[:, None]
         fixed = 2

@@ -9,27 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock
 from orthoswarm.refine.features.patch_matching import texture_field
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.absolute_orientation import TIE_HALF_M, accepted
+from orthoswarm.refine.registration.absolute_orientation import accepted
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import match_points
 from orthoswarm.refine.surface.ground_densification import cells_near, flying_height, sight_reach
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 Array = NDArray[np.float64]
-
-CELL_SHARE, LEAST_CELL_M = 0.06, 5.0
-"""Distance of the positions, as a share of the flying height, and at least."""
-LEAST_SLOPE = 0.35
-"""Horizontal distance over height from which on a view counts as oblique."""
-REACH_M = 6.0
-ACROSS_M = 0.6
-"""What is found must lie on the line of sight."""
-SIGMA_SHARE = 1.5
-"""How well the map tells a place, in sigmas of the ties (which are averages over a leg's views)."""
-_TRIED = 8
 
 
 def map_heights(
@@ -52,11 +42,13 @@ def map_heights(
     cameras, own = flight.cameras(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
     if not len(tie_sigma_m) or not len(own):
         return np.zeros((0, 3)), np.zeros(0)
+    config = active().registration
     cells = _positions(flight, flying_height(flight, surface), own, others)
     points = np.column_stack([cells, surface.terrain().height(cells)])
     camera = _best_views(cameras, points, own)
     chosen = np.flatnonzero(camera >= 0)
-    half, reach = max(8, round(TIE_HALF_M / ground.gsd_m)), max(4, round(REACH_M / ground.gsd_m))
+    half = max(config.tie_half_px, round(config.tie_half_m / ground.gsd_m))
+    reach = max(config.tie_reach_px, round(config.oblique_reach_m / ground.gsd_m))
     gray, level = flight.pictures.gray, points[:, 2]
     found = accepted(match_points(cameras, points, chosen, camera, gray, ground, half, reach, level, texture_field))
     sight = points[found.point] - cameras.position[found.camera]
@@ -65,19 +57,21 @@ def map_heights(
     east, north = (sight[:, :2] / np.maximum(out, 1.0)[:, None]).T
     along = found.shift[:, 0] * east + found.shift[:, 1] * north
     across = found.shift[:, 1] * east - found.shift[:, 0] * north
-    good = (np.abs(across) < ACROSS_M) & (slope > LEAST_SLOPE)
+    good = (np.abs(across) < config.oblique_across_m) & (slope > config.oblique_slope)
     where = points[found.point[good]].copy()
     where[:, :2] += found.shift[good]
     where[:, 2] -= along[good] / slope[good]
-    return where, SIGMA_SHARE * float(np.median(tie_sigma_m)) / slope[good]
+    return where, config.oblique_sigma_share * float(np.median(tie_sigma_m)) / slope[good]
 
 
 def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
     """Centres (K, 2) of cells that own cameras see obliquely and nobody sees better."""
-    path, cell, reach = flight.cameras().position[:, :2], max(CELL_SHARE * height_m, LEAST_CELL_M), sight_reach(flight)
+    config = active().registration
+    path, reach = flight.cameras().position[:, :2], sight_reach(flight)
+    cell = max(config.oblique_cell_share * height_m, config.oblique_cell_m)
     cells = cells_near(path, cell, reach + cell)
     mine, _ = cKDTree(path[own]).query(cells)
-    keep = (mine > LEAST_SLOPE * height_m) & (mine < reach)
+    keep = (mine > config.oblique_slope * height_m) & (mine < reach)
     if len(others):
         keep &= mine <= cKDTree(others).query(cells)[0]
     return np.asarray(cells[keep])
@@ -88,7 +82,9 @@ def _best_views(cameras: CameraBlock, points: Array, own: NDArray[np.integer]) -
     best = np.full(len(points), -1, np.int32)
     if not len(points) or not len(own):
         return best
-    _, near = cKDTree(cameras.position[own, :2]).query(points[:, :2], k=min(_TRIED, len(own)))
+    _, near = cKDTree(cameras.position[own, :2]).query(
+        points[:, :2], k=min(active().registration.oblique_views, len(own))
+    )
     for rank in np.atleast_2d(near.T):
         left = best < 0
         camera = own[rank]

@@ -17,8 +17,6 @@ from orthoswarm.model.placement import PlacedFrame
 
 Array = NDArray[np.float64]
 
-_OUTLIER_SPREADS = 5.0
-
 
 @dataclass(frozen=True, slots=True)
 class MapOffset:
@@ -112,7 +110,7 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
 def _mean(moved: Array) -> tuple[Array, float]:
     """Mean of a vehicle's differences (n, 2) without gross errors, and their spread, an axis."""
     away = np.hypot(*(moved - np.median(moved, axis=0)).T)
-    kept = moved[away <= _OUTLIER_SPREADS * max(float(np.median(away)), 1e-6)]
+    kept = moved[away <= active().registration.offset_outlier * max(float(np.median(away)), 1e-6)]
     return np.asarray(kept.mean(axis=0)), float(np.sqrt(kept.var(axis=0).mean()))
 
 

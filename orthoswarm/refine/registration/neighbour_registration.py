@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
@@ -20,12 +21,6 @@ from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
 Array = NDArray[np.float64]
 
-REACH_PX = 24
-"""How far points are searched in held pictures once strips agree: relief moves them by metres across a border."""
-SCHEDULE = (1e4, 400.0, 36.0, 9.0, 9.0)
-FEWEST_LINKS = 8
-LEAST_SHARE = 0.4
-"""Of the links found, so many must agree in the end, or the vehicle stays where its receiver says."""
 _BLOCK_PX = 512
 
 
@@ -68,7 +63,7 @@ class HeldMosaic:
         north = grid.north - rows.start * gsd - float(self._origin[1])
         high, wide = gray.shape
         x, y = cameras.position[:, 0], cameras.position[:, 1]
-        reach = 0.6 * self._reach_m
+        reach = active().registration.unfound_reach_share * self._reach_m
         near = (
             (x > west - reach)
             & (x < west + wide * gsd + reach)
@@ -114,20 +109,21 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
 
 def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> bool:
     """Adjust a vehicle with its points observed in held pictures; False where too few of them agree."""
+    config = active().registration
     flight = state.flight
     shift_cameras(flight, fit.correction)
     held = held_cameras(state, others)
     if held is None:
         return False
-    found = link_to_held(flight, held, working_gsd(flight), REACH_PX)
-    if found < FEWEST_LINKS:
+    found = link_to_held(flight, held, working_gsd(flight), config.unfound_reach_px)
+    if found < config.unfound_fewest:
         return False
     adj = flight.adjustment
-    for c in SCHEDULE:
+    for c in config.unfound_scales:
         adj.step(c, state.surface.height_prior(adj.points))
     linked = adj.tracks.camera >= len(flight.frames)
-    agree = int((adj.obs_weight[linked] > 0.3).sum())
-    if agree < max(FEWEST_LINKS, LEAST_SHARE * found):
+    agree = int((adj.obs_weight[linked] > config.unfound_agrees).sum())
+    if agree < max(config.unfound_fewest, config.unfound_least_share * found):
         return False
     release(flight)
     state.confidence = agree / found

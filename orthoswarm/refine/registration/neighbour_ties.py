@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
@@ -16,10 +17,6 @@ from orthoswarm.refine.registration.tie_points import link_legs
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
-
-CELL_M = 40.0
-HELD_SIGMA_PX = 1.5
-MOST_HELD = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +33,17 @@ class Held:
 
 
 def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | None:
-    """The neighbours' cameras near a vehicle's path (every second one is enough); None where there are none."""
+    """The neighbours' cameras near a vehicle's path (not all are needed); None where there are none."""
+    config = active().registration
     own = state.flight.adjustment.cameras.position[:, :2]
     height = float(np.median(state.flight.adjustment.cameras.position[:, 2]))
-    low, high = own.min(0) - 1.2 * height, own.max(0) + 1.2 * height
+    reach = config.neighbour_reach_heights * height
+    low, high = own.min(0) - reach, own.max(0) + reach
     parts: list[tuple[VehicleState, NDArray[np.int64]]] = []
     for other in others:
         xy = other.flight.adjustment.cameras.position[: len(other.flight.frames), :2]
-        near = np.flatnonzero(((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0))[::2]
+        within = ((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0)
+        near = np.flatnonzero(within)[:: config.neighbour_every]
         fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
         if len(near) and fits:
             parts.append((other, near))
@@ -68,29 +68,39 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
 
 
 def link_to_held(
-    flight: Flight, held: Held, gsd_m: float, reach_px: int = 6, pictures: NDArray[np.bool_] | None = None
+    flight: Flight, held: Held, gsd_m: float, reach_px: int | None = None, pictures: NDArray[np.bool_] | None = None
 ) -> int:
     """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended.
 
     Args:
-        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
+        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there, None: as configured.
         pictures: bool (N,), own ones to compare, None for all.
     """
+    config = active().registration
     adj = flight.adjustment
     n = len(adj.cameras)
     joint = _joined(adj.cameras, held.cameras)
     seen = flight.best_views(pictures)
-    usable = (seen.camera >= 0) & (seen.count >= 3) & (seen.mean_weight > 0.5)
+    usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + held.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)
-    chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, CELL_M)
+    chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, config.link_cell_m)
     candidates = np.arange(n, len(joint))
 
     def gray(i: int) -> Gray:
         return flight.pictures.gray(i) if i < n else held.gray(i - n)
 
     camera, point, uv, _ = link_legs(
-        joint, adj.points, chosen, seen.camera, leg, candidates, gray, gsd_m, most=MOST_HELD, reach=reach_px
+        joint,
+        adj.points,
+        chosen,
+        seen.camera,
+        leg,
+        candidates,
+        gray,
+        gsd_m,
+        most=config.neighbour_pictures,
+        reach=reach_px,
     )
     if not len(camera):
         return 0
@@ -98,7 +108,7 @@ def link_to_held(
         np.concatenate([adj.tracks.camera, camera]),
         np.concatenate([adj.tracks.point, point]),
         np.concatenate([adj.tracks.uv, uv]),
-        np.concatenate([adj.tracks.sigma_px, np.full(len(camera), HELD_SIGMA_PX, np.float32)]),
+        np.concatenate([adj.tracks.sigma_px, np.full(len(camera), config.neighbour_sigma_px, np.float32)]),
     )
     free = np.arange(len(joint)) < n
     new = Adjustment.begin(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -41,8 +42,9 @@ def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Co
 
     An edge keeps its value when light and dark change places.
     """
+    side = active().registration.strip_border_px
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0).astype(bool)
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)
     g = gx + 1j * gy
     size = np.abs(g)
     middle = float(np.median(size[inner])) if inner.any() else 1.0
@@ -62,7 +64,7 @@ def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float
     energy_fixed = fft.irfft2(fft.rfft2(np.abs(fixed) ** 2, shape) * np.conj(fft.rfft2(weight, shape)), shape)
     energy = float((np.abs(moving) ** 2).sum())
     n = 2 * reach + 1
-    floor = 0.05 * float(energy_fixed[:n, :n].max()) + 1e-6
+    floor = active().registration.energy_share * float(energy_fixed[:n, :n].max()) + 1e-6
     score = product[:n, :n] / np.sqrt(np.maximum(energy_fixed[:n, :n], floor) * max(energy, 1e-6))
     return np.asarray(score, np.float32)
 
@@ -73,7 +75,7 @@ def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float
     Returns:
         Column and row of the shift from the centre (sub-pixel), peak, ratio of second peak to peak.
     """
-    return _highest(correlation(moving, fixed, reach), 4)
+    return _highest(correlation(moving, fixed, reach), active().registration.peak_apart_px)
 
 
 def _highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
@@ -107,14 +109,14 @@ def strip_mosaic(
     Returns:
         Grey (rows, columns), validity, west and north edges; None where nothing is seen.
     """
+    config = active().registration
     corners, homographies = [], []
     for i in index:
         camera = cameras.camera(int(i), np.zeros(2))
         quad = camera.corners(ground_z)
-        if (
-            not np.isfinite(quad).all()
-            or np.abs(quad - camera.nadir).max() > 4 * abs(camera.position[2] - ground_z) + 50
-        ):
+        height = abs(camera.position[2] - ground_z)
+        farthest = config.strip_farthest_heights * height + config.strip_farthest_m
+        if not np.isfinite(quad).all() or np.abs(quad - camera.nadir).max() > farthest:
             continue
         corners.append(quad)
         homographies.append((int(i), camera))
@@ -123,7 +125,7 @@ def strip_mosaic(
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     west, north = np.floor(low[0] / gsd_m) * gsd_m, np.ceil(high[1] / gsd_m) * gsd_m
     width, height = int(np.ceil((high[0] - west) / gsd_m)), int(np.ceil((north - low[1]) / gsd_m))
-    if width * height > 4_000_000:
+    if width * height > config.strip_most_px:
         return None
     out = np.zeros((height, width), np.float32)
     best = np.full((height, width), np.inf, np.float32)
@@ -193,7 +195,7 @@ def strip_and_map(
     )
     ground, known = basemap.gray(bounds, gsd_m)
     ground, known = ground[: rows + 2 * reach, : cols + 2 * reach], known[: rows + 2 * reach, : cols + 2 * reach]
-    if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < 0.1:
+    if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < active().registration.strip_map_share:
         return None
     grid = GroundGrid.around(basemap.epsg, bounds, gsd_m)
     return Strip(gray, valid, ground, known, reach, gsd_m, (grid.west - bounds[0], grid.north - bounds[3]))
@@ -211,14 +213,12 @@ def by_edges(strip: Strip) -> Found | None:
 
 def _edges(strip: Strip) -> tuple[Complex, Complex] | None:
     """Orientation fields of a strip and of its map; None where one of them has hardly an edge."""
-    moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), 0.7), strip.valid)
-    fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), 0.7), strip.known)
-    return None if min(np.count_nonzero(moving), np.count_nonzero(fixed)) < FEWEST_EDGES else (moving, fixed)
-
-
-FEWEST_EDGES = 400
-STACK_BLUR_PX, STACK_APART_PX = 2.0, 6
-STACK_KNOWN = 0.7
+    config = active().registration
+    blur = config.strip_blur_px
+    moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), blur), strip.valid)
+    fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), blur), strip.known)
+    edges = min(np.count_nonzero(moving), np.count_nonzero(fixed))
+    return None if edges < config.strip_fewest_edges else (moving, fixed)
 
 
 def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
@@ -236,20 +236,21 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak: a guess
         that the caller must confirm. None where no strip has an edge.
     """
-    total = None
+    config = active().registration
+    total, apart = None, config.stack_apart_px
     for strip in strips:
-        fields = None if strip.known.mean() < STACK_KNOWN else _edges(strip)
+        fields = None if strip.known.mean() < config.stack_map_share else _edges(strip)
         if fields is None:
             continue
         energy = float((np.abs(fields[0]) ** 2).sum())
-        score = cv2.GaussianBlur(correlation(*fields, strip.reach), (0, 0), STACK_BLUR_PX)
+        score = cv2.GaussianBlur(correlation(*fields, strip.reach), (0, 0), config.stack_blur_px)
         score *= np.sqrt(energy) / max(float(score.std()), 1e-9)
         total = score if total is None else total + score
     if total is None:
         return None
-    column, row, peak, ratio = _highest(total, STACK_APART_PX)
+    column, row, peak, ratio = _highest(total, apart)
     r, c = np.unravel_index(int(total.argmax()), total.shape)
-    rest = _without(total, int(r), int(c), STACK_APART_PX)
+    rest = _without(total, int(r), int(c), apart)
     rest = rest[rest != 0]
     z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
     offset, gsd = np.mean([s.offset for s in strips], axis=0), strips[0].gsd_m
@@ -271,8 +272,8 @@ def register(
     basemap: MapWindow,
     origin: Array,
     ground_z: float,
-    reach_m: float = 60.0,
-    gsd_m: float = 2.0,
+    reach_m: float,
+    gsd_m: float,
     find: Callable[[Strip], Found | None] = by_edges,
 ) -> Match | None:
     """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.patch_matching import gradient_field, match, rectify
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -42,8 +43,8 @@ def match_points(
     camera: Ints,
     gray: Callable[[int], Gray],
     ground: LoadedMap,
-    half: int = 20,
-    reach: int = 28,
+    half: int,
+    reach: int,
     level: Array | None = None,
     field: Callable[[Floats], Floats] = gradient_field,
 ) -> MapMatches:
@@ -59,6 +60,7 @@ def match_points(
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
         field: what is compared of pictures.
     """
+    config = active().registration
     order = np.argsort(camera[chosen], kind="stable")
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
     rows: list[tuple[int, int, float, float, float, float]] = []
@@ -70,13 +72,13 @@ def match_points(
         x, y = x + along[0] * (z - plane), y + along[1] * (z - plane)
         row, column, cx, cy = ground.pixel_centre(x, y)
         window = ground.window(row, column, half + reach + 1)
-        if window is None or window[1] < 0.7:
+        if window is None or window[1] < config.map_window_share:
             continue
         lens = cameras.lens[cameras.lens_id[i]]
         seen = rectify(
             cameras.position[i], cameras.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch
         )
-        if seen < 0.85:
+        if seen < config.patch_share:
             continue
         dc, dr, peak, second = match(field(patch), field(window[0]))
         if peak > 0:
@@ -97,18 +99,19 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
     Returns:
         East and north lean, or None where too few roofs agree (the caller then takes zero).
     """
-    if len(height) < 12:
+    config = active().registration
+    if len(height) < config.lean_fewest:
         return None
     shift = matches.shift - offset
     slope = shift / height[:, None]
-    sigma = 0.25 + 0.05 * height
+    sigma = config.lean_sigma_m + config.lean_sigma_share * height
 
     def support(lean: Array) -> tuple[float, Array]:
         e2 = ((shift - lean * height[:, None]) ** 2).sum(1) / sigma**2
-        w = 1.0 / (1.0 + e2 / 4.0) ** 2
+        w = 1.0 / (1.0 + e2 / config.lean_scale) ** 2
         return float(w.sum()), w
 
-    candidates = slope[(np.hypot(*slope.T) < 1.0)]
+    candidates = slope[np.hypot(*slope.T) < config.lean_most]
     if not len(candidates):
         return None
     best = candidates[int(np.argmax([support(c)[0] for c in candidates]))]
@@ -117,7 +120,8 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
         best = (shift * (w * height)[:, None]).sum(0) / max(float((w * height**2).sum()), 1e-9)
     total, w = support(best)
     zero = support(np.zeros(2))[0]
-    if total < 12 or total < 1.5 * zero or total < 0.25 * len(height):
+    least = max(config.lean_fewest, config.lean_over_none * zero, config.lean_least_share * len(height))
+    if total < least:
         return None
     return float(best[0]), float(best[1])
 
@@ -131,18 +135,21 @@ def link_legs(
     candidates: NDArray[np.integer],
     gray: Callable[[int], Gray],
     gsd_m: float,
-    most: int = 3,
-    half: int = 15,
-    reach: int = 6,
+    most: int | None = None,
+    reach: int | None = None,
 ) -> tuple[Ints, Ints, Array, int]:
     """Find points of one leg in the pictures of other legs.
 
     Args:
         camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
+        most: other legs in which a point is observed. reach: search in pixels. None: as configured.
 
     Returns:
         Camera (K,), point (K,), pixel (K, 2) of new observations, and how many were tried.
     """
+    config = active().registration
+    most = config.link_pictures if most is None else most
+    half, reach = config.link_half_px, config.link_reach_px if reach is None else reach
     cams, pts, uvs, tried = [], [], [], 0
     size = 2 * (half + reach) + 3
     template, window = np.empty((2 * half + 3, 2 * half + 3), np.float32), np.empty((size, size), np.float32)
@@ -153,7 +160,7 @@ def link_legs(
         distance = np.hypot(nadir[:, 0] - x, nadir[:, 1] - y)
         uv = cameras.project(candidates, np.broadcast_to(points[p], (len(candidates), 3)))
         lens = cameras.lens[cameras.lens_id[candidates]]
-        margin = 12.0
+        margin = config.link_margin_px
         sees = (uv[:, 0] > margin) & (uv[:, 1] > margin)
         sees &= (uv[:, 0] < lens[:, 6] - margin) & (uv[:, 1] < lens[:, 7] - margin)
         sees &= leg[candidates] != leg[i]
@@ -163,7 +170,8 @@ def link_legs(
         if not len(picks):
             continue
         li = cameras.lens[cameras.lens_id[i]]
-        if rectify(cameras.position[i], cameras.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template) < 0.95:
+        shown = rectify(cameras.position[i], cameras.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template)
+        if shown < config.link_template_share:
             continue
         field = gradient_field(template)
         for j in picks:
@@ -172,10 +180,10 @@ def link_legs(
             seen = rectify(
                 cameras.position[j], cameras.rotation[j], lj, gray(int(j)), x, y, z, gsd_m, half + reach + 1, window
             )
-            if seen < 0.8:
+            if seen < config.link_window_share:
                 continue
-            dc, dr, peak, second = match(field, gradient_field(window), exclude=3)
-            if peak >= 0.45 and second <= 0.8 * peak:
+            dc, dr, peak, second = match(field, gradient_field(window), exclude=config.link_apart_px)
+            if peak >= config.link_peak and second <= config.link_ratio * peak:
                 moved = np.array([[x + dc * gsd_m, y - dr * gsd_m, z]])
                 cams.append(int(j))
                 pts.append(int(p))

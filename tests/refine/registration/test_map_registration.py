@@ -90,7 +90,7 @@ def test_a_strip_is_found_although_light_and_dark_changed_places(world):
 def test_a_map_elsewhere_gives_no_match(world):
     cameras, images = pictures_of(world, (0.0, 0.0))
     away = CameraBlock(cameras.position + np.array([900.0, 0, 0]), cameras.rotation, cameras.lens_id, cameras.lens)
-    assert register(away, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0) is None
+    assert register(away, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=60.0, gsd_m=2.0) is None
 
 
 def test_correlation_finds_fractions_of_a_pixel():
