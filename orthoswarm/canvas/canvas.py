@@ -78,7 +78,9 @@ class Canvas:
             dtype=_DTYPES[header.plane],
             memory_mb=memory_mb,
             writable=writable,
-            on_evict=self._evicted if writable else None,
+            # a rendered tile is drawn once and reduced while it is mapped; a real-time one changes with every picture
+            # and is reduced when it is read
+            on_evict=self._evicted if writable and header.plane == "frame" else None,
         )
         self._overview = Overview(path, self.tile_rows, self.tile_cols, self.tile_px, writable=writable)
         self._index = VersionIndex(path / "versions.u64", (self.tile_rows, self.tile_cols), writable=writable)
@@ -177,7 +179,7 @@ class Canvas:
             (path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Bring the overviews up to date and let go of all files."""
+        """Bring the overviews of rendered tiles up to date and let go of all files."""
         with self._lock:
             self._store.close()
             self._overview.close()
@@ -405,7 +407,7 @@ class Canvas:
     def update_overviews(self, tiles: tuple[int, int, int, int] | None = None) -> None:
         """Renew the reduced copies of the tiles that changed, in a window of tiles (row0, row1, col0, col1) or all.
 
-        Reading does this by itself; tiles that were mapped and let go have been done then.
+        Reading does this by itself; rendered tiles that were mapped and let go have been done then.
         """
         if not self._writable:
             return

@@ -302,8 +302,12 @@ def _read(read: Read, path: Path, size: Ints) -> Bytes:
 
 
 def thumbnail(picture: Bytes) -> Bytes:
-    """The means of a picture's parts, uint8 (12, 16, 3), from 160 x 120 of its pixels."""
+    """The means of the parts of a picture, uint8 (rows, columns, 3 or 4), from 160 x 120 of its pixels.
+
+    Returns:
+        uint8 (12, 16, 3).
+    """
     import cv2
 
     small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(cv2.resize(small, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA))
+    return np.ascontiguousarray(cv2.resize(small, THUMBNAIL[::-1], interpolation=cv2.INTER_AREA)[..., :3])

@@ -7,6 +7,7 @@ import json
 import logging
 import sqlite3
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -118,7 +119,7 @@ class MapSite:
             return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
         if self.area is None:
             return None
-        lat, lon = (float(v) for v in LocalGrid(self.area.epsg).to_geographic(self.area.origin))
+        lat, lon = _origin_of(self.area)
         away_m = distance_m(fix.lat_deg, fix.lon_deg, lat, lon)
         if away_m <= _FAR_M:
             return None
@@ -232,3 +233,10 @@ class MapSite:
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(self.area.epsg)
         self._on_area(self.area)
+
+
+@lru_cache(maxsize=8)
+def _origin_of(area: Area) -> tuple[float, float]:
+    """Latitude and longitude of an area's origin, degrees."""
+    lat, lon = LocalGrid(area.epsg).to_geographic(area.origin)
+    return float(lat), float(lon)

@@ -335,7 +335,4 @@ def _quality(picture: Bytes) -> PictureQuality | None:
 
 def _thumbnail(picture: Bytes) -> bytes:
     """The means of a picture's parts, for gains; see `thumbnail`."""
-    import cv2
-
-    some = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_NEAREST)
-    return thumbnail(np.ascontiguousarray(some[..., :3])).tobytes()
+    return thumbnail(picture).tobytes()
