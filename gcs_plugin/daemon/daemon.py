@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import cv2  # noqa: F401  before any thread: two that import it at once find it half made
+import cv2  # before any thread: two that import it at once find it half made
 
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
@@ -76,6 +76,7 @@ class Daemon:
             InputError: another daemon runs in the workspace, or the basemap is of no use.
             OrthoSwarmError: the workspace cannot be written.
         """
+        cv2.setNumThreads(1)  # its threads wait for cores that the daemon's own threads use
         self.settings, self.started = settings, time.time()
         self.events = Events()
         self._lock = take_over(settings.workspace)
