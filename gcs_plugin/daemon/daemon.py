@@ -47,6 +47,7 @@ from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, pictu
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.daemon.terrain_data import TerrainData
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.compute.workers import peak_rss_mb
@@ -98,7 +99,7 @@ class Daemon:
         self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
         self.refused = RefusedPictures(self.events.publish)
         self.console = ConsoleState(self.journal, self.events.publish)
-        self.plans = Plans(folder / "plans")
+        self.plans = Plans(folder / "plans", settings.dem)
         fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
@@ -143,10 +144,13 @@ class Daemon:
         self.poses = Poses()
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
+        self.terrain: TerrainData | None = None
         if settings.links:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
             self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
+            if settings.dem is not None:
+                self.terrain = TerrainData(settings.dem, self.links.fleet)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         self.sources = [
@@ -182,6 +186,8 @@ class Daemon:
         self.coverage.start()
         if self.links is not None:
             self.links.start()
+        if self.terrain is not None:
+            self.terrain.start()
         if self.settings.tak:
             self.tak.start()
         for source in self.sources:
@@ -197,6 +203,8 @@ class Daemon:
             bus.close()
         self.leg_watch.close()
         self.tak.close()
+        if self.terrain is not None:
+            self.terrain.close()
         if self.takeoffs is not None:
             self.takeoffs.close()
         if self.links is not None:

@@ -73,7 +73,8 @@ class GapFlights:
         """Field of view in degrees, altitude in metres, and notes about them."""
         plan = self._coverage.document["plan"]
         figures = {} if plan is None else json.loads((self._plans.folder / plan / "plan.json").read_text("utf-8"))
-        altitude = body.get("altitude_m", figures.get("altitude_m"))
+        over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m"), "terrain_items": False}
+        altitude = body.get("altitude_m", over["nominal_m"])
         if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
             raise InputError("altitude_m is missing or no height; send metres above takeoff, for example 80")
         solved = self._coverage.solved_fov_deg

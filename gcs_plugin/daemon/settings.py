@@ -19,6 +19,7 @@ TEMPLATE: Final = """\
 # port = 8650
 # bind = "127.0.0.1"              # another address needs the token for everything
 # basemap = "before.tif"          # GeoTIFF, COG, MBTiles or folder z/x/y.png; relative to this file
+# dem = "heights.tif"             # height model: plans follow the ground, and vehicles get their terrain data from it
 # links = ["udpin:0.0.0.0:14550", "serial:/dev/ttyUSB0:57600"]
 # fov_min_deg = 70                # smallest horizontal field of view in the swarm, for the real-time map
 # gsd_m = 0.1                     # ground pixel of the map; from the first pictures unless given
@@ -61,7 +62,7 @@ class Settings:
 
     Attributes:
         workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
-        links: MAVLink links. basemap: the map before the disaster, or None.
+        links: MAVLink links. basemap: the map before the disaster, or None. dem: height model of the ground, or None.
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
         workers: processes that refine. coarse: whether legs are placed in flight.
         lost_after_s: when a silent vehicle's sortie counts as over.
@@ -75,6 +76,7 @@ class Settings:
     port: int = PORT
     links: tuple[str, ...] = ()
     basemap: Path | None = None
+    dem: Path | None = None
     fov_min_deg: float | None = None
     gsd_m: float | None = None
     workers: int = 1
@@ -104,6 +106,8 @@ class Settings:
             raise InputError(f"port {self.port} is no port; give 1 to 65535, or 0 for any free one")
         if self.basemap is not None and not self.basemap.exists():
             raise InputError(f"the basemap {self.basemap} does not exist; check the path")
+        if self.dem is not None and not self.dem.is_file():
+            raise InputError(f"the height model {self.dem} does not exist; check the path")
         if self.fov_min_deg is not None and not 5.0 <= self.fov_min_deg <= 150.0:
             raise InputError(f"a field of view of {self.fov_min_deg:g} degrees is not possible; for example 70")
         if self.gsd_m is not None and not 0.005 <= self.gsd_m <= 5.0:
@@ -127,7 +131,7 @@ class Settings:
 
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "fov_min_deg": (int, float),
+    "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "dem": (str,), "fov_min_deg": (int, float),
     "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
     "tak": (list,), "tak_certificate": (str,), "tak_authority": (str,),
 }  # fmt: skip
@@ -156,7 +160,7 @@ def read_settings(workspace: Path) -> Settings:
         document["links"] = tuple(str(link) for link in document["links"])
     if "tak" in document:
         document["tak"] = tuple(str(address) for address in document["tak"])
-    for key in ("basemap", "tak_certificate", "tak_authority"):
+    for key in ("basemap", "dem", "tak_certificate", "tak_authority"):
         if key in document:
             document[key] = workspace / document[key]
     return replace(Settings(workspace), vehicles=vehicles, **document)

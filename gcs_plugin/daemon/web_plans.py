@@ -13,17 +13,17 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.plans.plan_request import ENDS, METHODS, MOST_ITEMS, PlanRequest, make_plan
+from gcs_plugin.plans.plan_request import ENDS, METHODS, MOST_ITEMS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
 _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
-    "clearance_m",
+    "clearance_m", "height_tolerance_m",
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6
 _NO_FLY_FILE: Final = "no-fly.geojson"
-_CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS}
+_CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS, "relief": RELIEFS}
 
 
 GeographicBounds = tuple[float, float, float, float]
@@ -34,11 +34,11 @@ class Plans:
     """The plans of a workspace.
 
     Args:
-        folder: where they are.
+        folder: where they are. dem: height model that they follow, None for level ground.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, dem: Path | None = None) -> None:
+        self.folder, self._dem = folder, dem
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -87,7 +87,9 @@ class Plans:
                 no_fly = [path / _NO_FLY_FILE]
                 no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
-                figures: dict[str, Any] = pool.run(plan_into, PlanRequest(area=path / name, no_fly=no_fly, **values))
+                figures: dict[str, Any] = pool.run(
+                    plan_into, PlanRequest(area=path / name, no_fly=no_fly, dem=self._dem, **values)
+                )
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
             raise
@@ -196,6 +198,8 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(body[key], str) or body[key] not in choices:
                 raise InputError(f"{key} is none of {', '.join(choices)}; choose one")
             values[key] = body[key]
+    if "terrain_items" in body:
+        values["terrain_items"] = body["terrain_items"] is True
     starts = body.get("starts", [])
     if not isinstance(starts, list) or not all(_is_position(start) for start in starts):
         raise InputError("starts is no list of [latitude, longitude]; send one")

@@ -7,7 +7,7 @@ ground station, and asks for streams.
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -19,6 +19,7 @@ from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.message_rates import Rates, default_rates
 from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
 from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
@@ -149,6 +150,10 @@ class Fleet:
         exchange.expires = order.expires_s
         order.exchange = self.begin(exchange)
         return order
+
+    def send(self, system: int, messages: Sequence[Message]) -> None:
+        """Send messages that no answer is waited for; in the polling thread. An unknown vehicle gets none."""
+        self._dialogues.send(system, messages)
 
     def vehicle(self, system: int) -> Vehicle:
         """A vehicle that can be commanded.

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.plan import Plan, Sortie
+from orthoswarm.model.plan import Plan, Sortie, Waypoint
 
 Autopilot = Literal["ardupilot", "px4"]
 LatLon = tuple[float, float]
 
-FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE = 0, 2, 3
+FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE, FRAME_TERRAIN = 0, 2, 3, 10
 NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 17, 20, 21, 22, 82
 DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
 _FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
@@ -26,6 +26,7 @@ _HIGHEST_M = 20_000.0
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2
+_ALTITUDE_MODE = {FRAME_GLOBAL_RELATIVE: 1, FRAME_TERRAIN: 4}  # QGroundControl's AltModeRelative, AltModeTerrainFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +105,29 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
     DO_SET_CAM_TRIGG_DIST follows a leg's first waypoint (its third parameter takes a picture at once) and its last
     one with distance 0. PX4 reads yaw 0 as "turn north", so there the yaw is NaN: nose along the path, as ArduPilot
     does by itself, which lays the picture's width across the leg.
+
+    Where the vehicle itself is to keep its height above the ground, waypoints have MAV_FRAME_GLOBAL_TERRAIN_ALT, and
+    those put into a leg for their height are left out: ArduPilot follows the ground between such waypoints.
     """
     yaw = math.nan if autopilot == "px4" else 0.0
+    by_vehicle = plan.over_ground is not None and plan.over_ground.by_vehicle
 
-    def nav(command: int, lat: float, lon: float, height: float) -> MissionItem:
-        return MissionItem(command, FRAME_GLOBAL_RELATIVE, (0.0, 0.0, 0.0, yaw), lat, lon, height)
+    def nav(command: int, lat: float, lon: float, height: float, frame: int = FRAME_GLOBAL_RELATIVE) -> MissionItem:
+        return MissionItem(command, frame, (0.0, 0.0, 0.0, yaw), lat, lon, height)
+
+    def fly_to(point: Waypoint) -> MissionItem:
+        if by_vehicle and point.above_ground_m is not None:
+            return nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.above_ground_m, FRAME_TERRAIN)
+        return nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.height_m)
 
     items = [
         nav(NAV_TAKEOFF, sortie.home_lat_deg, sortie.home_lon_deg, sortie.takeoff_height_m),
         MissionItem(DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
     ]
     for point in sortie.waypoints:
-        items.append(nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.height_m))
+        if by_vehicle and point.between:
+            continue
+        items.append(fly_to(point))
         if point.camera is not None:
             distance, at_once = (plan.trigger_m, 1.0) if point.camera else (0.0, 0.0)
             items.append(MissionItem(DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
@@ -124,8 +136,7 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
     elif plan.end == "land":
         items.append(nav(NAV_LAND, sortie.home_lat_deg, sortie.home_lon_deg, 0.0))
     else:  # a plain waypoint last: both autopilots then report the mission as complete
-        last = sortie.waypoints[-1]
-        items.append(nav(NAV_WAYPOINT, last.lat_deg, last.lon_deg, last.height_m))
+        items.append(fly_to(sortie.waypoints[-1]))
     return tuple(items)
 
 
@@ -164,8 +175,8 @@ def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
         "frame": item.frame,
         "params": values,
     }
-    if item.frame == FRAME_GLOBAL_RELATIVE:
-        result |= {"AMSLAltAboveTerrain": None, "Altitude": alt, "AltitudeMode": 1}
+    if item.frame in _ALTITUDE_MODE:
+        result |= {"AMSLAltAboveTerrain": None, "Altitude": alt, "AltitudeMode": _ALTITUDE_MODE[item.frame]}
     return result
 
 

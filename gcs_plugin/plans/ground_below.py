@@ -61,6 +61,8 @@ def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
         if over.follows
         else f"all legs are flown {plan.altitude_m:.0f} m above the lowest takeoff"
     )
+    if over.by_vehicle:
+        how += ", by the terrain data of the vehicles: the ground station must send it to them, or their card hold it"
     back = math.ceil(ground.way_m + LEAST_ABOVE_GROUND_M)
     return [
         f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "

@@ -64,6 +64,7 @@ def report(plan: Plan, autopilot: Autopilot, fov_min_deg: float) -> dict[str, An
 def _over_ground(over: OverGround) -> dict[str, Any]:
     return {
         "follows": over.follows,
+        "terrain_items": over.by_vehicle,
         "nominal_m": over.nominal_m,
         "above_ground_m": [round(over.least_m, 2), round(over.most_m, 2)],
         "ground_pixels": [round(over.least_m / over.nominal_m, 4), round(over.most_m / over.nominal_m, 4)],

@@ -30,6 +30,8 @@ from orthoswarm.planning.sorties.flight_time import Motion
 MOST_ITEMS: Final[dict[Autopilot, int]] = {"ardupilot": 650, "px4": 1900}
 """Mission items that an autopilot stores (ArduPilot: measured; PX4: its dataman's table)."""
 METHODS: Final = ("columns", "bcd", "tmstc")
+WITH_TERRAIN: Final = frozenset({"ardupilot"})
+"""Autopilots whose missions can state heights above the ground (MAV_FRAME_GLOBAL_TERRAIN_ALT)."""
 RELIEFS: Final = ("auto", "follow", "level")
 ENDS: Final = ("rtl", "land", "hover")
 _MOST_LAYERS: Final = 12.0
@@ -59,6 +61,7 @@ class PlanRequest:
             pictures were taken but have not arrived.
         dem: height model of the ground, None for level ground at takeoff. relief: legs follow the ground, lie at one
             level, or whichever is done sooner. height_tolerance_m: of the height above ground, None for a tenth of it.
+            terrain_items: mission items state heights above the ground where the autopilot knows such (ArduPilot).
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
     """
 
@@ -89,6 +92,7 @@ class PlanRequest:
     dem: Path | None = None
     relief: Relief = "auto"
     height_tolerance_m: float | None = None
+    terrain_items: bool = False
     wind_m_s: float = 0.0
     wind_from_deg: float = 0.0
 
@@ -187,10 +191,15 @@ def _over_ground(
     tolerance_m = request.height_tolerance_m
     if tolerance_m is None:
         tolerance_m = _TOLERANCE * request.altitude_m
+    by_vehicle = request.terrain_items and request.autopilot in WITH_TERRAIN
     plan = plan_over_relief(
-        make, lambda above_m: _footprint(request, above_m), ground, request.altitude_m, tolerance_m, request.relief
-    )
-    return replace(plan, warnings=(*plan.warnings, *relief_notes(plan, ground)))
+        make, lambda above_m: _footprint(request, above_m), ground, request.altitude_m, tolerance_m, request.relief,
+        by_vehicle,
+    )  # fmt: skip
+    notes = relief_notes(plan, ground)
+    if request.terrain_items and not by_vehicle:
+        notes.append(f"{request.autopilot} has no items with heights above the ground: heights count from takeoff")
+    return replace(plan, warnings=(*plan.warnings, *notes))
 
 
 def _footprint(request: PlanRequest, above_m: float) -> Footprint:

@@ -20,6 +20,7 @@ from gcs_plugin.mission.refusal import (
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 _FRAMES: Final = frozenset({0, 2, 3, 5, 6, 10, 11})
+_FRAMES_PX4: Final = _FRAMES - {10, 11}
 _COMMANDS: Final = frozenset({
     16, 17, 18, 19, 20, 21, 22, 82, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 183, 189, 195, 197, 201, 203,
     205, 206, 207, 210, 212, 218, 222, 530, 2000, 2001, 2500, 2501,
@@ -206,7 +207,7 @@ class MissionStore:
         ardupilot = self.autopilot is Autopilot.ARDUPILOT
         if item.command not in _COMMANDS:
             return UNSUPPORTED
-        if item.frame not in _FRAMES:
+        if item.frame not in (_FRAMES if ardupilot else _FRAMES_PX4):
             return UNSUPPORTED_FRAME
         for index, value in enumerate(item.params):
             if math.isnan(value) and (ardupilot or index == 0):

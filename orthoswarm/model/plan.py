@@ -133,6 +133,7 @@ class OverGround:
 
     Attributes:
         follows: legs keep a constant height above the ground; else all legs lie at one height.
+        by_vehicle: mission items are to state heights above the ground, which the vehicle keeps by a model of its own.
         nominal_m: height above the ground that was asked for.
         least_m: lowest point of the legs; most_m: highest.
         way_least_m: lowest point of the flights but for takeoff and landing.
@@ -142,6 +143,7 @@ class OverGround:
     """
 
     follows: bool
+    by_vehicle: bool
     nominal_m: float
     least_m: float
     most_m: float

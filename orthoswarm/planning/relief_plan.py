@@ -20,6 +20,7 @@ MakePlan = Callable[[float, Footprint, FlightHeights], Plan]
 
 _CLOSER = 0.93
 _ROUNDS = 4
+_BY_VEHICLE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,7 @@ def plan_over_relief(
     above_m: float,
     tolerance_m: float,
     relief: Relief = "auto",
+    by_vehicle: bool = False,
 ) -> Plan:
     """The plan that is done sooner, among those whose ground pixels are as fine as `above_m + tolerance_m` gives.
 
@@ -55,6 +57,7 @@ def plan_over_relief(
         make: plans. lens: footprint of the narrowest camera from a height above level ground.
         ground: below the area and the ways to it. above_m: height of legs above ground. tolerance_m: of that height.
         relief: "follow" or "level" for one kind only.
+        by_vehicle: the vehicle keeps its height above the ground by a model of its own; the plan counts on 1 m.
 
     Raises:
         InputError: lower than 20 m above the ground, or as `make`.
@@ -81,10 +84,12 @@ def plan_over_relief(
                 f"{above_m:g} m above ground, less a tolerance of {tolerance_m:g} m, are less than the "
                 f"{LEAST_ABOVE_GROUND_M:g} m that must be kept; give a larger --altitude"
             )
-        plans.append(_closely_enough(make, lens, GroundHeights(ground.terrain, above_m, tolerance_m), least_m))
+        kept_m = min(tolerance_m, _BY_VEHICLE_M) if by_vehicle else tolerance_m
+        heights = GroundHeights(ground.terrain, above_m, kept_m, by_vehicle=by_vehicle)
+        plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
-        heights = LevelHeights(level_m, ground.terrain, above_m)
-        plans.append(_closely_enough(make, lens, heights, level_m - ground.high_m))
+        level = LevelHeights(level_m, ground.terrain, above_m)
+        plans.append(_closely_enough(make, lens, level, level_m - ground.high_m))
     return min(plans, key=lambda plan: (not _complete(plan), plan.makespan_s))
 
 

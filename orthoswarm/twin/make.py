@@ -27,7 +27,7 @@ from orthoswarm.twin.dataset_files import (
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.recorded_noise import Record, record
 from orthoswarm.twin.site import Site, disaster_zones
-from orthoswarm.twin.true_flight import Flight, fly
+from orthoswarm.twin.true_flight import Flight, fly, raised
 
 Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0
@@ -80,8 +80,10 @@ def make_twin(
     tell("city", 0, 1)
     site = Site.of(spec)
     flights = [fly(spec.plan, spec.motion, site.center, v, spec.seed, spec.lens_k) for v in range(spec.plan.vehicles)]
-    records = [record(flight, spec.noise, v, spec.seed) for v, flight in enumerate(flights)]
     scene, slots = site.build(spec)
+    if spec.follow_ground:
+        flights = [raised(flight, scene.bare_ground()) for flight in flights]
+    records = [record(flight, spec.noise, v, spec.seed) for v, flight in enumerate(flights)]
     zones = disaster_zones(spec, site)
     if not (folder / "basemap.tif").exists():
         tell("basemap", 0, 1)

@@ -30,6 +30,7 @@ class TwinSpec:
         noise_name: kind of noise; noise: its values.
         plan: the flight. motion: how calmly it is flown.
         relief_m: ground relief, +- metres (procedural city only).
+        follow_ground: legs keep their height above the bare ground; else they are level.
         lens_k: true radial distortion k1, k2 of all lenses.
         lean: size of the map's lean, metres per metre of height; lean_deg: its azimuth, both drawn if None.
         map_gsd_m: pixel of the basemap. reference_gsd_m: of the reference.
@@ -50,6 +51,7 @@ class TwinSpec:
     plan: FlightPlan = field(default_factory=FlightPlan)
     motion: Motion = field(default_factory=Motion)
     relief_m: float = 0.0
+    follow_ground: bool = False
     lens_k: tuple[float, float] = (0.0, 0.0)
     lean: float | None = None
     lean_deg: float | None = None

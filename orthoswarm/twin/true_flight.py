@@ -1,12 +1,13 @@
 """Flights over the area: boustrophedon legs per vehicle, true motion with its wobble, and where pictures are taken."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import Lens, focal_px
+from orthoswarm.model.placement import Terrain
 
 Array = NDArray[np.float64]
 
@@ -205,6 +206,13 @@ def fly(
     time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
     return Flight(name, lens, (float(mount[0]), float(mount[1])), time, planned, position, velocity, angles, body)
+
+
+def raised(flight: Flight, ground: Terrain) -> Flight:
+    """A flight that keeps its heights above the ground below the plan."""
+    up = np.zeros_like(flight.planned)
+    up[:, 2] = ground.height(flight.planned[:, :2])
+    return replace(flight, planned=flight.planned + up, position=flight.position + up)
 
 
 def _receiver_drift(rng: np.random.Generator, n: int, size: float) -> Array:

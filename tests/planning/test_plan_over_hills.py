@@ -11,7 +11,7 @@ import rasterio
 from rasterio.transform import from_origin
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.mission.mission_files import parse_mission
+from gcs_plugin.mission.mission_files import FRAME_TERRAIN, NAV_WAYPOINT, parse_mission
 from tests.kit.flown_area import CORNER, EPSG, FlownArea
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -122,3 +122,27 @@ def test_a_start_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     given = _arguments(tmp_path, 100)
     assert main([*given[: given.index("--start")], "--dem", str(dem)]) == 2
     assert "--start" in capsys.readouterr().err
+
+
+def test_arducopter_gets_heights_above_the_ground_where_it_is_to_keep_them_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(60.0))
+    out = _planned(tmp_path, capsys, 80, "--dem", dem, "--relief", "follow", "--terrain-items")
+    assert out["over_ground"]["terrain_items"] and out["complete"]
+    items = parse_mission((tmp_path / "p" / "v1.plan").read_text()).items
+    flown = [i for i in items if i.command == NAV_WAYPOINT]
+    assert {i.frame for i in flown} == {FRAME_TERRAIN} and {i.alt_m for i in flown} <= {80.0, 85.0, 90.0, 95.0, 100.0}
+    legs = sum(flight["legs"] for flight in out["vehicles"][0]["flights"])
+    assert len(flown) <= 3 * legs + 4  # no points put in for their height alone
+
+
+def test_px4_has_no_heights_above_the_ground_and_gets_those_over_takeoff(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem = _dem(tmp_path / "dem.tif", _hill(60.0))
+    given = ("--dem", dem, "--relief", "follow", "--terrain-items", "--autopilot", "px4")
+    out = _planned(tmp_path, capsys, 80, *given)
+    assert not out["over_ground"]["terrain_items"] and any("px4 has no items" in w for w in out["warnings"])
+    items = parse_mission((tmp_path / "p" / "v1.plan").read_text()).items
+    assert FRAME_TERRAIN not in {i.frame for i in items}

@@ -12,6 +12,8 @@ from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import GROUND_STATION, Address, Verdict
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
+    FRAME_RELATIVE,
+    FRAME_TERRAIN,
     JUMP,
     LAND,
     RTL,
@@ -417,6 +419,27 @@ def test_a_difference_that_matters_in_flight_is_found(word):
     stored[2] = DIFFERENCES[word](stored[2])
     found = difference(mission, stored)
     assert found.item == 2 and word in found.text
+
+
+def above_ground(autopilot):
+    """The usual mission with waypoints at 80 m above the ground."""
+    mission = make_mission(autopilot)
+    items = [replace(i, frame=FRAME_TERRAIN, z=80.0) if i.command == WAYPOINT and i.z else i for i in mission.items]
+    return replace(mission, items=tuple(items))
+
+
+def test_heights_above_the_ground_are_stored_by_ardupilot_and_verified():
+    rig, mission = Rig(AP), above_ground(AP)
+    (outcome,) = rig.run(upload(rig, mission))
+    assert outcome.ok and sum(i.frame == FRAME_TERRAIN for i in rig.store.items) >= 2
+    home = [replace(i, frame=FRAME_RELATIVE) if i.frame == FRAME_TERRAIN else i for i in rig.store.items]
+    assert "frame" in difference(mission, home).text  # a vehicle that took them for heights over home is found out
+
+
+def test_heights_above_the_ground_are_refused_by_px4_in_words():
+    rig = Rig(PX4)
+    (outcome,) = rig.run(upload(rig, above_ground(PX4)))
+    assert not outcome.ok and "use heights over home" in outcome.text
 
 
 def test_rounding_by_the_autopilot_is_no_difference():

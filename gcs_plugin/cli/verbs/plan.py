@@ -44,6 +44,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--relief", choices=["auto", "follow", "level"], default="auto", help=relief_help)
     tolerance_help = "of the height above ground (default: a tenth of --altitude)"
     add("--height-tolerance", type=float, metavar="M", help=tolerance_help)
+    terrain_help = "legs that follow the ground state heights above it (ArduPilot, which needs terrain data)"
+    add("--terrain-items", action="store_true", help=terrain_help)
     flight = parser.add_argument_group("flight")
     start_help = "takeoff point; give it again for more (default: at each vehicle's first line; for example -33.9,18.4)"
     flight.add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
@@ -120,6 +122,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         dem=args.dem,
         relief=args.relief,
         height_tolerance_m=args.height_tolerance,
+        terrain_items=args.terrain_items,
         vehicles=args.vehicles,
         altitude_m=args.altitude,
         fov_min_deg=args.fov_min if args.map is None else _solved_fov(args.map),

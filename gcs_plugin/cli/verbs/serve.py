@@ -31,6 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--token-file", type=Path, metavar="FILE", help="where the token is, or goes (default: in the workspace)")
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm (default 70)")
     add("--gsd", type=float, metavar="M", help="ground pixel of the map (default: that of the first pictures)")
+    add("--dem", type=Path, metavar="FILE", help="height model: plans follow the ground, vehicles get terrain data")
     add("--workers", type=int, metavar="N", help="processes that refine (default: one less than cores)")
     add(
         "--source",
@@ -112,7 +113,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
 
     settings = read_settings(args.workspace)
     flags = {
-        "bind": args.bind, "port": args.port, "basemap": args.basemap, "fov_min_deg": args.fov_min,
+        "bind": args.bind, "port": args.port, "basemap": args.basemap, "dem": args.dem, "fov_min_deg": args.fov_min,
         "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
         "tak": tuple(args.tak) or None,
     }  # fmt: skip

@@ -33,6 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--disaster", choices=("none", "debris", "water", "haze", "all"), help="instead of the preset's")
     add("--lens", metavar="K1,K2", help="radial distortion of all lenses, in units of f (write --lens=-0.05,0.01)")
     add("--relief", type=float, default=0.0, metavar="M", help="smooth ground relief of +-M metres")
+    add("--follow-ground", action="store_true", help="legs keep --height-m above the bare ground instead of one level")
     add("--ground", type=Path, metavar="ORTHO.tif", help="a real orthoimage as the ground; needs --surface")
     add("--surface", type=Path, metavar="DSM.tif", help="its surface model (uint16: height = 100 + v/100 m; or float)")
     add("--dtm", type=Path, metavar="DTM.tif", help="its bare ground, in the same form")
@@ -146,7 +147,7 @@ def _spec(args: argparse.Namespace) -> Any:
     given = {
         "disaster": args.disaster, "lens_k": _pair(args.lens, "--lens"), "relief_m": args.relief, "every": args.every,
         "lean": args.lean, "lean_deg": args.lean_deg, "lat_deg": args.lat, "lon_deg": args.lon,
-        "map_gsd_m": args.map_gsd, "quality": args.quality, "rays": args.rays,
+        "map_gsd_m": args.map_gsd, "quality": args.quality, "rays": args.rays, "follow_ground": args.follow_ground,
     }  # fmt: skip
     if args.ground is not None:
         if args.surface is None:

@@ -24,13 +24,14 @@ class LevelHeights:
         z_m: height of the legs.
         ground: heights of the ground, None where only the height above takeoff counts.
         nominal_m: height above the ground that was asked for, None for z_m.
-        follows: False, as heights do not follow the ground.
+        follows: False, as heights do not follow the ground. by_vehicle: False, likewise.
     """
 
     z_m: float
     ground: Terrain | None = None
     nominal_m: float | None = None
     follows: bool = False
+    by_vehicle: bool = False
 
     @property
     def above_m(self) -> float:
@@ -57,12 +58,15 @@ class GroundHeights:
     Attributes:
         ground: heights of the ground. above_m: height above it. tolerance_m: largest difference from it.
         follows: True, as heights follow the ground.
+        by_vehicle: the vehicle itself keeps its height above the ground, so that points put in for their height are no
+            mission items.
     """
 
     ground: Terrain
     above_m: float
     tolerance_m: float
     follows: bool = True
+    by_vehicle: bool = False
     _known: dict[tuple[float, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def ground_at(self, place: Array) -> float:

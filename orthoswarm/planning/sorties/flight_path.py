@@ -29,6 +29,7 @@ class Flight:
         above_m: float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the
             ground.
         between: bool (n,), points on a straight way, put in for their height alone.
+        ground_by_vehicle: the vehicle keeps its height above the ground by itself, without those points.
     """
 
     home: Array
@@ -39,6 +40,7 @@ class Flight:
     home_z_m: float
     above_m: Array
     between: NDArray[np.bool_]
+    ground_by_vehicle: bool = False
 
     def track(self) -> Array:
         """The whole path from the ground on, (n, 3)."""
@@ -63,7 +65,8 @@ class Flight:
     @property
     def items(self) -> int:
         """Mission items that it needs: waypoints, camera commands, home, takeoff, speed and the end."""
-        return len(self.points) + int(np.count_nonzero(self.camera)) + 4
+        points = np.count_nonzero(~self.between) if self.ground_by_vehicle else len(self.points)
+        return int(points) + int(np.count_nonzero(self.camera)) + 4
 
 
 def make_flight(
@@ -146,6 +149,7 @@ def _raised(flat: list[tuple[Array, float, int]], start: Array, heights: FlightH
         heights.ground_at(home),
         above,
         np.array(between, bool),
+        heights.by_vehicle,
     )
 
 

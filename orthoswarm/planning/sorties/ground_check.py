@@ -112,6 +112,7 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
     top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)
     return OverGround(
         follows=heights.follows,
+        by_vehicle=heights.by_vehicle,
         nominal_m=heights.above_m,
         least_m=float(above.min()),
         most_m=float(above.max()),

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import Terrain
 
 TEXEL_M = 0.25
 """Side of a texture pixel, metres."""
@@ -79,6 +80,12 @@ class Scene:
             wall=self.wall.copy(),
             facade=self.facade.copy(),
         )
+
+    def bare_ground(self) -> Terrain:
+        """Heights of the bare ground, a node in the middle of each cell."""
+        g = self.cells
+        south = g.north - g.gsd_m * (g.height - 0.5)
+        return Terrain(g.west + 0.5 * g.gsd_m, south, g.gsd_m, self.dtm[::-1])
 
     def above_ground(self) -> NDArray[np.float32]:
         """Height of the surface over the bare ground, float32 (rows/2, columns/2)."""
