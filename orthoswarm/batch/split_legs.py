@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.legs import split_legs
+from orthoswarm.trajectory.legs import split_legs
 
 
 def legs_as_vehicles(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:

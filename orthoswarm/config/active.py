@@ -10,6 +10,7 @@ from typing import Any
 from orthoswarm.config.bundle import BundleConfig
 from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
+from orthoswarm.config.evaluation import EvaluationConfig
 from orthoswarm.config.features import FeaturesConfig
 from orthoswarm.config.flight import FlightConfig
 from orthoswarm.config.initial import InitialConfig
@@ -45,6 +46,7 @@ class Config:
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)

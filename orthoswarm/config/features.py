@@ -177,8 +177,8 @@ class FeaturesConfig:
     pair_sectors: int = 6
     """Directions over which a photo's neighbours are spread (chosen; not measured)."""
     pair_best_distance: float = 0.4
-    """Best distance of a pair as a share of its reach: nearer photos hold relief and tilt badly, farther ones
-    share little ground (chosen; not measured)."""
+    """Best distance of a pair as a share of its reach: nearer photos hold relief and tilt badly, farther ones share
+    little ground (chosen; not measured)."""
 
     # Tracks of matched features
     track_longest: int = 20

@@ -35,8 +35,8 @@ class FlightConfig:
     followed_photos: int = 10
     """Flights of fewer photos are matched in pairs instead of being followed (chosen; not measured)."""
     followed_overlap: float = 0.78
-    """Flights of less forward overlap are matched in pairs: of 150 corners 106 to 127 survive at an overlap of 0.90,
-    76 to 109 at 0.81, 51 at 0.72, 15 to 42 at 0.52 (measured on real and simulated sets)."""
+    """Flights of less forward overlap are matched in pairs: of 150 corners 106 to 127 survive at an overlap of 0.90, 76
+    to 109 at 0.81, 51 at 0.72, 15 to 42 at 0.52 (measured on real and simulated sets)."""
     followed_calibration_pairs: int = 3
     """With fewer pairs for the first focal length a flight is matched in pairs (chosen; not measured)."""
     followed_survival: float = 0.5

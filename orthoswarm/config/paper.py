@@ -18,8 +18,8 @@ class PaperConfig:
     line_sigmas: float = 3.0
     """... or within so many standard deviations of its photos across the line (chosen)."""
     receiver_sigma_m: float = 3.0
-    """Sigma of the bias of a receiver, an axis, metres, which no line reduces: twice
-    `records.position_sigma_m`, since drift is not estimated here (chosen)."""
+    """Sigma of the bias of a receiver, an axis, metres, which no line reduces: twice `records.position_sigma_m`, since
+    drift is not estimated here (chosen)."""
 
     # Scale and field of view (III.C, Eq. 4)
 

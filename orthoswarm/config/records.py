@@ -39,3 +39,20 @@ class RecordsConfig:
     """The same without a recorded attitude: 6 degrees of sway about straight down (chosen; not measured)."""
     pause_s: float = 60.0
     """Photos farther apart in time do not follow each other: the vehicle did something else between (chosen)."""
+
+    # Legs: straight runs of a flight
+    leg_reach: int = 3
+    """Frames before and after a frame between which the bend of the path is measured (chosen: one is noise)."""
+    leg_turn_deg: float = 35.0
+    """Least bend of the path at the corner between two legs, degrees (chosen; not measured)."""
+    leg_fewest: int = 3
+    """Fewer frames are no leg (chosen)."""
+    leg_jump_steps: float = 6.0
+    """A step of more than so many median steps and the next field ends a leg (chosen) ..."""
+    leg_jump_m: float = 30.0
+    """... metres (chosen: receivers' outliers are below)."""
+    one_way_deg: float = 35.0
+    """Legs within this angle of the longest lead in its direction, degrees; not the opposite one (chosen)."""
+    other_way_share: float = 0.3
+    """Ways in other directions, as a share of the longest leg, from which on drift and tilt can be told apart (chosen;
+    not measured)."""

@@ -18,16 +18,16 @@ class StrategyConfig:
     """The same from a start that is known to be near: wrong tracks, far off, weigh less from the first step on
     (chosen)."""
     flow_pairs: int = 6
-    """So many pairs of pictures must have told the focal length by their flow before an adjustment is held against
-    it (chosen; not measured)."""
+    """So many pairs of pictures must have told the focal length by their flow before an adjustment is held against it
+    (chosen; not measured)."""
     runaway_share: float = 0.15
-    """A focal length that leaves what flow told by this share is another minimum and not believed, unless flow
-    itself is so unsure (next field; chosen)."""
+    """A focal length that leaves what flow told by this share is another minimum and not believed, unless flow itself
+    is so unsure (next field; chosen)."""
     runaway_sigmas: float = 5.0
     """... and by so many of its sigmas (chosen; not measured)."""
     narrowest_fov_deg: float = 33.0
-    """Horizontal fields of view, degrees, to which recorded heights are believed, a little wider than those that
-    flow is believed to show (chosen)."""
+    """Horizontal fields of view, degrees, to which recorded heights are believed, a little wider than those that flow
+    is believed to show (chosen)."""
     widest_fov_deg: float = 137.0
     """The same at the other end."""
 
@@ -41,8 +41,7 @@ class StrategyConfig:
     at_rest_share: float = 0.03
     """A focal length that still moves by this share in three steps is not at rest (chosen; not measured)."""
     agreeing_share: float = 0.08
-    """Pictures that, set free, come to rest within this share of the recorded height do not contradict it
-    (chosen)."""
+    """Pictures that, set free, come to rest within this share of the recorded height do not contradict it (chosen)."""
 
     # On the map
     map_fov_sigmas: float = 6.0
@@ -51,21 +50,21 @@ class StrategyConfig:
     map_fov_deg: float = 4.0
     """... and by more than this, degrees (chosen; not measured)."""
     coherent_sigmas: float = 2.0
-    """Ties that agree on an offset of so many sigmas beside a picture show an error that the adjustment does not
-    know (chosen; not measured)."""
+    """Ties that agree on an offset of so many sigmas beside a picture show an error that the adjustment does not know
+    (chosen; not measured)."""
 
     # What the field of view's sigma takes in
     takeoff_level_sigma_m: float = 2.0
     """How well the takeoff spot is known to lie at the level of the ground, metres (chosen; not measured)."""
     no_height_share: float = 0.03
-    """Sigma of the focal length of followed pictures without a height, a share: relief and tilt tell it (15
-    flights: 2.5 % rms)."""
+    """Sigma of the focal length of followed pictures without a height, a share: relief and tilt tell it (15 flights:
+    2.5 % rms)."""
     one_way_fov_sigma_deg: float = 5.0
-    """The same of photos on one straight way, degrees: tilt, height and lens stand for each other (11 such legs of
-    a suburb: 5.6 rms)."""
+    """The same of photos on one straight way, degrees: tilt, height and lens stand for each other (11 such legs of a
+    suburb: 5.6 rms)."""
     decentred_share: float = 0.02
-    """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share
-    (measured: 1.6 %)."""
+    """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share (measured:
+    1.6 %)."""
 
     # A given height model
     dem_differs_m: float = 0.2
@@ -79,8 +78,8 @@ class StrategyConfig:
     sparse_fewest: int = 4
     """Fewer photos are not placed in flight (chosen; not measured)."""
     sparse_most: int = 60
-    """More photos that must be matched in pairs wait for the refinement: they cost fifty times as much as those
-    that can be followed."""
+    """More photos that must be matched in pairs wait for the refinement: they cost fifty times as much as those that
+    can be followed."""
     held_drift_m: float = 3.0
     """Sigma of a receiver's drift over one straight run, metres: tilt and drift stand for each other there. Without
     this hold single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -28,8 +29,6 @@ Array = NDArray[np.float64]
 
 STANDARD_COUNT = 30
 """Checkpoints that a statement by the standard needs at least."""
-_RELIEF_M = 10.0
-"""How far ground may lie off the mapped area's level, where rays do not say: holds a point that one photo shows."""
 _GRID = "+proj=longlat +datum=WGS84 +no_defs"
 
 
@@ -377,7 +376,7 @@ def photo_named(known: Mapping[str, Any], image: str) -> str | None:
 def intersection(
     rays: Sequence[tuple[Array, Array]],
     ground_z_m: float,
-    height_sigma_m: float = _RELIEF_M,
+    height_sigma_m: float | None = None,
     pixel_rad: float = 1e-3,
 ) -> Array:
     """East and north (2,) of the point nearest to all rays; its height is held by the ground where they do not hold it.
@@ -386,8 +385,9 @@ def intersection(
 
     Args:
         rays: camera position (3,) and unit direction (3,) of each. ground_z_m: level of the ground there, metres.
-        height_sigma_m: of the point's height over it. pixel_rad: sigma of a ray's direction, radians.
+        height_sigma_m: of the point's height over it, None: as configured. pixel_rad: sigma of a ray, radians.
     """
+    height_sigma_m = active().evaluation.relief_sigma_m if height_sigma_m is None else height_sigma_m
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for position, direction in rays:
         distance = max(position[2] - ground_z_m, 1.0)

@@ -6,9 +6,9 @@ import numpy as np
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.model.legs import split_legs
 from orthoswarm.refine.bundle.block_arrays import Ints
 from orthoswarm.refine.bundle.flight_records import Array, FlightRecords
+from orthoswarm.trajectory.legs import split_legs
 
 
 @dataclass(frozen=True, slots=True)

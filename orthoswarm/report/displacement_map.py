@@ -6,16 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.evaluation.displacement import Displacements, FieldSettings, displacement_field
 from orthoswarm.model.geo import GroundGrid
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-
-_BLOCK_PX, _SEARCH_PX, _APART_PX = 64, 15, 6
-_MOST_BLOCKS = 500
-_BAND_PX = 500_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +54,16 @@ def moved(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, grid: GroundGri
         valid: where the map means something.
         grid: of both.
     """
-    step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
+    config = active().evaluation
+    step = max(config.block_px, float(np.sqrt(seen.sum() / config.most_blocks)))
     settings = FieldSettings(
         gsd_m=grid.gsd_m,
-        block_m=_BLOCK_PX * grid.gsd_m,
+        block_m=config.block_px * grid.gsd_m,
         step_m=step * grid.gsd_m,
-        search_m=_SEARCH_PX * grid.gsd_m,
-        apart_m=_APART_PX * grid.gsd_m,
-        min_cover=0.9,
-        min_peak=0.4,  # a map of another day: a chance likeness reaches 0.3
+        search_m=config.search_px * grid.gsd_m,
+        apart_m=config.apart_px * grid.gsd_m,
+        min_cover=config.least_cover,
+        min_peak=config.least_peak,
     )
     field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
     found = field.matched
@@ -80,7 +78,7 @@ def _fields(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, settings: Fie
     )
     wide_ortho, wide_seen = np.pad(ortho, reach), np.pad(seen, reach)
     rows, columns = basemap.shape
-    at_once = step * max(1, _BAND_PX // columns // step)
+    at_once = step * max(1, active().evaluation.band_px // columns // step)
     for top in range(0, rows - side + 1, at_once):
         last = min(top + at_once, rows - side + 1) - 1
         end = last // step * step + side

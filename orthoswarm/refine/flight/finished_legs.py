@@ -3,12 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.legs import REACH, split_legs
+from orthoswarm.config import active
+from orthoswarm.trajectory.legs import split_legs
 
 Array = NDArray[np.float64]
-
-FINAL_AFTER_FRAMES = 2 * REACH
-"""So many frames after a leg's end neither its corner nor its frames can change; follows from `split_legs`."""
 
 
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
@@ -22,11 +20,13 @@ def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = Fal
     n = len(position)
     if n < 2:
         return []
+    # so many frames after a leg's end neither its corner nor its frames can change any more, see `split_legs`
+    settled = 2 * active().records.leg_reach
     leg = split_legs(position, time_s)
     ends = []
     for k in range(int(leg.max()) + 1):
         members = np.flatnonzero(leg == k)
         last = int(members[-1])
-        if over or last + FINAL_AFTER_FRAMES < n:
+        if over or last + settled < n:
             ends.append((int(members[0]), last))
     return ends

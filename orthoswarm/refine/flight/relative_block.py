@@ -10,7 +10,6 @@ from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.legs import leads_one_way, split_legs
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
@@ -21,6 +20,7 @@ from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.features.tracks import follow, predicted_homography
+from orthoswarm.trajectory.legs import leads_one_way, split_legs
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

@@ -16,7 +16,6 @@ from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
-from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.relative_block import Flight, open_flight
@@ -29,6 +28,7 @@ from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse
 from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.strategy.vehicle_passes import Options, from_flight, read_frame, relative
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
+from orthoswarm.trajectory.legs import leads_one_way
 
 __all__ = ["coarse_of", "local_origin", "place_in_flight"]
 

@@ -11,7 +11,6 @@ from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.legs import leads_one_way
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
@@ -35,6 +34,7 @@ from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
+from orthoswarm.trajectory.legs import leads_one_way
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.legs import split_legs
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
+from orthoswarm.trajectory.legs import split_legs
 
 
 def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):

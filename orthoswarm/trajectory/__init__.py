@@ -1,0 +1,1 @@
+"""The flown path: straight legs, and whether they lead in one direction only."""
