@@ -35,6 +35,27 @@ def test_commands_to_all_are_on_the_screen_in_every_mode(browser, size):
                 assert stage["height"] >= 2 / 3 * size[1]
 
 
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_a_dialog_leaves_the_commands_in_reach(browser, size):
+    with standing(vehicle(1)) as station, opened(browser, station.url, size) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile")
+        page.click("header .icon")
+        page.wait_for_selector("dialog[open]")
+        shown, bar = (page.locator(name).bounding_box() for name in ("dialog[open]", ".command-bar"))
+        assert shown["y"] >= 0 and shown["y"] + shown["height"] <= bar["y"]
+        page.click(".command[data-verb=rtl]")
+        confirm(page)
+        page.wait_for_selector("[data-outcome=done]")
+        assert len(station.commands("rtl")) == 1
+        assert page.evaluate("document.querySelector('#map').inert")
+        page.focus("dialog[open] select")
+        page.keyboard.press("Escape")
+        page.wait_for_selector("dialog[open]", state="detached")
+        assert not page.evaluate("document.querySelector('#map').inert")
+        assert page.evaluate("document.activeElement.className") == "icon"
+
+
 def test_one_press_and_one_confirmation_send_once_to_all(browser):
     with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:
         ok_for_all(station)

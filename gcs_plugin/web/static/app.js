@@ -19,10 +19,10 @@ const tabs = MODES.map((mode) => make("button", { type: "button", role: "tab", i
 const settingsBox = settingsDialog(refresh);
 const fold = button("", () => { setSetting("folded", !settings.folded); setMode(settings.mode); }, { class: "fold" });
 const header = make("header", {}, make("h1", {}, t("app.title")), make("div", { class: "tabs", role: "tablist", "aria-label": t("mode.title") }, ...tabs), problemList(), linkStatus(),
-  button("⚙", () => settingsBox.showModal(), { class: "icon", "aria-label": t("settings.title") }));
+  button("⚙", settingsBox.open, { class: "icon", "aria-label": t("settings.title") }));
 byId("top").replaceWith(header);
 document.body.prepend(linkBanner());
-document.body.append(settingsBox);
+document.body.append(settingsBox.box);
 
 // The map is loaded after the bar of commands: a browser without WebGL still commands vehicles.
 const { commandBar } = await import("/static/fly/command_bar.js");

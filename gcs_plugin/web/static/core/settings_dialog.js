@@ -1,6 +1,7 @@
 // Theme, units, coordinates, sound and the token.
 
 import { setToken, token } from "/static/core/api.js";
+import { dialogBox } from "/static/core/dialog.js";
 import { button, choice, labelled, make } from "/static/core/dom.js";
 import { setSetting, settings } from "/static/core/settings.js";
 import { t } from "/static/core/strings.js";
@@ -10,7 +11,7 @@ const CHOICES = { theme: ["dark", "sunlight"], units: ["metric", "us"], coordina
 export function settingsDialog(onToken) {
   const secret = make("input", { type: "password", autocomplete: "off", value: token() });
   const sound = make("input", { type: "checkbox", checked: settings.sound, onchange: () => setSetting("sound", sound.checked) });
-  const dialog = make("dialog", { class: "settings", "aria-labelledby": "settings-title" }, make("h2", { id: "settings-title" }, t("settings.title")),
+  const dialog = dialogBox({ class: "settings", "aria-labelledby": "settings-title" }, make("h2", { id: "settings-title" }, t("settings.title")),
     ...Object.entries(CHOICES).map(([name, values]) => labelled(t(`settings.${name}`), choice(values.map((value) => [value, t(`settings.${name}.${value}`)]), settings[name], (value) => setSetting(name, value)))),
     make("label", { class: "check" }, sound, make("span", {}, t("settings.sound"))),
     labelled(t("settings.token"), secret, t("settings.token.hint")),

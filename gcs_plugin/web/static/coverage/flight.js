@@ -2,6 +2,7 @@
 // the start. Nothing is uploaded before it is confirmed.
 
 import { get, post } from "/static/core/api.js";
+import { dialogBox } from "/static/core/dialog.js";
 import { button, make, setHidden, setText } from "/static/core/dom.js";
 import { state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
@@ -19,9 +20,9 @@ const warnings = make("ul", { class: "warnings" });
 const summary = make("ul", {});
 const planButton = button(t("gapflight.plan"), () => makePlan());
 const go = button(t("gapflight.confirm"), () => confirm(), { class: "primary" });
-const dialog = make("dialog", { class: "preflight", "aria-labelledby": "gap-flight-title" }, title, make("p", { class: "quiet" }, t("gapflight.about")), list, status, summary, warnings,
+const dialog = dialogBox({ class: "preflight", "aria-labelledby": "gap-flight-title" }, title, make("p", { class: "quiet" }, t("gapflight.about")), list, status, summary, warnings,
   make("div", { class: "row wrap" }, planButton, button(t("confirm.no"), () => dialog.close()), go));
-export const gapFlightDialog = () => dialog;
+export const gapFlightDialog = () => dialog.box;
 
 let rows = [];
 let plan = null;
@@ -38,7 +39,7 @@ export async function openGapFlight() {
   setPlan(null);
   list.replaceChildren();
   setText(status, "");
-  dialog.showModal();
+  dialog.open();
   try {
     const vehicles = await get("/api/coverage/vehicles");
     rows = vehicles.map((row) => {

@@ -2,6 +2,7 @@
 // item can be allowed by itself, never all at once.
 
 import { post } from "/static/core/api.js";
+import { dialogBox } from "/static/core/dialog.js";
 import { button, make, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { state } from "/static/core/store.js";
@@ -17,9 +18,9 @@ const checks = make("div", { class: "checks" });
 const status = make("p", { role: "status" });
 const again = button(t("preflight.again"), () => check());
 const go = button(t("preflight.start"), () => start(), { class: "primary" });
-const dialog = make("dialog", { class: "preflight", "aria-labelledby": "preflight-title" }, title, make("p", { class: "quiet" }, t("preflight.about")), facts, checks, status,
+const dialog = dialogBox({ class: "preflight", "aria-labelledby": "preflight-title" }, title, make("p", { class: "quiet" }, t("preflight.about")), facts, checks, status,
   make("div", { class: "row wrap" }, again, button(t("confirm.no"), () => dialog.close()), go));
-export const preflightDialog = () => dialog;
+export const preflightDialog = () => dialog.box;
 
 let plan = null;
 let names = {};
@@ -31,7 +32,7 @@ export function openPreflight(chosen, vehicles) {
   names = vehicles;
   allowed = {};
   setText(title, t("preflight.title", { n: plan.vehicles.length }));
-  dialog.showModal();
+  dialog.open();
   check();
 }
 
