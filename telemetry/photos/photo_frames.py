@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.frame import Frame
 from telemetry.photos.attitude import check_legs, decide
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import courses_deg, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+from telemetry.samples.sample_frame import fix_of
 
 _LEAST_HEIGHT_M = 1.0
 
@@ -44,22 +46,19 @@ def frames_of(
 def _frame(
     photo: PhotoTags, vehicle: str, image: str, height_m: float | None, angles: Angles, yaw_origin: str
 ) -> Frame:
-    def rad(value: float | None) -> float | None:
-        return None if value is None else math.radians(value)
-
     origin = dict(photo.origin)
     if angles[0] is not None and yaw_origin:
         origin["yaw"] = f"{yaw_origin} ({origin.get('angles') or origin.get('flight_yaw', '')})"
-    fix = Fix(
-        lat_deg=photo.lat_deg or 0.0,
-        lon_deg=photo.lon_deg or 0.0,
+    recorded = Sample(
+        lat_deg=photo.lat_deg,
+        lon_deg=photo.lon_deg,
         height_m=height_m,
         altitude_m=photo.altitude_m,
-        yaw_rad=rad(angles[0]),
-        pitch_rad=rad(angles[1]),
-        roll_rad=rad(angles[2]),
-        flight_yaw_rad=rad(photo.flight_deg[0]),
-        position_sigma_m=photo.position_sigma_m,
+        yaw_deg=angles[0],
+        pitch_deg=angles[1],
+        roll_deg=angles[2],
+        flight_yaw_deg=photo.flight_deg[0],
+        sigma_m=photo.position_sigma_m,
         height_is_ground=photo.height_is_ground,
     )
     return Frame(
@@ -67,7 +66,7 @@ def _frame(
         path=photo.path,
         vehicle=vehicle,
         time_s=photo.time_s,
-        fix=fix,
+        fix=fix_of(recorded),
         width=photo.width,
         height=photo.height,
         camera=photo.camera,

@@ -1,4 +1,4 @@
-"""A frame from a sample: for pictures whose pose is known already (live streams, camera events, posted pictures)."""
+"""Samples, in degrees, to the fixes of frames, in radians, and back: the only place where the two are converted."""
 
 import math
 from pathlib import Path
@@ -32,9 +32,25 @@ def frame_of(
     """
     if sample.lat_deg is None or sample.lon_deg is None:
         return None
-    fix = Fix(
-        lat_deg=sample.lat_deg,
-        lon_deg=sample.lon_deg,
+    return Frame(
+        image=image,
+        path=path,
+        vehicle=vehicle,
+        time_s=sample.time_s,
+        fix=fix_of(sample),
+        width=width,
+        height=height,
+        camera=camera or f"{width}x{height}",
+        fov_hint_rad=_radians(sample.fov_deg),
+        origin={"position": origin, "angles": origin} if origin else {},
+    )
+
+
+def fix_of(sample: Sample) -> Fix:
+    """The fix that a sample records; latitude 0 and longitude 0 where it has no position."""
+    return Fix(
+        lat_deg=sample.lat_deg or 0.0,
+        lon_deg=sample.lon_deg or 0.0,
         height_m=sample.height_m,
         altitude_m=sample.altitude_m,
         yaw_rad=_radians(sample.yaw_deg),
@@ -44,18 +60,30 @@ def frame_of(
         position_sigma_m=sample.sigma_m,
         height_is_ground=sample.height_is_ground and sample.height_m is not None,
     )
-    return Frame(
-        image=image,
-        path=path,
-        vehicle=vehicle,
-        time_s=sample.time_s,
-        fix=fix,
-        width=width,
-        height=height,
-        camera=camera or f"{width}x{height}",
-        fov_hint_rad=_radians(sample.fov_deg),
-        origin={"position": origin, "angles": origin} if origin else {},
+
+
+def sample_of(frame: Frame) -> Sample:
+    """The sample that a frame's fix records, in degrees to 13 digits: angles recorded in degrees come back exactly."""
+    fix = frame.fix
+    return Sample(
+        time_s=frame.time_s,
+        lat_deg=fix.lat_deg,
+        lon_deg=fix.lon_deg,
+        height_m=fix.height_m,
+        altitude_m=fix.altitude_m,
+        yaw_deg=_degrees(fix.yaw_rad),
+        pitch_deg=_degrees(fix.pitch_rad),
+        roll_deg=_degrees(fix.roll_rad),
+        flight_yaw_deg=_degrees(fix.flight_yaw_rad),
+        fov_deg=_degrees(frame.fov_hint_rad),
+        sigma_m=fix.position_sigma_m,
+        height_is_ground=fix.height_is_ground,
+        vehicle=frame.vehicle,
     )
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else float(f"{math.degrees(angle):.13g}")
 
 
 def _radians(angle: float | None) -> float | None:

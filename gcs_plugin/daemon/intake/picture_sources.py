@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.daemon.intake.pose_relay import pose_values
-from gcs_plugin.daemon.intake.posted_pose import PostedPose
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, pose_values
 from gcs_plugin.daemon.intake.watched_folder import FolderReader, PictureIntake
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from telemetry.live.live_poses import LinkPose

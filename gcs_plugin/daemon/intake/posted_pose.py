@@ -1,20 +1,27 @@
-"""The pose of a posted picture: JSON with degrees on the outside, a Frame inside."""
+"""The pose of a posted picture: a JSON object with degrees, as the journal keeps it, and the frame that it makes."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.frame import Frame
+from telemetry.samples import sample_frame
+from telemetry.samples.sample import Sample
 
 MOST_TEXT: Final = 1 << 20
 _OPTIONAL: Final = {
     "height_m": 1e5, "altitude_m": 1e5, "yaw_deg": 1e5, "pitch_deg": 1e5, "roll_deg": 1e5, "flight_yaw_deg": 1e5,
     "position_sigma_m": 1e6, "fov_deg": 179.0, "gps_fix": 8,
 }  # fmt: skip
+_FIELDS: Final = {
+    "lat_deg": "lat_deg", "lon_deg": "lon_deg", "height_m": "height_m", "altitude_m": "altitude_m",
+    "yaw_deg": "yaw_deg", "pitch_deg": "pitch_deg", "roll_deg": "roll_deg", "flight_yaw_deg": "flight_yaw_deg",
+    "fov_deg": "fov_deg", "position_sigma_m": "sigma_m",
+}  # fmt: skip
+"""Key of the JSON object -> field of a sample; both in degrees and metres."""
 _FIX_2D: Final = 2
 _NOWHERE_DEG: Final = 1e-3
 
@@ -97,21 +104,23 @@ def parse_time(value: Any) -> float | None:
 def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str, time_s: float | None,
              size: tuple[int, int]) -> Frame:  # fmt: skip
     """The frame of a stored picture and the pose values that `parse_pose` gave, with their `origin` if known."""
-    v = dict(values)
+    sample = Sample(time_s=time_s, **{field: values[key] for key, field in _FIELDS.items() if key in values})
+    sample.height_is_ground = bool(values.get("height_is_ground"))
+    if not is_position(values):
+        sample.lat_deg = sample.lon_deg = 0.0  # kept without a place, until the vehicle's link says where it was
+    frame = sample_frame.frame_of(sample, image=image, path=path, vehicle=vehicle, width=size[0], height=size[1])
+    assert frame is not None
+    return replace(frame, origin=values.get("origin", {}), damaged=bool(values.get("damaged")))
 
-    def radians(key: str) -> float | None:
-        return None if v.get(key) is None else math.radians(v[key])
 
-    lat_deg, lon_deg = (v["lat_deg"], v["lon_deg"]) if is_position(v) else (0.0, 0.0)
-    fix = Fix(
-        lat_deg, lon_deg, v.get("height_m"), v.get("altitude_m"), radians("yaw_deg"), radians("pitch_deg"),
-        radians("roll_deg"), radians("flight_yaw_deg"), v.get("position_sigma_m"), bool(v.get("height_is_ground")),
-    )  # fmt: skip
-    hint, origin = radians("fov_deg"), v.get("origin", {})
-    damaged = bool(v.get("damaged"))
-    return Frame(
-        image, path, vehicle, time_s, fix, size[0], size[1], fov_hint_rad=hint, origin=origin, damaged=damaged
-    )  # fmt: skip
+def pose_values(sample: Sample) -> dict[str, float] | None:
+    """What the journal keeps of a sample; None without a position."""
+    if not sample.has_position:
+        return None
+    values = {key: float(v) for key, field in _FIELDS.items() if (v := getattr(sample, field)) is not None}
+    if sample.height_is_ground:
+        values["height_is_ground"] = True
+    return values
 
 
 def _text(document: Mapping[str, Any], key: str, default: str | None = None) -> str:
