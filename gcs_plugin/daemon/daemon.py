@@ -119,14 +119,28 @@ class Daemon:
             self.journal, self.store, publisher, self.background, settings.basemap, self._published
         )
         self.refinement = SortieRefinement(
-            self.journal, self.store, publisher, self.workers, self.drawer, settings.basemap, self._published,
-            self._make_way, lambda: self.jobs.stopping,
-        )  # fmt: skip
+            journal=self.journal,
+            store=self.store,
+            publisher=publisher,
+            workers=self.workers,
+            drawer=self.drawer,
+            basemap=settings.basemap,
+            on_published=self._published,
+            make_way=self._make_way,
+            stopped=lambda: self.jobs.stopping,
+        )
         self.together = JointRefinement(self.journal, publisher, self.background, settings.basemap, self._published)
         self.exports = Exports(
-            settings, self.journal, self.store, self.layers, self.console, self.background,
-            lambda: self.drawer.area, self.vehicles, self._facts,
-        )  # fmt: skip
+            settings=settings,
+            journal=self.journal,
+            store=self.store,
+            layers=self.layers,
+            console=self.console,
+            workers=self.background,
+            area=lambda: self.drawer.area,
+            vehicles=self.vehicles,
+            facts=self._facts,
+        )
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
             "redraw": lambda job, tell: publisher.draw_again(self.background, tell), "export": self.exports.write,

@@ -114,9 +114,15 @@ class Exports:
             " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
         )
         return ExportTask(
-            self._settings.workspace, (), {}, area.epsg, area.gsd_m,
-            [frame_of_row(row, self._store) for row in rows],
-            {(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-            [kept / row["path"] for row in coarse], [kept / row["path"] for row in solutions],
-            self._settings.basemap, None if fov_deg is None else math.radians(fov_deg),
-        )  # fmt: skip
+            workspace=self._settings.workspace,
+            formats=(),
+            canvases={},
+            epsg=area.epsg,
+            gsd_m=area.gsd_m,
+            frames=[frame_of_row(row, self._store) for row in rows],
+            reasons={(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
+            coarse=[kept / row["path"] for row in coarse],
+            solutions=[kept / row["path"] for row in solutions],
+            basemap=self._settings.basemap,
+            fov_rad=None if fov_deg is None else math.radians(fov_deg),
+        )

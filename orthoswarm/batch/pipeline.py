@@ -117,7 +117,17 @@ def _load(run: RunContext, load: Load) -> RunState:
     dem = None if run.options.dem is None else _height_model(run, run.options.dem, grid, recorded)
     rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
     control = _control_points(run, grid, recorded, basemap)
-    return RunState(ingest, grid, recorded, gsd, basemap, dem, warnings, rejected, control_points=control)
+    return RunState(
+        ingest=ingest,
+        grid=grid,
+        recorded=recorded,
+        gsd_m=gsd,
+        basemap=basemap,
+        dem=dem,
+        warnings=warnings,
+        rejected=rejected,
+        control_points=control,
+    )
 
 
 def _control_points(run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None) -> list[Checkpoint]:

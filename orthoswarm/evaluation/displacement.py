@@ -275,18 +275,39 @@ def accuracy(displacements: Displacements, cover: Completeness, step_px: float) 
     count = len(matched)
     nan = float("nan")
     if not len(length):
-        return Accuracy(nan, nan, nan, nan, nan, nan, 1.0, 0.0, count, cover.share, nan, nan, displacements)
+        return Accuracy(
+            median_m=nan,
+            p90_m=nan,
+            p95_m=nan,
+            max_m=nan,
+            mean_east_m=nan,
+            mean_north_m=nan,
+            unmatched_share=1.0,
+            share_within_1m=0.0,
+            blocks=count,
+            completeness=cover.share,
+            sharpness=nan,
+            seam_p95_m=nan,
+            field=displacements,
+        )
     p50, p90, p95 = (float(x) for x in np.percentile(length, [50, 90, 95]))
     east, north = (float(x) for x in displacements.shift_m[matched].mean(0))
     jumps = np.array(list(_jumps(displacements, step_px)))
     return Accuracy(
-        p50, p90, p95, float(length.max()), east, north,
-        1.0 - len(length) / count,
-        float((length <= 1.0).sum()) / count,
-        count, cover.share, float(np.median(displacements.contrast[matched])),
-        float(np.percentile(jumps, 95)) if len(jumps) else nan,
-        displacements,
-    )  # fmt: skip
+        median_m=p50,
+        p90_m=p90,
+        p95_m=p95,
+        max_m=float(length.max()),
+        mean_east_m=east,
+        mean_north_m=north,
+        unmatched_share=1.0 - len(length) / count,
+        share_within_1m=float((length <= 1.0).sum()) / count,
+        blocks=count,
+        completeness=cover.share,
+        sharpness=float(np.median(displacements.contrast[matched])),
+        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else nan,
+        field=displacements,
+    )
 
 
 def _jumps(d: Displacements, step_px: float) -> Iterator[float]:

@@ -156,7 +156,15 @@ class _Pair:
             comparable = ground & self._mask(start, stop) if self._masked else ground
             own = min(rows, stop - start)
             inner = ortho_valid[reach : reach + own, reach : reach + self.shape[1]]
-            yield _Strip(start, ortho, ortho_valid, reference, comparable, inner, ground[:own])
+            yield _Strip(
+                first_row=start,
+                ortho=ortho,
+                ortho_valid=ortho_valid,
+                reference=reference,
+                comparable=comparable,
+                own_ortho=inner,
+                own_ground=ground[:own],
+            )
 
     def _read(self, which: int, start: int, stop: int, spare: int = 0) -> tuple[Floats, Mask]:
         """Grey values and validity of some rows, with `spare` more pixels on every side, invalid beyond the grid."""

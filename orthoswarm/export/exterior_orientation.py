@@ -70,7 +70,13 @@ def oriented_pictures(rows: Sequence[Row]) -> list[OrientedPicture]:
         image = str(row["image"])
         found.append(
             OrientedPicture(
-                names[image], image, row, camera_of(row), float(block["lat_deg"]), float(block["lon_deg"]), altitude
+                name=names[image],
+                image=image,
+                row=row,
+                camera=camera_of(row),
+                lat_deg=float(block["lat_deg"]),
+                lon_deg=float(block["lon_deg"]),
+                altitude_m=altitude,
             )
         )
     return found

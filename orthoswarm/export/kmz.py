@@ -49,7 +49,9 @@ def write_kmz(
             north, west = transform.f, transform.c
             box = (west, north + transform.e * height, west + transform.a * width, north)
             with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
-                _Pyramid(raster, archive, box, width, height, name, progress).write()
+                _Pyramid(
+                    raster=raster, archive=archive, box=box, width=width, height=height, name=name, progress=progress
+                ).write()
     except RasterioError as error:
         raise InputError(f"{source} cannot be read ({error}); make the map again") from None
 

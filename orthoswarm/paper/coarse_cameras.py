@@ -97,6 +97,14 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height
     cameras = CameraBlock(position, rotation, np.zeros(len(frames), np.int32), lens)
     return CoarseVehicle(
-        frames[0].vehicle, list(frames), leg, lines, cameras, sigma, float(fov_sigma), dict(pictures.damaged), warnings,
-        process_time() - began,
-    )  # fmt: skip
+        vehicle=frames[0].vehicle,
+        frames=list(frames),
+        leg=leg,
+        lines=lines,
+        cameras=cameras,
+        sigma_m=sigma,
+        fov_sigma_rad=float(fov_sigma),
+        damaged=dict(pictures.damaged),
+        warnings=warnings,
+        cpu_s=process_time() - began,
+    )

@@ -12,7 +12,6 @@ from time import perf_counter, process_time
 import numpy as np
 
 from orthoswarm.config import active
-from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
@@ -21,7 +20,8 @@ from orthoswarm.paper.coarse_cameras import CoarseOptions, CoarseVehicle, coarse
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
-from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.flight.solve_units import merge_units
+from orthoswarm.refine.flight.vehicle_refinement import refine_vehicle, unit_states, units_of_area
 
 Progress = Callable[[str, int, int], None]
 
@@ -36,9 +36,14 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class PaperState:
-    """What a vehicle leaves for its neighbours: centre and shift of each leg that was found on the map."""
+    """What a unit of a vehicle leaves.
+
+    Attributes:
+        found: centre and shift of each leg that was found on the map, for neighbours. frames: those that were solved.
+    """
 
     found: list[tuple[Array, Array]]
+    frames: list[Frame]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +65,24 @@ class PaperRefiner:
         Raises:
             OrthoSwarmError: if there are no frames.
         """
-        if not frames:
-            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
-        units = split_units({frames[0].vehicle: frames})
         held = [pair for n in neighbours for pair in _found(n)]
-        grid = LocalGrid(self.epsg)
-        return _refine(units, held, basemap, grid, self.origin, self.options, serial, None).fine[0]
+
+        def solve(units: list[list[Frame]]) -> Solution:
+            grid = LocalGrid(self.epsg)
+            return _refine(units, held, basemap, grid, self.origin, self.options, serial, None).fine[0]
+
+        return refine_vehicle(frames, self.epsg, solve)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Place a vehicle again beside neighbours; only one that found no leg itself can gain by them."""
         if _found(solution) or not any(_found(n) for n in neighbours):
             return solution
-        return self.refine([p.frame for p in solution.placed], neighbours, basemap)
+        now = self.refine([p.frame for p in solution.placed], neighbours, basemap)
+        return replace(now, dropped={**solution.dropped, **now.dropped})
 
     def refined_frames(self, solution: Solution) -> list[Frame]:
-        """All frames of a solution (placement.Refiner)."""
-        return [p.frame for p in solution.placed]
+        """The frames of the vehicle's units (placement.Refiner)."""
+        return [frame for state in unit_states(solution) for frame in state.frames]
 
     def refine_batch(
         self,
@@ -85,15 +92,12 @@ class PaperRefiner:
         progress: Progress | None = None,
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner); the paper's ground is flat."""
-        if not vehicles:
-            raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
-        grid, units = LocalGrid(self.epsg), split_units(vehicles)
+        grid, units = LocalGrid(self.epsg), units_of_area(vehicles)
         return _refine(units, [], basemap, grid, self.origin, self.options, run, progress)
 
 
 def _found(solution: Solution) -> list[tuple[Array, Array]]:
-    states = solution.state if isinstance(solution.state, list) else [solution.state]
-    return [pair for state in states if isinstance(state, PaperState) for pair in state.found]
+    return [pair for state in unit_states(solution) for pair in state.found]
 
 
 def _refine(
@@ -210,14 +214,23 @@ def _solution(
     if had_map and not matched:
         how = "neighbours carry it" if shift is not None else "it lies in the GPS frame"
         warnings.append(f"no leg of this flight was found on the map; {how}")
-    state = PaperState([(f.centre, f.shift) for f in matched.values()])
+    state = PaperState([(f.centre, f.shift) for f in matched.values()], [p.frame for p in placed])
     timings = {"relative": vehicle.cpu_s, "patches": sum(f.cpu_s for f in fits.values())}
     timings["cameras"] = process_time() - began
     return Solution(
-        vehicle.vehicle, placed, dropped, _legs(vehicle, fits, sigmas, shift is not None),
-        float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)), float(np.degrees(vehicle.fov_sigma_rad)),
-        None, 0.0, (0.0, 0.0), state, warnings, timings,
-    )  # fmt: skip
+        vehicle=vehicle.vehicle,
+        placed=placed,
+        dropped=dropped,
+        legs=_legs(vehicle, fits, sigmas, shift is not None),
+        fov_deg=float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)),
+        fov_sigma_deg=float(np.degrees(vehicle.fov_sigma_rad)),
+        terrain=None,
+        ground_z_m=0.0,
+        map_lean=(0.0, 0.0),
+        state=state,
+        warnings=warnings,
+        timings=timings,
+    )
 
 
 def _carried(

@@ -132,7 +132,15 @@ def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
     if clock_doubt < _CLOCK_DOUBT:
         shifted = _without_coincidences(problem, inside, shifted, offset, drift)
     offset += float(photos[0]) - middle
-    return SequenceMatch(single, inside, shifted, offset, drift, resolution, problem.jitter_s)
+    return SequenceMatch(
+        events=single,
+        first=inside,
+        probability=shifted,
+        offset_s=offset,
+        drift=drift,
+        resolution_s=resolution,
+        jitter_s=problem.jitter_s,
+    )
 
 
 def _without_coincidences(

@@ -182,7 +182,13 @@ def pictures(
 
 def _picture(taken: Candidate) -> Picture:
     return Picture(
-        taken.number, taken.sample, taken.origin, to_rgb(taken.frame), taken.video_s, taken.packet, taken.damaged
+        number=taken.number,
+        sample=taken.sample,
+        origin=taken.origin,
+        rgb=to_rgb(taken.frame),
+        video_s=taken.video_s,
+        packet=taken.packet,
+        damaged=taken.damaged,
     )
 
 

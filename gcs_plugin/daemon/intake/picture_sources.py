@@ -56,14 +56,14 @@ class Source:
         self._reader: FolderReader | None = None
         if not is_stream(where):
             desk = PictureIntake(
-                vehicle,
-                self._keep,
-                partial(pose_at, vehicle),
-                partial(link_log, vehicle),
-                tell,
-                partial(settled, vehicle),
-                cache,
-                self._stop,
+                vehicle=vehicle,
+                keep=self._keep,
+                pose_at=partial(pose_at, vehicle),
+                link_log=partial(link_log, vehicle),
+                tell=tell,
+                settled=partial(settled, vehicle),
+                cache=cache,
+                stop=self._stop,
             )
             self._reader = FolderReader(Path(where), desk)
         run = self._stream if self._reader is None else self._reader.run

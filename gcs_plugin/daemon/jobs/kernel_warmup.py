@@ -87,8 +87,29 @@ def made_up_flight(ground: NDArray[np.float32], folder: Path, vehicle: str) -> l
         _photograph(ground, camera, path)
         lat, lon = (float(v) for v in grid.to_geographic(position[:2]))
         turn = float(grid.convergence_rad(lat, lon))
-        fix = Fix(lat, lon, _HEIGHT_M, None, yaw + turn, NADIR_PITCH_RAD, 0.0, None, None, False)
-        frames.append(Frame(path.name, path, vehicle, 1e9 + number, fix, _LENS.width, _LENS.height))
+        fix = Fix(
+            lat_deg=lat,
+            lon_deg=lon,
+            height_m=_HEIGHT_M,
+            altitude_m=None,
+            yaw_rad=yaw + turn,
+            pitch_rad=NADIR_PITCH_RAD,
+            roll_rad=0.0,
+            flight_yaw_rad=None,
+            position_sigma_m=None,
+            height_is_ground=False,
+        )
+        frames.append(
+            Frame(
+                image=path.name,
+                path=path,
+                vehicle=vehicle,
+                time_s=1e9 + number,
+                fix=fix,
+                width=_LENS.width,
+                height=_LENS.height,
+            )
+        )
     return frames
 
 

@@ -98,9 +98,15 @@ class LegPlacement:
         before = self._row(job)
         small = {f.image: thumbnails[f.image] for f in frames if f.image in thumbnails}
         task = SolveTask(
-            frames, area.epsg, area.origin, self.basemap, small, self._others(job, frames), target,
-            None if before is None else self.publisher.solutions / before["path"],
-        )  # fmt: skip
+            frames=frames,
+            epsg=area.epsg,
+            origin=area.origin,
+            basemap=self.basemap,
+            thumbnails=small,
+            neighbours=self._others(job, frames),
+            target=target,
+            before=None if before is None else self.publisher.solutions / before["path"],
+        )
         solved = self.workers.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}
         fresh = {leg["images"][0] for leg in solved.legs if "images" in leg}

@@ -91,9 +91,15 @@ class SortieRefinement:
         tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
         target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         task = SolveTask(
-            frames, area.epsg, area.origin, self.basemap, thumbnails, self._neighbours(job, near(frames, area.epsg)),
-            target, None if before is None else self.publisher.solutions / before["path"],
-        )  # fmt: skip
+            frames=frames,
+            epsg=area.epsg,
+            origin=area.origin,
+            basemap=self.basemap,
+            thumbnails=thumbnails,
+            neighbours=self._neighbours(job, near(frames, area.epsg)),
+            target=target,
+            before=None if before is None else self.publisher.solutions / before["path"],
+        )
         return before, target, len(frames), self.workers.run(solve if before is None else register_late, task)
 
     def _show(self, job: Job, tell: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:

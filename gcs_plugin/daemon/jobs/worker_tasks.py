@@ -86,11 +86,17 @@ class _Watch:
         self, solution: Solution, frames: Sequence[Frame], sortie: SolutionFile, changed: BoundingBox
     ) -> SortieResult:
         return SortieResult(
-            {p.frame.image: (p.stage, p.sigma_m) for p in solution.placed}, dict(solution.dropped),
-            [_leg(leg, frames) for leg in solution.legs], solution.fov_deg, solution.fov_sigma_deg,
-            list(solution.warnings), visible_ground(sortie.solution.placed, sortie.terrain), changed,
-            time.process_time() - self._cpu, time.monotonic() - self._wall,
-        )  # fmt: skip
+            stages={p.frame.image: (p.stage, p.sigma_m) for p in solution.placed},
+            dropped=dict(solution.dropped),
+            legs=[_leg(leg, frames) for leg in solution.legs],
+            fov_deg=solution.fov_deg,
+            fov_sigma_deg=solution.fov_sigma_deg,
+            warnings=list(solution.warnings),
+            bounds=visible_ground(sortie.solution.placed, sortie.terrain),
+            changed=changed,
+            cpu_s=time.process_time() - self._cpu,
+            wall_s=time.monotonic() - self._wall,
+        )
 
 
 def solve(task: SolveTask) -> SortieResult:

@@ -91,7 +91,16 @@ def open_flight(
     if unknown and survived[1:].min() < c.unbroken_survival:
         return None
     adjustment = _begin(records, pictures, calibration, tracks)
-    return Flight(frames, records, leg, pictures, calibration, adjustment, survived, list(calibration.warnings))
+    return Flight(
+        frames=frames,
+        records=records,
+        leg=leg,
+        pictures=pictures,
+        calibration=calibration,
+        adjustment=adjustment,
+        survived=survived,
+        warnings=list(calibration.warnings),
+    )
 
 
 def weigh_records(flight: Flight) -> None:
@@ -181,15 +190,15 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
         drift_sigma=usual.drift_sigma_m if not np.isfinite(records.position_sigma).all() else 0.0,
     )
     priors = Priors(
-        position,
-        np.column_stack([horizontal, horizontal, z_sigma]),
-        rotation,
-        np.column_stack([tilt, tilt, yaw]),
-        records.velocity(),
-        np.zeros(n, np.int32),
-        (model,),
-        np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
-        np.array([[*c.lens_sigma, 0, 0, 0]]),
+        position=position,
+        position_sigma=np.column_stack([horizontal, horizontal, z_sigma]),
+        rotation=rotation,
+        rotation_sigma=np.column_stack([tilt, tilt, yaw]),
+        velocity=records.velocity(),
+        group=np.zeros(n, np.int32),
+        models=(model,),
+        lens=np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
+        lens_sigma=np.array([[*c.lens_sigma, 0, 0, 0]]),
     )
     return Adjustment.begin(cameras, tracks, priors, first_points(cameras, tracks))
 

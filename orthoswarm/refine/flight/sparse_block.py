@@ -101,9 +101,17 @@ def make_flight(
     leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
     held = start.placed[rows].astype(np.float64)
     return Flight(
-        frames, records.with_yaw(yaw), leg, pictures, calibration, adjustment, held, list(mine), sparse=True,
+        frames=frames,
+        records=records.with_yaw(yaw),
+        leg=leg,
+        pictures=pictures,
+        calibration=calibration,
+        adjustment=adjustment,
+        survived=held,
+        warnings=list(mine),
+        sparse=True,
         focal_sigma=focal_sigma,
-    )  # fmt: skip
+    )
 
 
 def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:

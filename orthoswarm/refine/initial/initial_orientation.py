@@ -191,7 +191,16 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
         priors = _network_priors(records, heights, relative, metres, lens_of, tilt_px, by_height)
         network = solve_network(graph, records, yaw, priors)
         metres = network.metres
-    return _Solved(shape, graph, heights, relative, yaw, yaw_known, scale_known, network)
+    return _Solved(
+        shape=shape,
+        graph=graph,
+        heights=heights,
+        relative=relative,
+        yaw=yaw,
+        yaw_known=yaw_known,
+        scale_known=scale_known,
+        network=network,
+    )
 
 
 def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:

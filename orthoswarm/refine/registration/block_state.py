@@ -131,20 +131,20 @@ def to_solution(
     dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
     lens = flight.adjustment.cameras.lens[0]
     return Solution(
-        state.vehicle,
-        placed,
-        dropped,
-        leg_states(state),
-        float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
-        state.fov_sigma_deg,
-        terrain,
-        ground_z_m,
-        map_lean,
-        state,
-        findings(state),
-        dict(state.timings),
-        _mean_gsd(cameras, flight),
-        state.false_matches,
+        vehicle=state.vehicle,
+        placed=placed,
+        dropped=dropped,
+        legs=leg_states(state),
+        fov_deg=float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
+        fov_sigma_deg=state.fov_sigma_deg,
+        terrain=terrain,
+        ground_z_m=ground_z_m,
+        map_lean=map_lean,
+        state=state,
+        warnings=findings(state),
+        timings=dict(state.timings),
+        gsd_m=_mean_gsd(cameras, flight),
+        false_matches=state.false_matches,
     )
 
 

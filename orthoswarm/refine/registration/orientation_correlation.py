@@ -198,7 +198,15 @@ def strip_and_map(
     if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < active().registration.strip_map_share:
         return None
     grid = GroundGrid.around(basemap.epsg, bounds, gsd_m)
-    return Strip(gray, valid, ground, known, reach, gsd_m, (grid.west - bounds[0], grid.north - bounds[3]))
+    return Strip(
+        gray=gray,
+        valid=valid,
+        ground=ground,
+        known=known,
+        reach=reach,
+        gsd_m=gsd_m,
+        offset=(grid.west - bounds[0], grid.north - bounds[3]),
+    )
 
 
 Found = tuple[float, float, float, float]

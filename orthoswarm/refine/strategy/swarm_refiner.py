@@ -14,14 +14,15 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.errors import AdjustmentError, OrthoSwarmError
+from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
 from orthoswarm.model.task_runner import Run, serial
-from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
-from orthoswarm.refine.flight.solve_units import merge_units, split_units
-from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours, place_by_neighbours, split_refinable
+from orthoswarm.mosaic.recorded_pose import recorded_cameras
+from orthoswarm.refine.flight.solve_units import merge_units
+from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
+from orthoswarm.refine.flight.vehicle_refinement import as_recorded, refine_vehicle, unit_states, units_of_area
 from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import lay_beside
 from orthoswarm.refine.strategy.first_pass import first_passes
@@ -63,27 +64,13 @@ class SwarmRefiner:
         Raises:
             OrthoSwarmError: if nothing can be made of the frames.
         """
-        if not frames:
-            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
-        recorded = recorded_cameras(frames, LocalGrid(self.epsg))
-        kinds = split_refinable(recorded.placed)
-        if kinds.fit:
-            solution = self._refined(hint_lone_photos(kinds.fit), neighbours, basemap)
-        else:
-            solution = _as_recorded(frames[0].vehicle, kinds.still)
-        odd = place_by_neighbours(kinds.odd, kinds.fit, solution.placed)
-        return replace(
-            solution,
-            placed=[*solution.placed, *odd],
-            dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
-            warnings=[*solution.warnings, *kinds.warnings],
-        )
-
-    def _refined(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        parts = split_units({frames[0].vehicle: frames})
-        own = [solo(part, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options) for part in parts]
         others = [state for n in neighbours for state in states_of(n)]
-        return self._second_pass(own, others, basemap)
+
+        def solve(units: list[list[Frame]]) -> Solution:
+            place = partial(solo, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
+            return self._second_pass([place(unit) for unit in units], others, basemap)
+
+        return refine_vehicle(frames, self.epsg, solve)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.
@@ -149,10 +136,7 @@ class SwarmRefiner:
         progress: Progress | None = None,
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner)."""
-        if not vehicles:
-            raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
-        grid, origin = LocalGrid(self.epsg), self.origin
-        units = split_units(vehicles)
+        grid, origin, units = LocalGrid(self.epsg), self.origin, units_of_area(vehicles)
         states, lost = first_passes(units, basemap, grid, origin, self.options, run, progress)
         if not states:
             raise AdjustmentError(lost[0])
@@ -173,25 +157,16 @@ class SwarmRefiner:
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
-def _as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
-    """A vehicle placed as recorded: it did not move, so that its pictures have no scale of their own."""
-    fov = float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan")
-    sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
-    legs = [Leg(vehicle, 0, len(placed) - 1, "failed", 0.0, sigma)] if placed else []
-    return Solution(vehicle, list(placed), {}, legs, fov, float("nan"), None)
-
-
 def states_of(solution: Solution) -> list[VehicleState]:
     """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
-    state = solution.state
-    return [] if state is None else list(state) if isinstance(state, list) else [state]
+    return unit_states(solution)
 
 
 def _unrefined(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
     """A vehicle that could not be refined, placed as recorded."""
     placed = recorded_cameras(frames, grid).placed
     warning = f"it could not be refined ({why}); it lies where its receiver says"
-    return replace(_as_recorded(frames[0].vehicle, placed), warnings=[warning])
+    return replace(as_recorded(frames[0].vehicle, placed), warnings=[warning])
 
 
 def lay_lost_beside(

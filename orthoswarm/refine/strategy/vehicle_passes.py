@@ -142,10 +142,21 @@ def from_flight(
     watch.lap("relative")
     none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     state = VehicleState(
-        flight.frames[0].vehicle, flight, coarse, surface, MapTies.none(), none, (none, np.zeros(0)),
-        (np.zeros((0, 3)), np.zeros(0)), False, 0.0, coarse_sigma, coarse_sigma, fov_sigma,
+        vehicle=flight.frames[0].vehicle,
+        flight=flight,
+        coarse=coarse,
+        surface=surface,
+        ties=MapTies.none(),
+        matches=none,
+        roofs=(none, np.zeros(0)),
+        dense=(np.zeros((0, 3)), np.zeros(0)),
+        on_map=False,
+        confidence=0.0,
+        sigma_m=coarse_sigma,
+        coarse_sigma_m=coarse_sigma,
+        fov_sigma_deg=fov_sigma,
         coarse_surface=surface,
-    )  # fmt: skip
+    )
     if basemap is not None:
         state.had_map = True
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)

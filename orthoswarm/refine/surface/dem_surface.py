@@ -160,7 +160,16 @@ def fit_over_dem(
     rest = replace(nodes, z=difference * _difference_share(difference, left.support, off))
     good = np.isfinite(over).all(1) & (sigma_z > 0)
     pull = robust_centre(over[good, 2] - rest.height(over[good, :2]) - shift)
-    return DemFit(dem, bounds, most_nodes, shift, rest, pull, sd, beyond), off
+    return DemFit(
+        dem=dem,
+        bounds=bounds,
+        most_nodes=most_nodes,
+        shift_m=shift,
+        rest=rest,
+        points_above_m=pull,
+        sd_m=sd,
+        beyond=beyond,
+    ), off
 
 
 def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:

@@ -111,7 +111,17 @@ def fit_terrain(
     flat = _shrink(sd, s.flat_sd_m) == 0.0
     ground = lower_flank(points[used, 2], sigma_z[used]) if flat else median
     pull = robust_centre(points[used, 2] - ground if flat else above)
-    return TerrainFit(terrain, weight, nodes.kappa, sd, median, ground, pull, nodes.support, s)
+    return TerrainFit(
+        terrain=terrain,
+        weight=weight,
+        kappa=nodes.kappa,
+        sd_m=sd,
+        median_m=median,
+        ground_m=ground,
+        points_above_m=pull,
+        support=nodes.support,
+        settings=s,
+    )
 
 
 def lower_flank(height: Array, sigma: Array | None = None) -> float:

@@ -47,4 +47,12 @@ def parse_dji(note: bytes) -> DjiNote | None:
         return None
     speed = (floats[3], floats[4], floats[5]) if {3, 4, 5} <= floats.keys() else None
     pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
-    return DjiNote(pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll, speed)
+    return DjiNote(
+        flight_pitch_deg=pitch,
+        flight_yaw_deg=yaw,
+        flight_roll_deg=roll,
+        camera_pitch_deg=camera_pitch,
+        camera_yaw_deg=camera_yaw,
+        camera_roll_deg=camera_roll,
+        speed=speed,
+    )

@@ -63,7 +63,16 @@ def read_geo_txt(path: Path) -> PoseTable:
             table.useless += 1
             continue
         n: list[float | None] = [v if math.isfinite(v) else None for v in numbers] + [None] * 8
-        row = PoseRow(n[1], n[0], n[2], None, n[3], n[4], n[5], n[6])
+        row = PoseRow(
+            lat_deg=n[1],
+            lon_deg=n[0],
+            altitude_m=n[2],
+            height_m=None,
+            yaw_deg=n[3],
+            pitch_deg=n[4],
+            roll_deg=n[5],
+            sigma_m=n[6],
+        )
         if row.yaw_deg == row.pitch_deg == row.roll_deg == 0.0:
             row.yaw_deg = row.pitch_deg = row.roll_deg = None  # fillers before the accuracies
         if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:

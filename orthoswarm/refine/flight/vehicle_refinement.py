@@ -1,0 +1,76 @@
+"""What every refiner does with one vehicle's frames before and after its units are solved."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Leg, PlacedFrame, Solution
+from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
+from orthoswarm.refine.flight.solve_units import split_units
+from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
+
+
+def refine_vehicle(frames: Sequence[Frame], epsg: int, solve: Callable[[list[list[Frame]]], Solution]) -> Solution:
+    """Solve one vehicle's frames as far as they can be solved, and place the others.
+
+    Frames too few of their camera and size move as their solved neighbours do; a vehicle that took all pictures at one
+    spot stays as recorded; a frame whose position cannot be true is left out.
+
+    Args:
+        frames: of one vehicle, in order of time. epsg: the area's grid.
+        solve: solves the vehicle's units (frames of one lens each) to one solution.
+
+    Raises:
+        OrthoSwarmError: if there are no frames, or nothing can be made of them.
+    """
+    if not frames:
+        raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+    recorded = recorded_cameras(frames, LocalGrid(epsg))
+    kinds = split_refinable(recorded.placed)
+    vehicle = frames[0].vehicle
+    if kinds.fit:
+        solution = solve(split_units({vehicle: hint_lone_photos(kinds.fit)}))
+    else:
+        solution = as_recorded(vehicle, kinds.still)
+    return replace(
+        solution,
+        placed=[*solution.placed, *place_by_neighbours(kinds.odd, kinds.fit, solution.placed)],
+        dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
+        warnings=[*solution.warnings, *kinds.warnings],
+    )
+
+
+def units_of_area(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
+    """The units of all vehicles of an area, frames of one lens each.
+
+    Raises:
+        OrthoSwarmError: if there is no vehicle.
+    """
+    if not vehicles:
+        raise OrthoSwarmError("there is no vehicle with frames to refine; check the inputs")
+    return split_units(vehicles)
+
+
+def unit_states(solution: Solution) -> list[Any]:
+    """What the refiner left in a solution for each of the vehicle's units."""
+    state = solution.state
+    return [] if state is None else list(state) if isinstance(state, list) else [state]
+
+
+def as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
+    """A vehicle placed as recorded: it did not move, so that its pictures have no scale of their own."""
+    sigma = float(np.median([p.sigma_m for p in placed])) if placed else float("nan")
+    return Solution(
+        vehicle=vehicle,
+        placed=list(placed),
+        dropped={},
+        legs=[Leg(vehicle, 0, len(placed) - 1, "failed", 0.0, sigma)] if placed else [],
+        fov_deg=float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan"),
+        fov_sigma_deg=float("nan"),
+        terrain=None,
+    )
