@@ -1,1 +1,1 @@
-"""Bundle adjustment: normal equations, priors, robust weights, covariance, and the arrays that it works on."""
+"""Bundle adjustment: normal equations, priors, robust weights, covariance and its arrays."""

@@ -1,7 +1,7 @@
 """Bundle adjustment: one robust least-squares problem over cameras, lenses, biases, drift and tie points.
 
-Beyond the paper: instead of a line a leg and a homography a leg, all errors that a swarm's records have are unknowns
-with priors (Förstner and Wrobel 2016, chapter 15), held together by tie points, ground heights and ties to the map.
+Beyond the paper: instead of one line and one homography for each leg, the errors of the records are unknowns
+with priors (Förstner and Wrobel 2016, chapter 15). Tie points, ground heights and map ties constrain them.
 """
 
 from dataclasses import dataclass, field, replace
@@ -23,9 +23,9 @@ _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 @dataclass(frozen=True, slots=True)
 class MapTies:
-    """Horizontal control points that image matching found on the map.
+    """Horizontal control points, found by matching pictures with the map.
 
-    What was compared is ground, which a map shows in its place, however much its roofs lean.
+    They lie on the ground: a map shows that in its true place, but roofs displaced.
 
     Attributes:
         point: int32 (Q,), tie point, each at most once. xy: float64 (Q, 2), its place on the map, local frame.
@@ -44,7 +44,7 @@ class MapTies:
 
 @dataclass(frozen=True, slots=True)
 class HeightPrior:
-    """Prior of the points' heights.
+    """Prior on the points' heights.
 
     Attributes:
         height: float64 (P,) expected Z, metres. sigma: robust sigma, metres; soft_sigma: sigma of a second, weak prior
@@ -62,15 +62,15 @@ class Adjustment:
     """State of a bundle adjustment; `step` improves it in place.
 
     Attributes:
-        cameras: exterior and interior orientation now. tracks: observations, sorted by point. priors: see there.
-        points: float64 (P, 3), tie points. free: bool (N,), False for cameras that are held.
+        cameras: present exterior and interior orientation. tracks: observations, sorted by point. priors: see there.
+        points: float64 (P, 3), tie points. free: bool (N,), False for cameras that are held fixed.
         layout: of the common unknowns. common: float64 (layout.size,), their values (the lens columns hold differences
             to the prior's start).
         start: int64 (P + 1,), first observation of each point. slot: int32 (N,), place of each camera in the band, -1
             if held. bandwidth: of the band, in cameras.
         obs_weight: float64 (M,), robust weights of the observations at the last step.
         point_inverse: float64 (P, 3, 3), inverse of each point's own block (its covariance with the cameras held).
-        tie_residual: float64 (Q, 2), metres, at the last step. cost: of the observations at the last step.
+        tie_residual: float64 (Q, 2), metres, at the last step. cost: of all observations at the last step.
         information: float64 (layout.size, layout.size), inverse covariance of the common unknowns at the last step
             (empty before it).
     """
@@ -95,7 +95,7 @@ class Adjustment:
     def begin(
         cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
     ) -> "Adjustment":
-        """Set up; observations are sorted by point, cameras are ordered for a narrow band."""
+        """Set up the state: observations sorted by point, cameras ordered for a narrow band."""
         order = np.lexsort((tracks.camera, tracks.point))
         tracks = Tracks(tracks.camera[order], tracks.point[order], tracks.uv[order], tracks.sigma_px[order])
         free = np.ones(len(cameras), bool) if free is None else free
@@ -117,7 +117,7 @@ class Adjustment:
         )
 
     def copy(self) -> "Adjustment":
-        """A state to go back to where steps lead astray: steps of one leave the other as it is."""
+        """An independent copy, to return to if further steps make the solution worse."""
         return replace(
             self,
             cameras=self.cameras.copy(),
@@ -139,11 +139,11 @@ class Adjustment:
 
         Args:
             c: robust scale of the reprojection residuals, squared sigmas. heights: prior of the points' heights.
-            ties: to the map. tie_c: their robust scale. damping: share added to the diagonal of the cameras' part
+            ties: map ties. tie_c: their robust scale. damping: share added to the diagonal of the cameras' part
                 (None: as configured).
 
         Returns:
-            The largest move of a camera in metres.
+            The largest change of a camera position, metres.
 
         Raises:
             AdjustmentError: if the system is singular even with its priors (NaN in the input).
@@ -176,7 +176,7 @@ class Adjustment:
         ties: MapTies | None = None,
         tie_c: float | None = None,
     ) -> tuple[Array, Array]:
-        """Covariances at the present state; the points are eliminated, not held.
+        """Covariances at the present state, with the points eliminated (not held fixed).
 
         Args:
             chosen: (K,) free cameras. c, heights, ties, tie_c: as for `step`.
@@ -199,7 +199,7 @@ class Adjustment:
         return out, np.asarray(inverse, np.float64)
 
     def _assemble(self, c: float, heights: HeightPrior, ties: MapTies, tie_c: float | None) -> BandedSystem:
-        """The reduced normal equations at the present state."""
+        """Build the reduced normal equations at the present state."""
         free, lenses, points = int(self.free.sum()), len(self.cameras.lens), len(self.points)
         system = BandedSystem.empty(
             free=free,
@@ -251,7 +251,7 @@ class Adjustment:
         return system
 
     def residuals(self) -> Array:
-        """Reprojection residuals (M, 2) in pixels now."""
+        """Present reprojection residuals (M, 2), pixels."""
         out = np.empty((len(self.tracks.point), 2))
         normal_equations.residuals(
             position=self.cameras.position,

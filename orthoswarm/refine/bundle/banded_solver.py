@@ -19,7 +19,7 @@ _BLOCK_COLUMNS, _NARROW_ROWS = 64, 600
 
 @dataclass(frozen=True, slots=True)
 class BandedSystem:
-    """Reduced normal equations: banded cameras, a border of common unknowns, and what back substitution needs.
+    """Reduced normal equations: banded cameras, a border of common unknowns, and the blocks for the back substitution.
 
     Attributes (n free cameras, s common unknowns, L lenses, P points, M observations):
         band: float64 (6 (bandwidth + 1), 6 n), lower band of the cameras' part. side: (6 n, s). corner: (s, s).
@@ -82,7 +82,7 @@ def factorise(band: Array) -> Array:
 def solve_factored(factor: Array, right: Array) -> Array:
     """Solve with a banded Cholesky factor and many right-hand sides (N, K).
 
-    LAPACK's own routine reads the whole factor once for each of them; in blocks of columns it is read once.
+    LAPACK reads the complete factor once for each right-hand side; working in blocks of columns reads it only once.
     """
     above, n = factor.shape
     if above <= _NARROW_ROWS:
@@ -102,12 +102,12 @@ def solve_factored(factor: Array, right: Array) -> Array:
 
 
 def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
-    """Of the factor's columns a to b: the triangle on the diagonal, and the rows below it down to `end`."""
+    """Two blocks of the factor's columns a to b: the triangle on the diagonal, and the rows below it down to `end`."""
     above = len(factor)
-    # entry (i, j) of the factor lies at [i - j, j]: a step of one row and a step of one column are both strides
+    # entry (i, j) of the factor is stored at [i - j, j], so the block is a strided view
     down, across = factor.strides[0], factor.strides[1] - factor.strides[0]
     columns = np.array(as_strided(factor[:, a:], (end - a, b - a), (down, across)), order="F")
-    beyond = columns[above:]  # outside the band the view shows other columns
+    beyond = columns[above:]  # outside the band the strided view holds entries of other columns
     beyond[np.tril_indices(len(beyond), 0, b - a)] = 0.0
     return columns[: b - a], columns[b - a :]
 
@@ -115,7 +115,8 @@ def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
 def camera_order(tracks: Tracks, points: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
-    Cameras that observe a common point must lie within the band: the better of the given order and that of Cuthill and
+    Cameras that observe a common point must lie within the band. Takes the better of the input order and that of
+    Cuthill and
     McKee (1969).
     """
     count = len(free)

@@ -1,4 +1,4 @@
-"""Exterior and interior orientation of many cameras as plain arrays for compiled kernels, and their observations."""
+"""Exterior and interior orientation of many cameras and their observations, as plain arrays for compiled kernels."""
 
 from dataclasses import dataclass, replace
 
@@ -38,15 +38,15 @@ class CameraBlock:
         return len(self.position)
 
     def copy(self) -> "CameraBlock":
-        """The same with positions, rotations and lenses of its own."""
+        """A copy with its own arrays."""
         return replace(self, position=self.position.copy(), rotation=self.rotation.copy(), lens=self.lens.copy())
 
     def take(self, index: NDArray[np.integer] | slice) -> "CameraBlock":
-        """Some of the cameras (lenses are shared)."""
+        """A subset of the cameras (the lens table is shared)."""
         return replace(self, position=self.position[index], rotation=self.rotation[index], lens_id=self.lens_id[index])
 
     def camera(self, i: int, origin: Array) -> Camera:
-        """Camera i in grid coordinates; origin is (2,) or (3,), what was subtracted from them."""
+        """Camera i in grid coordinates; origin (2,) or (3,): the local frame's origin."""
         row = self.lens[self.lens_id[i]]
         lens = Lens(int(row[WIDTH]), int(row[HEIGHT]), *(float(row[j]) for j in (F, K1, K2, K3, CX, CY)))
         offset = np.zeros(3)
@@ -54,7 +54,10 @@ class CameraBlock:
         return Camera(self.position[i] + offset, self.rotation[i].copy(), lens)
 
     def project(self, camera: NDArray[np.integer], points: Array) -> Array:
-        """Pixels (M, 2), distortion included, of points (M, 3) in cameras (M,); NaN where not visible in principle."""
+        """Pixels (M, 2), distortion included, of points (M, 3) in cameras (M,).
+
+        NaN behind a camera or beyond its distortion model.
+        """
         uv = np.empty((len(camera), 2))
         _project_many(
             self.position,
@@ -86,7 +89,7 @@ class CameraBlock:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Observations of tie points in pictures: corners followed or features matched.
+    """Observations of tie points in pictures, from tracked corners or matched features.
 
     Attributes:
         camera: int32 (M,), index of the camera of each observation.
@@ -110,7 +113,7 @@ class Tracks:
 def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a ground point in one camera (position (3,), rotation (3, 3), lens (8,)); NaN if behind it.
 
-    Beyond the radius where the distortion folds (see LEAST_RADIAL_SLOPE) the point is not visible.
+    A point beyond the radius at which the distortion stops being monotonic (LEAST_RADIAL_SLOPE) is not visible.
     """
     dx, dy, dz = x - position[0], y - position[1], z - position[2]
     cz = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz

@@ -1,4 +1,4 @@
-"""Stated errors: the adjustment's covariance carried to the ground, and the systematic errors that it cannot show."""
+"""Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,11 @@ _MEDIAN_SIGMA = 1.25
 def frame_sigmas(
     adjustment: Adjustment, c: float, heights: HeightPrior, ties: MapTies | None, tie_c: float, floor_m: float
 ) -> tuple[Array, float]:
-    """Stated error of the ground point at each picture's centre, and of the field of view.
+    """Stated error of the ground point at each picture's centre, and sigma of the field of view.
 
     Args:
-        adjustment: at its end. c, heights, ties, tie_c: as for Adjustment.step.
-        floor_m: error that all pictures have in common and no covariance shows, one sigma of an axis.
+        adjustment: after its last step. c, heights, ties, tie_c: as for Adjustment.step.
+        floor_m: error common to all pictures, which the covariance does not contain; one sigma per axis.
 
     Returns:
         float64 (N,) metres (`stated_sigma_factor` times the sigma of an axis), and one sigma in degrees.
@@ -43,30 +43,31 @@ def frame_sigmas(
 
 
 def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
-    """Error that all map ties of a picture have in common, one sigma of an axis, metres.
+    """Error common to all map ties of a picture, one sigma per axis, metres.
 
-    A map that suits the pictures badly (old, coarse, blurred) scatters ties and shifts all of them: the common shift
-    grew with the scatter where maps of simulated cities were blurred and made noisy.
+    A poor map (old, coarse, blurred) makes ties scatter and also shifts them together: the common shift
+    grew with the scatter when maps of simulated cities were blurred and made noisy.
 
     Args:
         residual: float64 (Q, 2) of the ties after the adjustment. sigma_m: float64 (Q,), their prior sigmas.
-        gsd_m: pixel of the compared map.
+        gsd_m: ground sampling distance of the map.
     """
     config = active().bundle
     floor = config.map_floor_px * gsd_m
     if len(residual) == 0:
         return floor
     scatter = mad_sigma(residual)
-    if len(residual) < config.scatter_least_ties:  # the adjustment follows so few: their residuals are too small
+    # so few ties do not resist the adjustment: their residuals are too small
+    if len(residual) < config.scatter_least_ties:
         scatter = max(scatter, float(np.median(sigma_m)))
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
 
 
 def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array) -> Array:
-    """Offset of the map about each picture on which its ties agree and which the adjustment did not follow.
+    """Offset of the map around each picture, where its ties agree on one that the adjustment did not remove.
 
-    A few ties that are off alone are wrong matches, or ground that changed; if most of those around a picture are
-    off by the same vector, the picture is, or the map.
+    A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are
+    off by the same vector, the picture or the map is.
 
     Args:
         leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
@@ -96,21 +97,25 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
 
 
 def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
-    """Variance of an axis of what the map is displaced by under a whole picture, from place to place, metres squared.
+    """Variance per axis of the map's displacement under one picture, from place to place, metres squared.
 
-    Matching noise differs from tie to tie, a distortion of the map is alike for neighbouring ties: so the semivariogram
-    of the residuals rises with distance by the distortion's variance. What differs within a picture averages out over
-    its ties: the variance of a mean over it is the semivariogram far away less that at the usual distance within it
+    Matching noise is independent from tie to tie, a distortion of the map is similar for neighbours: so the
+    semivariogram
+    of the residuals rises with distance by the distortion's variance. The part that varies within a picture averages
+    out over
+    its ties: the variance of a picture's mean is the semivariogram at large distance minus that at the usual distance
+    within it
     (Cressie 1993, Statistics for Spatial Data, chapter 2). Medians instead of means of the
-    squared differences, as ties may be wrong: of two Gaussian axes ln 2 of the mean. That is what the adjustment left;
-    it followed somewhat more (`distortion_followed`).
+    squared differences are used, as ties may be wrong (for two Gaussian axes the median is ln 2 of the mean). The
+    residuals
+    lack the share that the adjustment absorbed (`distortion_followed`).
 
     Args:
-        place: float64 (Q, 2), where the ties are. residual: float64 (Q, 2), of them after the adjustment, metres.
+        place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), their residuals, metres.
         height_m: flying height.
 
     Returns:
-        0 where there are too few pairs of ties near each other and far apart to tell.
+        The variance; 0 where there are too few close or distant pairs of ties to estimate it.
     """
     config = active().bundle
     step = max(1, -(-len(place) // config.variogram_most_ties))
@@ -128,7 +133,7 @@ def map_distortion_variance(place: Array, residual: Array, height_m: float) -> f
 
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
-    """Variance of an axis, mean of both, of the point where the picture's optical axis meets the ground (height 0)."""
+    """Variance per axis (mean of both) of the point where the picture's optical axis meets the ground at height 0."""
     rotation, height = adjustment.cameras.rotation[i], max(float(adjustment.cameras.position[i, 2]), 1.0)
     ray = rotation[:, 2]
     if ray[2] > -active().bundle.oblique_axis_down:
@@ -136,7 +141,7 @@ def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float
     reach = -height / ray[2]
     moved = np.zeros((3, 6))
     moved[:, :3] = np.eye(3)
-    for a in range(3):  # rotating about the camera's axis a moves the ray by R (e_a x e_z)
+    for a in range(3):  # a rotation about the camera's axis a turns the ray by R (e_a x e_z)
         moved[:, 3 + a] = reach * (rotation @ np.cross(np.eye(3)[a], [0.0, 0.0, 1.0]))
     onto = np.array([[1.0, 0.0, -ray[0] / ray[2]], [0.0, 1.0, -ray[1] / ray[2]]])
     j = onto @ moved

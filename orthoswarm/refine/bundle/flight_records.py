@@ -1,4 +1,4 @@
-"""What one vehicle's frames recorded, as arrays in the local frame; gaps are filled and marked."""
+"""The records of one vehicle's frames as arrays in the local frame; gaps are filled and marked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ class FlightRecords:
 
     Attributes:
         position: float64 (N, 3), east, north minus the origin, height over the takeoff level (see has_height).
-        yaw, pitch, roll: float64 (N,), GRID yaw; filled from the course and straight down where unknown.
+        yaw, pitch, roll: float64 (N,), GRID yaw; where unknown: the course, and nadir.
         time_s: float64 (N,), seconds; picture number where times are unknown or not increasing.
-        has_height, has_yaw, has_tilt: bool (N,), what was recorded.
+        has_height, has_yaw, has_tilt: bool (N,), True where recorded.
         position_sigma: float64 (N,) horizontal, metres, as stated by the source (NaN where not).
         timed: True if time_s are real seconds.
     """
@@ -45,7 +45,7 @@ class FlightRecords:
         return rotation_from_angles(self.yaw, self.pitch, self.roll)
 
     def steps(self) -> Array:
-        """Flown step to each frame from the one before, median over neighbours on the same course: (N, 3)."""
+        """Movement from the previous frame to each frame, median over neighbours on the same course: (N, 3)."""
         config = active().bundle
         reach, turn_rad = config.course_reach_photos, np.radians(config.course_turn_deg)
         n = len(self.position)
@@ -71,12 +71,12 @@ class FlightRecords:
         return np.asarray(np.where((speed > config.velocity_leap * usual + 1)[:, None], 0.0, v))
 
     def with_yaw(self, yaw: Array) -> "FlightRecords":
-        """The same with other headings."""
+        """The records with other headings."""
         return replace(self, yaw=yaw)
 
 
 def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> FlightRecords:
-    """Records of frames (in order); where no frame has a height, all get the default of the configuration."""
+    """Read the records of frames, in order; if no frame has a height, all get the configured default."""
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
     xy = grid.to_grid(lat, lon) - origin[:2]

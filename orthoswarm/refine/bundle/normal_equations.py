@@ -16,7 +16,7 @@ from orthoswarm.refine.bundle.robust_kernel import robust_weight
 def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: ignore[no-untyped-def]
     """Residual (2,) in pixels and Jacobians of one projection by camera (2, 6), point (2, 3) and lens (2, 6).
 
-    Returns False where the point is not visible (behind the camera, or where the distortion folds).
+    Returns False where the point is not visible (behind the camera, or where the distortion is not monotonic).
     """
     ax, ay, az = x - position[0], y - position[1], z - position[2]
     dx = rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az
@@ -35,7 +35,7 @@ def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: 
     r[1] = v - (f * s * py + 0.5 * (lens[7] - 1.0) + lens[5])
     uxx, uxy, uyy = f * (s + 2.0 * px * px * ds), f * 2.0 * px * py * ds, f * (s + 2.0 * py * py * ds)
     iz = 1.0 / dz
-    # by the point in camera axes
+    # derivative by the point in camera axes
     a0, a1, a2 = uxx * iz, uxy * iz, -(uxx * px + uxy * py) * iz
     b0, b1, b2 = uxy * iz, uyy * iz, -(uxy * px + uyy * py) * iz
     for k in range(3):
@@ -116,7 +116,7 @@ def build(  # type: ignore[no-untyped-def]
         c: robust scale of reprojection. height, height_weight: (P,) prior on Z, robust with height_c, plus a
             constant weight height_soft that is not robust.
         tie_point: (P,) row of the tie of a point or -1; tie_xy (Q, 2), tie_weight (Q,), tie_c: map ties
-            (X, Y) = tie_xy, whatever the height.
+            (X, Y) = tie_xy, height free.
         band: (6 (bandwidth + 1), 6 n) lower band, side: (6 n, 6 L), corner: (6 L, 6 L), rhs: (6 n,), rhs_lens: (6 L,).
         w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): for back substitution.
         obs_weight: (M,) robust weight times 1 (0 where invisible). tie_residual: (Q, 2).

@@ -1,4 +1,4 @@
-"""Which picture observes a tie point best, and which points to choose: one in each cell of ground and leg."""
+"""Choice of the best picture for each tie point, and of one point for each ground cell and leg."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class BestViews:
-    """For each point the inlier observation nearest its camera's nadir, and how well the point is observed.
+    """For each point the inlier observation nearest to its camera's nadir, and the quality of the point's observations.
 
     Attributes (P points):
         camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.

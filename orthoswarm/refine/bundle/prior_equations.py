@@ -1,4 +1,4 @@
-"""What the records add to the normal equations: priors of lenses, attitudes, positions, biases, lag and drift."""
+"""The records' part of the normal equations: priors of lenses, attitudes, positions, biases, lag and drift."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,10 @@ def _add_attitudes(
     index: NDArray[np.intp],
     at: Ints,
 ) -> None:
-    """Rotation vector of recorded to solved attitude, minus the bias; `at`: first row of each free camera."""
+    """Attitude priors: rotation vector from recorded to solved attitude, minus the bias.
+
+    `at`: first row of each free camera.
+    """
     base = np.asarray(layout.offset)[priors.group[index]]
     bias = common[base[:, None] + np.arange(3)]
     r = log_rotation(np.swapaxes(priors.rotation[index], 1, 2) @ cameras.rotation[index]) - bias
@@ -87,7 +90,7 @@ def _add_attitudes(
 def _add_positions(
     system: BandedSystem, priors: Priors, layout: Layout, residual: Array, index: NDArray[np.intp], at: Ints
 ) -> None:
-    """Recorded positions with lag and drift, heights with their offset."""
+    """Position priors: recorded positions with lag and drift, heights with their offset."""
     base = np.asarray(layout.offset)[priors.group[index]]
     knots = np.asarray(layout.knots)[priors.group[index]]
     xy, rz = residual[:, :2], residual[:, 2]
@@ -125,7 +128,7 @@ def _weights(sigma: Array) -> Array:
 
 
 def _add_drift(system: BandedSystem, common: Array, at: int, knots: int, sigma: float, bend: float) -> None:
-    """Knots are small (sigma) and bend little (second differences, sigma `bend`)."""
+    """Drift priors: knots are near zero (sigma) and their second differences small (sigma `bend`)."""
     precision = np.eye(knots) / sigma**2
     if knots > 2:
         second = np.diff(np.eye(knots), 2, axis=0)

@@ -13,7 +13,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True)
 class GroupPriors:
-    """Sigmas of the errors that the frames of one group (a vehicle's sortie) have in common; SI and radians.
+    """Sigmas of the errors common to all frames of a group (a vehicle's sortie); SI units and radians.
 
     Attributes:
         bias_sigma: attitude bias about the camera's x, y, z axes, radians.
@@ -38,12 +38,12 @@ class Priors:
     """Records of N cameras in G groups, and of L lenses.
 
     Attributes:
-        position: float64 (N, 3), recorded position in the block's frame (heights already with a sensible level).
+        position: float64 (N, 3), recorded position in the block's frame (heights already shifted to its level).
         position_sigma: float64 (N, 3), infinite where unknown.
         rotation: float64 (N, 3, 3), recorded attitude. rotation_sigma: float64 (N, 3) about the camera's axes.
         velocity: float64 (N, 2), ground velocity in m/s for the lag; zeros where time is unknown.
-        group: int32 (N,). models: one for each group.
-        lens: float64 (L, 6), start of log f, k1, k2, k3, cx, cy. lens_sigma: float64 (L, 6), 0 holds a parameter.
+        group: int32 (N,). models: sigmas of each group.
+        lens: float64 (L, 6), start of log f, k1, k2, k3, cx, cy. lens_sigma: float64 (L, 6), 0 fixes a parameter.
         position_c: robust scale (squared sigmas) of the horizontal positions.
     """
 

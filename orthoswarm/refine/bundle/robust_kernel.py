@@ -1,7 +1,7 @@
 """The robust kernel of all adjustments, Geman and McClure (1987): cost e^2 / (1 + e^2 / c), e a residual in sigmas.
 
-It is flat far from 0, so that wrong matches pull no more than a few sigmas would, whatever their number of metres; c in
-squared sigmas says from where on. Used as iteratively reweighted least squares.
+The cost levels off for large residuals, so a wrong match has no more influence than an error of a few sigmas; c, in
+squared sigmas, sets where. Used as iteratively reweighted least squares.
 """
 
 import numpy as np
@@ -18,5 +18,5 @@ def robust_weight(e2, c):  # type: ignore[no-untyped-def]
 
 
 def robust_weights(e2: NDArray[np.float64], c: float) -> NDArray[np.float64]:
-    """The same of many, float64 of the shape of e2."""
+    """The weights of an array of squared residuals, float64 in the shape of e2."""
     return np.asarray(1.0 / (1.0 + e2 / c) ** 2)

@@ -1,1 +1,1 @@
-"""What pictures show of each other: tracked corners, matched features, pair homographies, first focal length."""
+"""Correspondences between pictures: tracked corners, matched features, pair homographies, first focal length."""

@@ -1,6 +1,6 @@
-"""First focal length and headings: the flow of whole pictures against the distance flown.
+"""First focal length and headings, by comparing the pictures' flow with the distance flown.
 
-Metres per pixel come from the distance flown, never from an altitude that may be wrong; headings that contradict the
+The ground scale comes from the distance flown, never from an altitude, which may be wrong; headings that contradict the
 flow (a yaw tag that flips) are corrected.
 """
 
@@ -23,15 +23,15 @@ Gray = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Interior orientation and headings of one vehicle by the flow of whole pictures.
+    """Focal length and headings of one vehicle from the pictures' flow.
 
     Attributes:
-        focal_px: focal length in working pixels. height_m: height above ground that goes with it.
+        focal_px: focal length in working pixels. height_m: height above ground consistent with it.
         yaw_offset: float64 (N,), to be added to the recorded yaw (radians): flips, and headings taken from the course.
-        trusted_height: False where the recorded height had to be replaced.
-        pairs: pairs of pictures that gave an answer.
+        trusted_height: False if the recorded height had to be replaced.
+        pairs: number of picture pairs with a result.
         warnings: sentences for the report.
-        spread: robust relative sigma of the pairs' answers, infinite where there are too few.
+        spread: robust relative sigma of the pairs' results, infinite if there are too few.
     """
 
     focal_px: float
@@ -51,7 +51,7 @@ class Calibration:
 def calibrate(
     records: FlightRecords, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
 ) -> Calibration:
-    """Compare the flow of picture pairs along each leg with what the records predict.
+    """Compare the flow of picture pairs along each leg with the flow that the records predict.
 
     Args:
         records: the vehicle's records. leg: int32 (N,), -1 in turns.
@@ -91,7 +91,7 @@ def calibrate(
 def _with_scale(
     f0: float, h0: float, scale: float, *, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
 ) -> Calibration:
-    """Attribute the scale to the lens where that gives a possible one, else to the height."""
+    """Attribute the measured scale to the lens if that gives a possible one, else to the height."""
     focal = f0 * scale
     narrowest, widest = np.radians(active().features.calibration_fov_deg)
     if usable and narrowest < fov_rad(focal, width) < widest:
@@ -107,11 +107,11 @@ def _with_scale(
 def _heading(
     records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
 ) -> tuple[Array, list[str]]:
-    """Offset of the recorded yaw for each frame: whole legs that are turned round, or headings from the course."""
+    """Offset to the recorded yaw of each frame: legs whose yaw is flipped, or headings taken from the course."""
     config = active().features
     offset = np.zeros(len(leg))
     warnings: list[str] = []
-    angle = -np.angle(ratio)  # picture flow turned against prediction = camera turned the other way
+    angle = -np.angle(ratio)  # a flow rotated against its prediction means a camera rotated the other way
     usual = float(np.median(np.abs(ratio)))
     wrong = np.radians(config.heading_wrong_deg)
     for k in range(int(leg.max()) + 1):
@@ -150,7 +150,10 @@ def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
 def _pairs(
     records: FlightRecords, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
 ) -> list[tuple[int, int]]:
-    """At most so many pairs along a leg whose expected flow is the configured share of the picture."""
+    """Pairs along a leg, in the configured number and with about the configured expected flow (share of the picture).
+
+    Picture.
+    """
     config = active().features
     if len(members) < 2:
         return []
@@ -171,14 +174,14 @@ def _pairs(
 def _flow_ratio(
     first: Gray, second: Gray, ra: Array, rb: Array, move: Array, focal: float, height: float
 ) -> complex | None:
-    """Measured over predicted flow as a complex number (scale and turn); None where the pictures do not agree."""
+    """Measured flow divided by predicted flow, complex (scale and rotation); None without agreement."""
     config = active().features
     shape = first.shape
     if second.shape != shape or not np.isfinite(move).all():
         return None
     centre = np.array([0.0, 0.0, 1.0])
     turned = rb.T @ ra @ centre
-    spin = focal * turned[:2] / max(turned[2], 0.2)  # flow by rotation alone
+    spin = focal * turned[:2] / max(turned[2], 0.2)  # flow caused by rotation alone
     shift = -focal / height * (rb.T @ move)[:2]
     factor = 0.5 if shape[1] > config.calibration_reduced_from_px else 1.0
     small = [

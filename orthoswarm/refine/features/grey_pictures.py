@@ -16,11 +16,11 @@ Gray = NDArray[np.uint8]
 
 
 class Pictures:
-    """Grey pictures by index; those read last stay in memory, reduced ones always do.
+    """Grey pictures by index; the most recently read ones stay in memory, reduced ones always do.
 
     Attributes:
         scale: full-resolution pixels per working pixel. size: (width, height) at working scale.
-        damaged: index -> sentence why that picture cannot be used.
+        damaged: index -> reason why that picture cannot be used.
     """
 
     def __init__(
@@ -43,7 +43,10 @@ class Pictures:
         self.damaged: dict[int, str] = {}
 
     def gray(self, i: int) -> Gray:
-        """Picture i, uint8 (rows, columns); a grey card where it cannot be decoded (see `damaged`) or lost parts."""
+        """Picture i, uint8 (rows, columns).
+
+        Uniform grey if it cannot be decoded (see `damaged`) or lost parts in transmission.
+        """
         cached = self._cache.get(i)
         if cached is not None:
             self._cache.move_to_end(i)
@@ -65,14 +68,14 @@ class Pictures:
         return self._small[i]
 
     def drop(self) -> None:
-        """Free the memory of working-scale pictures (the reduced ones stay)."""
+        """Free the memory of the working-scale pictures (the reduced ones stay)."""
         self._cache.clear()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
 
     def _load(self, i: int) -> Gray:
-        if self._frames[i].damaged:  # what it shows may be of another moment: its record counts, its content does not
+        if self._frames[i].damaged:  # parts of it may show another moment: its record is used, its content is not
             return np.full(self.size[::-1], 127, np.uint8)
         try:
             picture = self._read(self._frames[i])

@@ -1,7 +1,8 @@
-"""Compiled Lucas-Kanade tracking of small windows, for which the expected turn and scale of each are known.
+"""Compiled Lucas-Kanade tracking of small windows with a predicted rotation and scale for each.
 
 Translation only, inverse compositional (Baker and Matthews 2004), two levels. The template is sampled in the later
-picture's geometry through a local affine map, so a turn between pictures costs nothing; brightness may shift.
+picture's geometry through a local affine map, so a rotation between pictures does no harm; a brightness offset is
+allowed.
 """
 
 import numpy as np
@@ -40,9 +41,9 @@ def _template(gray, u, v, affine, wide):  # type: ignore[no-untyped-def]
 
 @kernel
 def _refine(gray, wide, q, rounds, texture, step):  # type: ignore[no-untyped-def]
-    """Move q (2,) to where the template lies in a picture; returns the final mean square error, negative if lost.
+    """Move q (2,) to the template's place in a picture; returns the final mean square error, negative if lost.
 
-    rounds: most iterations. texture: least eigenvalue of the gradient matrix a pixel. step: a smaller one ends, px.
+    rounds: most iterations. texture: least eigenvalue of the gradient matrix per pixel. step: stop below this step, px.
     """
     rows, cols = gray.shape
     gx, gy = np.empty((_SIZE, _SIZE), np.float32), np.empty((_SIZE, _SIZE), np.float32)
@@ -179,15 +180,15 @@ def anchor(  # type: ignore[no-untyped-def]
     found,
     ok,
 ):
-    """Compare K windows with their first observation, so that errors from picture to picture do not add up.
+    """Compare K windows with their first observation, so that errors do not accumulate from picture to picture.
 
     Args:
-        stack: uint8 (R, rows, columns), pictures held. slot: int64 (K,), the picture of each first observation.
+        stack: uint8 (R, rows, columns), pictures in memory. slot: int64 (K,), the picture of each first observation.
         points: float32 (K, 2), its place there. after: the picture now.
         affine: float64 (K, 2, 2), derivative of the map from `after` back to that picture.
         limit: farthest move in pixels. rounds (one number), texture, step, mismatch, noise: as for `track`.
-        found: float32 (K, 2), in: from picture to picture, out: improved.
-        ok: bool (K,) out, False where the first observation is not recognised.
+        found: float32 (K, 2); in: as tracked from the last picture, out: improved.
+        ok: bool (K,) out, False where the window no longer matches its first observation.
     """
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
     q = np.empty(2)

@@ -1,4 +1,4 @@
-"""Forward overlap of consecutive photos: it decides between following corners and matching features."""
+"""Forward overlap of consecutive photos, which decides between tracking corners and matching features."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Overlap:
 
     @property
     def dense(self) -> bool:
-        """Whether corners can be followed from photo to photo."""
+        """Whether corners can be tracked from photo to photo."""
         config = active().features
         return self.share >= config.dense_overlap and self.matched >= config.dense_matched
 
@@ -38,11 +38,11 @@ def forward_overlap(
 ) -> Overlap:
     """Measure the overlap of consecutive photos of one vehicle from the pictures, about 15 ms a photo.
 
-    It needs no tag: positions only, no height, no angles, an unknown field of view all do.
+    No recorded height, angle or field of view is needed.
 
     Args:
         frames: of one vehicle in order of time.
-        read_gray: gives a photo's grey values, uint8 (rows, columns), at any size.
+        read_gray: returns a photo's grey values, uint8 (rows, columns), at any size.
         samples: how many pairs, spread over the flight (None: as configured).
     """
     shares: list[float] = []
@@ -61,7 +61,7 @@ def forward_overlap(
 
 
 def _sample_pairs(frames: Sequence[Frame], samples: int) -> list[tuple[int, int]]:
-    """Consecutive pairs of equal pictures without a pause between, evenly over the flight."""
+    """Consecutive pairs of the same picture size without a pause between, spread evenly over the flight."""
     pairs, longest = [], active().records.pause_s
     for k in range(len(frames) - 1):
         a, b = frames[k], frames[k + 1]
@@ -81,7 +81,10 @@ def _features(frame: Frame, read_gray: Callable[[Frame], NDArray[np.uint8]]) -> 
 
 
 def _shared_area(one: Features, two: Features) -> float:
-    """Share of the first picture that the second shows, by the similarity of their matches; 0 without a match."""
+    """Share of the first picture's area that the second shows, from the similarity of their matches.
+
+    0 without a match.
+    """
     import cv2
 
     match = match_features(one, two)

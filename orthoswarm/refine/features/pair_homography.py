@@ -1,4 +1,4 @@
-"""The homography between two pictures, measured in the pictures, whatever was recorded of them."""
+"""The homography between two pictures, measured in the pictures without relying on their records."""
 
 import cv2
 import numpy as np
@@ -11,10 +11,10 @@ Gray = NDArray[np.uint8]
 
 
 def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
-    """The homography that flow over several octaves supports; None where it supports none.
+    """The homography that most of a flow over several octaves agrees on; None without agreement.
 
-    For a camera that sways and whose angles are wrong by degrees or were not recorded. Begun from the prediction and,
-    where that finds no consensus (a heading that is wrong by more than ten degrees), from no motion at all; then by
+    For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and,
+    if that finds no consensus (a heading more than ten degrees off), from no motion; after that from
     ORB corners.
 
     Args:
@@ -32,7 +32,7 @@ def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float3
 
 
 def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
-    """The homography from one picture to the next that most flow from a start agrees on, None without agreement."""
+    """The homography that most of the flow from a given start agrees on, None without agreement."""
     config = active().features
     guess = apply_homography(start, uv)
     warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
@@ -47,9 +47,9 @@ def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start:
 
 
 def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
-    """The homography that corners described whatever their direction (ORB) agree on, None without agreement.
+    """The homography that rotation-invariant corners (ORB) agree on, None without agreement.
 
-    For a turn of the flight whose headings nobody recorded.
+    For turns of the flight without recorded headings.
     """
     config = active().features
     orb = cv2.ORB.create(nfeatures=config.orb_corners)
@@ -65,7 +65,7 @@ def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
 
 
 def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Array | None:
-    """The homography that so many pairs of pixels (K, 2) agree on, None where fewer do."""
+    """The homography by RANSAC over pairs of pixels (K, 2), None with too few inliers."""
     homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, active().features.homography_px)
     if homography is None or inlier.sum() < fewest:
         return None
@@ -73,7 +73,10 @@ def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Ar
 
 
 def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
-    """The prediction with the shift that it lacks, by phase correlation of reduced pictures; None where unclear."""
+    """The prediction corrected by a shift from phase correlation of reduced pictures.
+
+    None where the peak is unclear.
+    """
     if previous is None:
         return None
     config = active().features
@@ -91,12 +94,12 @@ def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> A
 
 
 def apply_homography(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Where a homography (3, 3) takes pixels (K, 2)."""
+    """Pixels (K, 2) mapped by a homography (3, 3)."""
     p = uv.astype(float) @ homography[:, :2].T + homography[:, 2]
     return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
 
 
 def is_inside(uv: NDArray[np.float32], shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
-    """Which pixels (K, 2) lie in a picture of this shape, so far from its border."""
+    """Which pixels (K, 2) lie in a picture of this shape, at least a margin inside its border."""
     h, w = shape[:2]
     return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)

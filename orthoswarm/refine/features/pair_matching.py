@@ -1,6 +1,6 @@
 """Pairs of overlapping photos: candidates, matching of their features, geometric verification.
 
-Candidates come from the recorded positions, not only from the order in time: legs, vehicles and sorties overlap, too.
+Candidates come from the recorded positions, not only from the order in time, as legs, vehicles and sorties overlap too.
 A pair is accepted when mutual nearest neighbours agree on one similarity of the plane (loosely, because cameras tilt
 and the ground is not flat) and on one epipolar geometry (tightly).
 """
@@ -24,7 +24,7 @@ class Pair:
     """Two photos that show the same ground.
 
     Attributes:
-        first: index of one photo; second: of the other, larger.
+        first: index of one photo; second: index of the other, larger.
         match: int32 (n, 2), rows of features in the first and in the second.
     """
 
@@ -37,10 +37,10 @@ class Pair:
 
 
 def match_features(one: Features, two: Features) -> Ints:
-    """Rows of features of one and of another photo that are the same points, int32 (n, 2); none: (0, 2).
+    """Rows of matching features in two photos, int32 (n, 2); (0, 2) without a match.
 
     Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
-    MAGSAC (Barath et al. 2020). Fewer than `match_least` inliers are none.
+    MAGSAC (Barath et al. 2020). Fewer than `match_least` inliers count as no match.
     """
     config = active().features
     none = np.zeros((0, 2), np.int32)
@@ -108,7 +108,7 @@ def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray
 
 
 class _Identity:
-    """A key by object identity that keeps its object alive."""
+    """A dictionary key by object identity that keeps the object alive."""
 
     __slots__ = ("features",)
 
@@ -150,9 +150,10 @@ def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
 
 
 def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
-    """Pairs whose footprints may overlap, spread over all directions, int32 (n, 2), sorted, first < second.
+    """Pairs with possibly overlapping footprints, spread over all directions, int32 (n, 2), sorted, first < second.
 
-    Each photo chooses by direction, in each from photos of its own group and of others, those first whose distance is
+    Each photo chooses partners in every direction, both of its own group and of others, preferring those whose distance
+    is
     near the best one.
 
     Args:
@@ -182,7 +183,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
 
 
 def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -> list[int]:
-    """The first of every kind, then the second, until `count`."""
+    """The first item of every kind, then the second, until there are `count`."""
     rank = np.zeros(len(near), np.int64)
     for k in np.unique(kind):
         inside = np.flatnonzero(kind == k)

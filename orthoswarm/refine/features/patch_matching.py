@@ -41,7 +41,7 @@ def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: i
 def _scharr(gray, field, length):  # type: ignore[no-untyped-def]
     """Scharr gradients (reflected at the border), float32 (rows, columns, 2), and their lengths.
 
-    Returns whether all lengths on every second row and column are known.
+    Returns True if the lengths on every second row and column are all known.
     """
     rows, cols = gray.shape
     three, ten = np.float32(3.0), np.float32(10.0)
@@ -63,7 +63,7 @@ def _scharr(gray, field, length):  # type: ignore[no-untyped-def]
 
 @kernel
 def _compress(field, length, middle, texture, out):  # type: ignore[no-untyped-def]
-    """Gradients weighed by their length and the middle one, without the border; those of unknown pixels are 0."""
+    """Gradients weighted by their length and the median length, without the border; 0 at unknown pixels."""
     rows, cols = length.shape
     for r in range(1, rows - 1):
         for c in range(1, cols - 1):
@@ -81,7 +81,7 @@ def _compress(field, length, middle, texture, out):  # type: ignore[no-untyped-d
 
 @kernel
 def _peaks(score, exclude):  # type: ignore[no-untyped-def]
-    """Row and column of the highest score, and the highest one farther than `exclude` from it (-1: there is none)."""
+    """Row and column of the highest score, and the best score farther than `exclude` from it (-1 if none)."""
     rows, cols = score.shape
     r, c, peak = 0, 0, score[0, 0]
     for i in range(rows):
@@ -109,12 +109,12 @@ def gradient_field(gray: Floats) -> Floats:
 
 
 def texture_field(gray: Floats) -> Floats:
-    """Gradients that count most where they are usual, g m / (|g|^2 + m^2), m = median |g|; else as `gradient_field`.
+    """Like `gradient_field`, but weighted most at the median length: g m / (|g|^2 + m^2), m = median |g|.
 
-    For comparing pictures of different days and directions: the strongest edges are those of shadows and of buildings
-    and trees, and these lie elsewhere in the other picture. Measured with true cameras on simulated cities, 1,000 ties
-    each: the shift that all ties have in common falls from 0.02-0.07 m to 0.01-0.04 m, their scatter from 0.07-0.10 m
-    to 0.04-0.05 m, and a seventh more are clear; blurred and noisy maps gain alike.
+    For pictures of different days and directions, whose strongest edges belong to shadows, buildings
+    and trees, which lie elsewhere in the other picture. Measured with true cameras on simulated cities, 1,000 ties
+    each: the common shift of all ties falls from 0.02-0.07 m to 0.01-0.04 m, their scatter from 0.07-0.10 m
+    to 0.04-0.05 m, and a seventh more matches are unambiguous; the gain is similar on blurred and noisy maps.
     """
     return _weighed_gradients(gray, True)
 
@@ -137,14 +137,14 @@ def _weighed_gradients(gray: Floats, texture: bool) -> Floats:
 
 
 def match(template: Floats, window: Floats, exclude: int | None = None) -> tuple[float, float, float, float]:
-    """Where a template field lies in a larger window field, by normalised vector correlation.
+    """Locate a template field in a larger window field by normalised vector correlation.
 
     Args:
         template: float32 (n, n, 2). window: float32 (n + 2 s, n + 2 s, 2).
-        exclude: the second peak is sought farther than this from the first, pixels (None: as configured).
+        exclude: least distance of the second peak from the first, pixels (None: as configured).
 
     Returns:
-        Column and row of the shift from the window's centre (sub-pixel), the peak, the second peak.
+        Column and row of the shift from the window's centre (sub-pixel), score of the peak, score of the second peak.
     """
     exclude = active().features.peak_exclude_px if exclude is None else exclude
     score = cv2.matchTemplate(window, template, cv2.TM_CCORR_NORMED)

@@ -1,4 +1,4 @@
-"""SIFT features, spread evenly over the picture, for photos that overlap too little for corners to be followed.
+"""SIFT features, spread evenly over the picture, for photos that overlap too little for tracking.
 
 Lowe 2004 (SIFT) as in OpenCV; RootSIFT after Arandjelovic and Zisserman 2012. The globally strongest features sit
 on a few glints and roofs; a cap per cell of the picture keeps the geometry well conditioned.
@@ -24,7 +24,7 @@ class Features:
         descriptor: uint8 (n, 128), SIFT descriptors as OpenCV gives them (see `root_sift`).
         sigma_px: float32 (n,), one sigma of the position in pixels of the full picture.
         width: columns of the full picture; height: rows.
-        step_px: pixels of the full picture to one of the reduced one.
+        step_px: full-picture pixels per pixel of the reduced picture.
     """
 
     uv: Floats
@@ -39,14 +39,14 @@ class Features:
 
     @classmethod
     def none(cls, width: int, height: int) -> "Features":
-        """No features of a picture of a size."""
+        """An empty set for a picture of this size."""
         empty = np.zeros((0, 2), np.float32)
         return cls(empty, np.zeros((0, 128), np.uint8), empty[:, 0], width, height, 1.0)
 
     def same_point(self) -> NDArray[np.int32]:
-        """For each feature the first one at the same place, int32 (n,).
+        """For each feature the index of the first one at the same place, int32 (n,).
 
-        SIFT describes a point once for each of its strong orientations; a track may hold it only once.
+        SIFT returns a point once for each strong orientation, but a track may contain it only once.
         """
         _, first, inverse = np.unique(self.uv, axis=0, return_index=True, return_inverse=True)
         return np.asarray(first[inverse.reshape(-1)], dtype=np.int32)
@@ -63,10 +63,10 @@ def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = No
     """Features of one photo.
 
     Args:
-        gray: uint8 (rows, columns), the photo at any size (a reduced decode is welcome).
+        gray: uint8 (rows, columns), the photo at any size (decoding at reduced size saves time).
         width: columns of the full picture, in whose pixels positions are given.
         height: its rows.
-        working_pixels: of the reduced picture on which to work (None: as configured).
+        working_pixels: number of pixels of the reduced working picture (None: as configured).
 
     Returns:
         At most `sift_kept` features, the strongest of each cell first.
@@ -100,7 +100,7 @@ def localisation_sigma(size: Floats) -> Floats:
 
 
 def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) -> tuple[Bytes, float]:
-    """The picture at about the working size (never enlarged), and full pixels to one of its pixels."""
+    """The picture reduced to about the working size (never enlarged), and full-size pixels per reduced pixel."""
     import cv2
 
     ratio = min(1.0, float(np.sqrt(working_pixels / (width * height))))
@@ -111,7 +111,7 @@ def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) ->
 
 
 def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.intp]:
-    """Indices of the features to keep: every cell's strongest first, then its second, until there are enough.
+    """Indices of the features to keep: the strongest of every cell, then the second strongest, until there are enough.
 
     Args:
         xy: float32 (n, 2), positions in a picture of `columns` by `rows`.

@@ -1,4 +1,4 @@
-"""Tracks from pairwise matches: points of many photos joined into one, by union-find."""
+"""Tracks from pairwise matches: features of many photos joined into one tie point by union-find."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
     """Tie points through all photos, each observed 2 to `track_longest` times.
 
     The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
-    one wrong match cannot glue two places together.
+    one wrong match cannot merge two places.
 
     Args:
         features: of each photo; the camera of an observation is the index here.
@@ -64,7 +64,7 @@ def _find(parent, x):  # type: ignore[no-untyped-def]
 
 @kernel
 def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
-    """Root of each node after joining along the edges in order; members of a root form a linked list."""
+    """Root of each node after joining along the edges in order; the members of a root form a linked list."""
     parent = np.arange(count)
     following = np.full(count, -1)
     tail = np.arange(count)
@@ -98,12 +98,12 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
 
 
 def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64]) -> Tracks:
-    """Fewer tracks that still cover every photo evenly: longest first, while one of their photos' cells has room.
+    """Thin the tracks but cover every photo evenly: longest first, while a cell of one of their photos has room. room.
 
     Args:
         tracks: of N photos.
-        width: (N,) columns of each photo.
-        rows: (N,) rows of each photo.
+        width: int (N,), columns of each photo.
+        rows: int (N,), rows of each photo.
     """
     if not len(tracks.camera):
         return tracks

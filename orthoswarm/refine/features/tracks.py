@@ -1,7 +1,7 @@
-"""Following corners through one vehicle's pictures: spread by cells, predicted by the records.
+"""Tracking of corners through one vehicle's pictures, spread by cells and predicted from the records.
 
 Optical flow between consecutive pictures, started from the recorded attitude and the flown step; each window is
-turned and scaled as the prediction says, so that tracks survive the turns of the flight.
+rotated and scaled as predicted, so that tracks survive the turns of the flight.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ Gray = NDArray[np.uint8]
 
 @dataclass(slots=True)
 class _Live:
-    """Tracks alive in the last picture: pixel, id, age in pictures, first observation (picture number and pixel)."""
+    """Tracks visible in the last picture: pixel, id, age in pictures, first observation (picture number and pixel)."""
 
     uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -37,16 +37,16 @@ class _Live:
     anchor_uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def take(self, keep: NDArray[Any]) -> "_Live":
-        """Some of the tracks."""
+        """A subset of the tracks."""
         return _Live(self.uv[keep], self.ident[keep], self.age[keep], self.anchor[keep], self.anchor_uv[keep])
 
 
 @dataclass(slots=True)
 class Tracker:
-    """Follows corners picture by picture; feed it in order, then take the tracks.
+    """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
 
     Attributes:
-        scale: full-resolution pixels per pixel of the pictures that are fed.
+        scale: full-resolution pixels per pixel of the added pictures.
         cell_px: at most one track in each cell of this size.
     """
 
@@ -61,7 +61,7 @@ class Tracker:
     _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
 
     def add(self, index: int, gray: Gray, predicted: Array | None) -> float:
-        """Follow all live tracks into the next picture and start new ones in empty cells.
+        """Track all live corners into the next picture and start new ones in empty cells.
 
         Args:
             index: of the picture (the camera of the observations).
@@ -88,7 +88,7 @@ class Tracker:
         return survived
 
     def tracks(self) -> Tracks:
-        """All tracks with enough observations, as observations in full-resolution pixels."""
+        """Observations of all tracks that are long enough, in full-resolution pixels."""
         config = active().features
         if not self._log:
             return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
@@ -126,12 +126,12 @@ class Tracker:
     def _better(
         self, gray: Gray, half: Gray, other: Array, now: tuple[NDArray[np.bool_], NDArray[np.float32], Array]
     ) -> tuple[NDArray[np.bool_], NDArray[np.float32], Array]:
-        """Flow as it is now or, where that keeps more tracks, from another prediction; with its prediction."""
+        """The present flow or, if it keeps more tracks, that from another prediction; with the prediction used."""
         good, found = self._flow(gray, half, other, apply_homography(other, self._live.uv))
         return (good, found, other) if good.sum() > now[0].sum() else now
 
     def _correct_drift(self, live: _Live, gray: Gray) -> None:
-        """Compare with the first observation; where it is not recognised any more, the present one takes its place."""
+        """Compare each window with its first observation; where that no longer matches, the present one replaces it."""
         if self._stack is None or not len(live.uv):
             return
         config = active().features
@@ -167,7 +167,7 @@ class Tracker:
     def _flow(
         self, gray: Gray, half: Gray, predicted: Array, guess: NDArray[np.float32]
     ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Flow of the live tracks from the guess, gated."""
+        """Flow of the live tracks from the predicted positions, without outliers."""
         config = active().features
         found, ok = np.empty_like(guess), np.zeros(len(guess), bool)
         klt.track(
@@ -215,7 +215,7 @@ class Tracker:
 def corners(gray: Gray, empty: NDArray[np.bool_], size: int, top: int = 0, left: int = 0) -> NDArray[np.float32]:
     """The strongest corner (minimum eigenvalue) of each wanted cell: float32 (K, 2), column and row.
 
-    Cells without texture give none. Only the rows of cells that are wanted are computed.
+    Cells without texture give no corner. Only the rows of wanted cells are computed.
     """
     config = active().features
     window, reach = config.corner_window_px, (config.corner_window_px + 1) // 2
@@ -242,7 +242,7 @@ def _runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
 
 
 def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int, ...], b: int) -> None:
-    """No corners within b pixels of the border of a picture of this shape; the score's origin is (x0, y0)."""
+    """Suppress corners within b pixels of the border of a picture of this shape; the score's origin is (x0, y0)."""
     score[: max(0, b - y0)] = 0
     score[:, : max(0, b - x0)] = 0
     below, right = y0 + score.shape[0] - (shape[0] - b), x0 + score.shape[1] - (shape[1] - b)
@@ -269,7 +269,7 @@ def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
 def _gate(
     guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Keep flow that agrees with the others: near the median residual, which must be near the guess."""
+    """Keep flow close to the median residual, which must itself be close to the prediction."""
     config = active().features
     good = ok & is_inside(found, shape, config.flow_inside_px)
     if good.sum() < config.flow_least:
@@ -282,7 +282,7 @@ def _gate(
 
 
 def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
-    """One track a cell, the one followed longest."""
+    """One track per cell, the longest."""
     cols = shape[1] // size + 1
     cell = (live.uv[:, 1] // size).astype(np.int64) * cols + (live.uv[:, 0] // size).astype(np.int64)
     order = np.lexsort((live.ident, -live.age))
@@ -292,10 +292,10 @@ def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
 
 
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
-    """The homography of flat ground from one picture's pixels to the next one's, from their records.
+    """The homography of flat ground from one picture's pixels to the next one's, predicted from their records.
 
     Args:
-        before: (3, 3) rotation of the earlier camera, camera to ground; after: of the later one.
+        before: (3, 3) rotation of the earlier camera, camera to ground; after: the later camera's.
         height_m: height of the earlier camera above the ground.
         step: (3,) its movement in metres, east, north, up.
         matrix: 3x3 calibration matrix.
@@ -312,11 +312,11 @@ def follow(
     scale: float = 1.0,
     cell_px: int | None = None,
 ) -> tuple[Tracks, NDArray[np.float64]]:
-    """Follow corners through pictures 0 .. count - 1.
+    """Track corners through pictures 0 .. count - 1.
 
     Args:
-        count: of pictures. read: gives picture i at working scale.
-        prediction: 3x3 homography from picture i - 1 to i, None where the chain begins anew.
+        count: number of pictures. read: returns picture i at working scale.
+        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
         scale: full-resolution pixels per working pixel. cell_px: see Tracker (None: as configured).
 
     Returns:

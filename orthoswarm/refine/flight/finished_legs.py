@@ -1,4 +1,4 @@
-"""Legs of a flight that are complete while the vehicle still flies: later pictures do not change them."""
+"""Legs that are complete while the vehicle still flies; later pictures do not change them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,12 @@ Array = NDArray[np.float64]
 
 
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
-    """First and last frame (inclusive) of each leg that is over, in order.
+    """First and last frame (inclusive) of each finished leg, in order.
 
     Args:
         position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres.
         time_s: float64 (N,) or None; see split_legs.
-        over: True if no more frames are expected, so that the last leg is over, too.
+        over: True if no more frames are expected, so that the last leg is finished, too.
     """
     n = len(position)
     if n < 2:

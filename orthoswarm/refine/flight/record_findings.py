@@ -1,4 +1,4 @@
-"""Messages for the report: where pictures contradict the records, and why a photo could not be placed."""
+"""Messages for the report: contradictions between pictures and records, and reasons why photos were not placed."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +15,7 @@ from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecor
 
 
 def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
-    """Photos whose recorded yaw is turned by 180 degrees against the picture's, bool (N,)."""
+    """Photos whose recorded yaw is off by 180 degrees from the picture's, bool (N,)."""
     flipped = np.zeros(len(records), bool)
     for v, tag in enumerate(start.tags):
         if tag.source:
@@ -26,7 +26,7 @@ def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
 
 
 def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
-    """Sentences on all records that the pictures contradict, except heights (see `height_findings`)."""
+    """Sentences on records that contradict the pictures, except heights (see `height_findings`)."""
     found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
     found += _position_findings(frames, records, start)
     found += _overlap_findings(records, start)
@@ -36,7 +36,7 @@ def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrien
 def unplaced_reasons(
     frames: Sequence[Frame], records: PhotoRecords, placed: Flags, damaged: Mapping[int, str]
 ) -> dict[int, str]:
-    """Why photos without tie points to others could not be placed by pictures."""
+    """Reasons why photos have no tie points to others."""
     reasons = dict(damaged)
     for k in np.flatnonzero(~placed).tolist():
         tilt = float(np.degrees(records.pitch[k])) + 90.0
@@ -114,9 +114,9 @@ def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initia
 def height_findings(
     frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation, adjustment: Adjustment
 ) -> list[str]:
-    """Sentences on recorded heights that the adjusted pictures contradict, and on heights that are not recorded.
+    """Sentences on recorded heights that contradict the adjusted pictures, and on heights that are not recorded.
 
-    Metres per pixel come from the distance flown, so a height is known as well as the focal length.
+    The ground scale comes from the distance flown, so a height is known as well as the focal length.
 
     Args:
         frames: N photos. records: what they recorded. start: from the pairs.
@@ -150,7 +150,7 @@ def height_findings(
 
 
 def contradiction(who: str, said_m: float, seen_m: float) -> str:
-    """The sentence on a recorded height that the pictures contradict."""
+    """Sentence on a recorded height that contradicts the pictures."""
     return f"{who}: the recorded height of {said_m:.0f} m contradicts the pictures, which say {seen_m:.0f} m"
 
 

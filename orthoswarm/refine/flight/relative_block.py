@@ -1,4 +1,4 @@
-"""One vehicle's flight of overlapping pictures: records, calibration, tracks, start of the adjustment without map."""
+"""The relative block of one vehicle with overlapping pictures: records, calibration, tracks, start values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,14 +28,14 @@ Gray = NDArray[np.uint8]
 
 @dataclass(slots=True)
 class Flight:
-    """A vehicle's frames and what is known of them so far.
+    """A vehicle's frames and their present solution.
 
     Attributes:
-        frames: in order. records: what they recorded (headings already corrected). leg: int32 (N,).
+        frames: in order. records: their records (headings already corrected). leg: int32 (N,).
         pictures: grey pictures. calibration: first guess. adjustment: the cameras and points.
         survived: float64 (N,), share of tracks that survived into each picture.
-        warnings: for the report. sparse: True where photos were matched in pairs, not followed.
-        focal_sigma: relative sigma of a focal length found together with other vehicles and held since (else 0).
+        warnings: for the report. sparse: True if photos were matched in pairs instead of tracked.
+        focal_sigma: relative sigma of a focal length found together with other vehicles and fixed since (else 0).
     """
 
     frames: Sequence[Frame]
@@ -50,11 +50,11 @@ class Flight:
     focal_sigma: float = 0.0
 
     def cameras(self) -> CameraBlock:
-        """The vehicle's own cameras now (neighbours that an adjustment holds are left out; lenses may be more)."""
+        """The vehicle's own cameras (without neighbours that the adjustment holds fixed; there may be more lenses)."""
         return self.adjustment.cameras.take(slice(0, len(self.frames)))
 
     def best_views(self, some: NDArray[np.bool_] | None = None) -> BestViews:
-        """Summaries of the points' observations; pictures are chosen among the vehicle's own, or some (N,) of them."""
+        """Best view of each tie point, chosen among the vehicle's own pictures, or among some (N,) of them."""
         adj = self.adjustment
         own = np.zeros(len(adj.cameras), bool)
         own[: len(self.frames)] = True if some is None else some
@@ -64,11 +64,11 @@ class Flight:
 def open_flight(
     frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: Callable[[Frame], Gray], fov_start: float
 ) -> Flight | None:
-    """Follow a vehicle's pictures and set up its adjustment; nothing is solved yet.
+    """Track corners through a vehicle's pictures and set up its adjustment, without solving it.
 
-    None where the pictures cannot be followed from one to the next (those are matched in pairs instead, see
+    Returns None where pictures cannot be tracked from one to the next and are matched in pairs instead (see
     `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a
-    chain that breaks or a single straight way, on which drift and scale cannot be separated.
+    chain that breaks, or a single straight line, on which drift and scale cannot be separated.
     """
     c = active().flight
     if len(frames) < c.followed_photos:
@@ -104,9 +104,9 @@ def open_flight(
 
 
 def weigh_records(flight: Flight) -> None:
-    """Estimate the sigmas of recorded heights and attitudes from how adjusted cameras differ from one to the next.
+    """Estimate the sigmas of recorded heights and attitudes from the differences between consecutive adjusted cameras.
 
-    Positions that scatter more than their sigmas say get larger ones, too. Heights doubtful from the start stay so.
+    Positions that scatter more than their sigmas get larger sigmas, too. Heights with a loose prior keep it.
     """
     c = active().flight
     adj = flight.adjustment
@@ -125,15 +125,15 @@ def weigh_records(flight: Flight) -> None:
 
 
 def distorts_strongly(flight: Flight) -> bool:
-    """True if the lens distorts so much that two parameters do not describe it."""
+    """True if the distortion is too strong for two parameters."""
     return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= active().flight.strong_k1)
 
 
 def free_full_lens(flight: Flight) -> bool:
-    """Solve a strongly distorting lens in full; others keep two parameters, which are better determined.
+    """Free all parameters of a strongly distorting lens; others keep two, which are better determined.
 
     Returns:
-        True if more parameters are free now (some more steps are due).
+        True if parameters were freed, so that more steps are needed.
     """
     adj = flight.adjustment
     if not distorts_strongly(flight):
@@ -204,7 +204,7 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
 
 
 def first_points(cameras: CameraBlock, tracks: Tracks) -> Array:
-    """Where the rays of each track meet the level ground, averaged: float64 (P, 3)."""
+    """Mean intersection of each track's rays with the level ground: float64 (P, 3)."""
     ground = cameras.to_ground(tracks.camera, tracks.uv, np.zeros(len(tracks.camera)))
     ok = np.isfinite(ground).all(1)
     count = np.maximum(np.bincount(tracks.point[ok], minlength=tracks.count), 1)
@@ -213,10 +213,11 @@ def first_points(cameras: CameraBlock, tracks: Tracks) -> Array:
 
 
 def _height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Array, Array]:
-    """Heights over the ground as recorded and their sigmas; one height where the record cannot be trusted.
+    """Recorded heights above the ground and their sigmas; one common height if the record is not trusted.
 
-    A height that leaves those around it may be a spike, or the climb after the takeoff: the height of the others is
-    as good a guess, as doubtful as they differ, and the pictures tell which it is.
+    A height unlike those around it may be a spike or the climb after takeoff: it is replaced by the others' height with
+    a
+    sigma as large as the difference, and the pictures decide.
     """
     c = active().flight
     z = records.position[:, 2]

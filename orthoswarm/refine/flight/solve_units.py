@@ -1,4 +1,4 @@
-"""What is solved at once: one lens of one vehicle, a stretch of moderate length; and joining the parts again."""
+"""Units that are solved at once (one lens of one vehicle, of limited length), and the merging of their solutions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,9 @@ from orthoswarm.model.placement import Solution
 
 
 def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
-    """Frames of one vehicle, camera and size each, in order; a zoom change or a turned camera starts a new lens.
+    """Split frames into units of one vehicle, camera and size, in order.
+
+    A change of zoom or orientation starts a new lens.
 
     A few frames with another camera name but the same size stay with the vehicle's main camera.
     """
@@ -52,7 +54,7 @@ def _even(frames: list[Frame], parts: int) -> list[list[Frame]]:
 
 
 def merge_units(solutions: Sequence[Solution]) -> list[Solution]:
-    """One solution a vehicle: placed frames and legs of its units together, the field of view of the largest."""
+    """Merge the units of each vehicle into one solution; its field of view is that of the largest unit."""
     by_vehicle: dict[str, list[Solution]] = {}
     for solution in solutions:
         by_vehicle.setdefault(solution.vehicle, []).append(solution)

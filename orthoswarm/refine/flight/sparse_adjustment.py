@@ -1,8 +1,8 @@
-"""The relative adjustment of sparse photos: the same unknowns as for followed flights, another schedule.
+"""The relative adjustment of sparse photos: the same unknowns as for tracked flights, in a different order.
 
-A prior on every point's height would pull the cameras down on flat ground seen straight down, where focal length and
-heights scale together unobserved. So level ground is assumed in the first stage only; then the median of the points
-alone is held, at the takeoff level.
+On flat ground seen straight down, focal length and heights can scale together; a prior on every point's height would
+then pull the cameras down. So level ground is assumed in the first stage only; later the median of the points
+alone is fixed at the takeoff level.
 """
 
 from dataclasses import replace
@@ -41,12 +41,12 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True) -> Adjustment:
     schedule = tuple(zip(config.sparse_stage_c, config.sparse_stage_steps, strict=True))
     cameras, tracks = start.cameras, start.tracks
     adjustment = Adjustment.begin(cameras, tracks, _priors(start), first_points(cameras, tracks))
-    for k, (c, steps) in enumerate(schedule):  # the first stage holds the lens and level ground
+    for k, (c, steps) in enumerate(schedule):  # the first stage fixes the lens and assumes level ground
         if k == 1:
             _free_lens(adjustment, start, full=False)
         if k >= 2:
             _widen_position_sigmas(adjustment)
-        if k == len(schedule) - 1:  # the last one solves the full lens
+        if k == len(schedule) - 1:  # the last stage solves the full lens
             _attitude_sigmas_from_residuals(adjustment)
             _free_lens(adjustment, start, full=full_lens)
         for _ in range(steps):
@@ -65,14 +65,14 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True) -> Adjustment:
 
 
 def trusted_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
-    """Photos whose recorded heights the adjustment used to the end, bool (N,)."""
+    """Photos whose recorded heights the final adjustment used, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])
     return np.asarray(start.height_known & (sigma < active().bundle.unknown_height_sigma_m)[p.group])
 
 
 def _converged_m(adjustment: Adjustment) -> float:
-    """A step that moves no camera farther than this is the last one."""
+    """Convergence limit: the largest camera movement of the last step, metres."""
     return active().flight.sparse_converged_share * float(np.median(np.abs(adjustment.cameras.position[:, 2])))
 
 
@@ -84,9 +84,9 @@ def plane_prior(adjustment: Adjustment) -> HeightPrior:
 
 
 def datum_prior(adjustment: Adjustment, level_m: float = 0.0) -> HeightPrior:
-    """A prior for the median height of all points; it does not constrain how they scatter about it.
+    """A prior for the median height of all points that does not constrain their scatter.
 
-    Each point is asked to move as the median must, all of them together with the weight of one observation.
+    Each point's prior asks for the shift of the median; together they weigh as much as one observation.
     """
     z = adjustment.points[:, 2]
     middle = float(np.median(z)) if len(z) else 0.0
@@ -136,7 +136,7 @@ def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
 
 
 def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> None:
-    """Priors of the lens: the focal length by the tags, no distortion."""
+    """Lens priors: the focal length from the tags, no distortion."""
     c = active().flight
     p = adjustment.priors
     lenses = len(start.cameras.lens)
@@ -156,9 +156,9 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
 
 
 def _widen_position_sigmas(adjustment: Adjustment) -> None:
-    """Larger sigmas for positions and heights that scatter more than theirs say.
+    """Widen the sigmas of positions and heights that scatter more than stated.
 
-    Heights with too small sigmas push the cameras up, where errors of heights matter less.
+    Too small height sigmas push the cameras up, where height errors cost less.
     """
     p = adjustment.priors
     off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
@@ -168,7 +168,7 @@ def _widen_position_sigmas(adjustment: Adjustment) -> None:
 
 
 def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:
-    """Sigmas of the attitude priors from how adjusted attitudes scatter about them."""
+    """Set the sigmas of the attitude priors to the scatter of adjusted attitudes about them."""
     c = active().flight
     p = adjustment.priors
     sigma = p.rotation_sigma.copy()
@@ -182,7 +182,7 @@ def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:
 
 
 def _rescale_sigmas(adjustment: Adjustment) -> None:
-    """Scale all observations' sigmas so that the median residual is that of the redundancy."""
+    """Scale the sigmas of all observations so that the median residual matches the redundancy."""
     c = active().flight
     tracks = adjustment.tracks
     residual = adjustment.residuals()

@@ -1,4 +1,4 @@
-"""A vehicle's sparse photos as a Flight, adjusted without a map, for the same later steps as a followed one."""
+"""The relative block of sparse photos, adjusted without a map, as a Flight for the same further steps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,15 +35,15 @@ def open_sparse_flight(
 ) -> Flight:
     """Match a vehicle's photos with each other and adjust them without a map.
 
-    The counterpart of `open_flight` for photos that cannot be followed, with the adjustment already solved.
+    The counterpart of `open_flight` for photos that cannot be tracked; its adjustment is already solved.
 
     Args:
         frames: of one vehicle and one lens, in order of time.
         grid: the area's grid.
         origin: float64 (2,), of the local frame.
-        read: gives a photo's grey values at full size.
-        run: where features are found and matched; the result does not depend on it.
-        progress: called with stage, done, all.
+        read: returns a photo's grey values at full size.
+        run: executes the feature and matching tasks; the result does not depend on it.
+        progress: called with stage, number done, total.
     """
     frames = [replace(frame, camera=frames[0].camera) for frame in frames]
     start = sparse_start(frames, read_photo_records(frames, grid, origin), read, run, progress)
@@ -69,19 +69,19 @@ def make_flight(
     warnings: Sequence[str],
     focal_sigma: float = 0.0,
 ) -> Flight:
-    """A vehicle's flight from photos that were adjusted alone or together with others.
+    """Make a vehicle's flight from photos adjusted alone or with others.
 
     Args:
         frames: of the vehicle.
         grid: the area's grid.
         origin: float64 (2,), of the local frame.
-        read: gives a photo's grey values at full size.
+        read: returns a photo's grey values at full size.
         start: of all photos that were matched together.
         rows: which of them are the vehicle's.
         adjustment: of the vehicle's photos alone, in pixels of the full pictures.
-        trusted_height: bool, of all photos, those whose recorded heights the adjustment used to the end.
+        trusted_height: bool, of all photos, True where the final adjustment used the recorded height.
         warnings: for the report of this vehicle.
-        focal_sigma: of a lens that was found together with others, see `Flight`.
+        focal_sigma: of a lens found together with other vehicles, see `Flight`.
     """
     records = flight_records.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
@@ -115,7 +115,7 @@ def make_flight(
 
 
 def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
-    """The same in pixels of pictures reduced `step` times to a size (columns, rows), its weights computed anew."""
+    """The adjustment in pixels of pictures reduced `step` times to a size (columns, rows), with recomputed weights."""
     cameras, t, p = adjustment.cameras, adjustment.tracks, adjustment.priors
     lens, lens_prior, lens_sigma = cameras.lens.copy(), p.lens.copy(), p.lens_sigma.copy()
     lens[:, [F, CX, CY]] /= step

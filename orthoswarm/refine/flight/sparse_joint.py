@@ -1,8 +1,9 @@
-"""Sparse photos of several vehicles matched and adjusted together, then taken apart into flights.
+"""Sparse photos of several vehicles matched and adjusted together, then split into flights.
 
-Each vehicle alone would have its own scale, tilt and drift: legs and vehicles fit each other only if the photos on both
-sides are adjusted together. Cameras of the same name share a lens until all else is found; then each vehicle has its
-own, close to the common one.
+Alone, each vehicle would have its own scale, tilt and drift: legs and vehicles only fit each other if the photos on
+both
+sides are adjusted together. Cameras of the same name share a lens until the end; then each vehicle gets its
+own lens, close to the shared one.
 """
 
 from collections.abc import Sequence
@@ -42,13 +43,13 @@ def open_sparse_flights(
         units: frames of one vehicle and one lens each, in order of time.
         grid: the area's grid.
         origin: float64 (2,), of the local frame.
-        read: gives a photo's grey values at full size.
-        run: where features are found and matched; the result does not depend on it.
-        progress: called with stage, done, all.
+        read: returns a photo's grey values at full size.
+        run: executes the feature and matching tasks; the result does not depend on it.
+        progress: called with stage, number done, total.
 
     Returns:
-        A flight for each unit. Its adjustment holds its own photos only, with priors at what was found together: it
-        may be moved as a whole (onto a map), but keeps its shape.
+        A flight for each unit. Its adjustment contains its own photos only, with priors at the joint solution: it
+        may be moved rigidly (onto a map), but keeps its shape.
     """
     if len(units) == 1:
         return [open_sparse_flight(units[0], grid, origin, read, run, progress)]
@@ -80,7 +81,7 @@ def open_sparse_flights(
 
 
 def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
-    """Warnings by unit; those that concern several go with the first one."""
+    """Warnings by unit; those about several units go to the first one."""
     by_unit: list[list[str]] = [[] for _ in names]
     for text in warnings:
         own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
@@ -89,7 +90,7 @@ def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
 
 
 def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
-    """Let every vehicle have its own lens, close to the one that it shared, and adjust on."""
+    """Give every vehicle its own lens, close to the shared one, and continue the adjustment."""
     c = active().flight
     vehicle = start.records.vehicle
     first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
@@ -109,7 +110,7 @@ def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
 
 
 def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
-    """The adjustment of some photos by themselves, as found together with all others."""
+    """The part of a joint adjustment that concerns some photos."""
     c = active().flight
     local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)

@@ -1,6 +1,6 @@
-"""Sparse photos: from frames to start values, tracks and priors of the adjustment.
+"""Start values, tracks and priors for the adjustment of sparse photos.
 
-For photos that overlap too little, or too irregularly, to be followed from one to the next: forward overlap under about
+For photos that overlap too little or too irregularly for tracking: forward overlap under about
 80 %, corners, crosshatches, several sorties. Tags are evidence; the pictures decide.
 """
 
@@ -34,11 +34,11 @@ class SparseStart:
         cameras: start values. tracks: observations of points, length 2 to 20.
         segment: int32 (N,), attitude bias, height offset and lag are common to a segment.
         component: int32 (N,), connected part of the pair graph, the largest is 0.
-        position_prior: float64 (N, 3), recorded positions; where the receiver is an outlier, the network's.
+        position_prior: float64 (N, 3), recorded positions; the network's position where the record is an outlier.
         position_sigma: float64 (N, 3), one sigma east, north, up. height_known: bool (N,), whether heights are recorded
             and possible. velocity: float64 (N, 2), metres per second.
         log_focal: float64 (L,) by the tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
-        placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why it has none.
+        placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why not.
         damaged: photos that cannot be decoded.
         yaw_flipped: bool (N,), the recorded yaw is turned by 180 degrees.
         metres_per_pixel: float64 (N,). warnings: for the report. plane: the planar start values.
@@ -75,7 +75,7 @@ def read_photo_records(
         frames: photos of one or several vehicles, of a vehicle in order of time.
         grid: the area's grid.
         origin: float64 (2,), grid coordinates of the local frame's origin.
-        share_lenses: vehicles whose cameras and picture sizes go by the same name share one lens.
+        share_lenses: True: vehicles with the same camera name and picture size share one lens.
     """
     lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
     xy = grid.to_grid(lat, lon) - origin[:2]
@@ -119,10 +119,10 @@ def sparse_start(
     Args:
         frames: N photos, of a vehicle in order of time.
         records: see `read_photo_records`.
-        read_gray: gives a photo's grey values, uint8 (rows, columns), at any size (a reduced decode is welcome); may
+        read_gray: returns a photo's grey values, uint8 (rows, columns), at any size (reduced decoding saves time); may
             raise PictureError.
-        run: where features are found and matched; the result does not depend on it.
-        progress: called with stage, done, all.
+        run: executes the feature and matching tasks; the result does not depend on it.
+        progress: called with stage, number done, total.
     """
     builder = PairGraphBuilder(frames, records, read_gray, run, progress)
     start = build_pair_graph(builder)
@@ -143,16 +143,16 @@ def assemble(
     damaged: Mapping[int, str],
     tried: int,
 ) -> SparseStart:
-    """Put together what the adjustment needs.
+    """Assemble the start of the adjustment.
 
     Args:
         frames: N photos.
         records: what they recorded.
         features: of each photo.
         pairs: E matched pairs.
-        start: found from these pairs.
-        damaged: photos that could not be read, and why.
-        tried: how many pairs were tried.
+        start: initial orientation from these pairs.
+        damaged: photos that could not be read -> reason.
+        tried: number of pairs tried.
     """
     trusted = [pair for pair, ok in zip(pairs, start.pair_ok, strict=True) if ok]
     tracks = thin_tracks(build_tracks(features, trusted), records.width, records.rows)
@@ -196,7 +196,7 @@ def _camera_block(records: PhotoRecords, start: InitialOrientation) -> CameraBlo
 def _position_priors(records: PhotoRecords, start: InitialOrientation) -> tuple[Array, Array, Flags]:
     """Recorded positions with their sigmas (N, 3) east, north, up, and where heights are recorded and possible.
 
-    A position that states its own sigma (RTK) lags by the same time on all photos; others by a time that varies.
+    Positions with a stated sigma (RTK) lag by the same time in all photos, others by a varying time.
     """
     c = active().flight
     position = np.stack([records.position.real, records.position.imag, start.height], axis=1)

@@ -1,6 +1,6 @@
-"""Pictures that cannot be refined: too few of their kind, or all taken at one spot.
+"""Pictures that cannot be refined: too few of their camera, or all taken from one position.
 
-They are placed as recorded, or as their solved neighbours moved.
+They stay as recorded, or move as their solved neighbours did.
 """
 
 from collections import Counter
@@ -24,9 +24,9 @@ class RefinableSplit:
     """Recorded frames by whether a refiner can solve them, each in the order of the frames.
 
     Attributes:
-        fit: those that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
-        still: those of vehicles that took all pictures at one spot, to stay as recorded.
-        warnings: what cannot be solved, for the report.
+        fit: frames that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
+        still: frames of vehicles that hovered for all pictures, which stay as recorded.
+        warnings: sentences for the report on what cannot be solved.
     """
 
     fit: list[PlacedFrame]
@@ -36,7 +36,7 @@ class RefinableSplit:
 
 
 def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
-    """Find the frames on which a refiner would fail, or be wrong without noticing it."""
+    """Separate the frames on which a refiner would fail, or silently give a wrong result."""
     spots = hovering_vehicles(recorded)
     warnings = [
         f"{vehicle}: all pictures were taken at one spot; they are placed as recorded" for vehicle in sorted(spots)
@@ -53,7 +53,7 @@ def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
 
 
 def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
-    """Which frames have too few of their vehicle, camera and size, where others have enough: bool (N,)."""
+    """Frames with too few others of their vehicle, camera and size, while other cameras have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
     least = active().flight.least_photos_of_kind
@@ -62,7 +62,7 @@ def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
 
 
 def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
-    """Vehicles with several pictures, in order of time, that were all taken at one spot."""
+    """Vehicles with several pictures (in order of time) that were all taken from one position."""
     members: dict[str, list[PlacedFrame]] = {}
     for p in recorded:
         members.setdefault(p.frame.vehicle, []).append(p)
@@ -75,7 +75,7 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
 
 
 def _hovers(positions: NDArray[np.float64]) -> bool:
-    """Whether a path (N, 3) is one spot, or a receiver's noise about one: steps as long as the spread."""
+    """True if a path (N, 3) is one position with a receiver's noise: steps as long as the total spread."""
     c = active().flight
     spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
     height = float(np.median(positions[:, 2]))
@@ -89,7 +89,7 @@ def _hovers(positions: NDArray[np.float64]) -> bool:
 def place_by_neighbours(
     odd: Sequence[PlacedFrame], recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
-    """Place frames by what refinement changed in their nearest neighbours: position, attitude, focal length.
+    """Place frames by applying the refinement's changes of their nearest neighbours: position, attitude, focal length.
 
     Args:
         odd: as recorded.
@@ -97,7 +97,7 @@ def place_by_neighbours(
         refined: frames after refinement.
 
     Returns:
-        One for each odd frame; where nothing was refined it stays as recorded.
+        One placed frame for each odd frame; as recorded if nothing was refined.
     """
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
@@ -108,12 +108,12 @@ def place_by_neighbours(
 def move_with_neighbours(
     extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
-    """Move frames by what changed in their nearest neighbours when those were placed again; as sure of them as before.
+    """Move frames by the changes of their nearest neighbours when those were placed again; sigmas stay.
 
     Args:
         extra: placed after the others, not solved with them.
-        before: the others as they were.
-        after: the others as they are.
+        before: the others before the change.
+        after: the others after the change.
     """
     own = {p.frame.image for p in extra}
     moved = place_by_neighbours(extra, [p for p in before if p.frame.image not in own], after)
@@ -130,7 +130,7 @@ def _nearest(
 
 
 def _moved_like(near: Sequence[BeforeAfter], one: PlacedFrame) -> PlacedFrame:
-    """A frame moved by the median shift of its neighbours, turned and scaled as the nearest."""
+    """A frame moved by its neighbours' median shift, rotated and scaled like the nearest one."""
     shift = np.median([after.camera.position - old.camera.position for old, after in near], axis=0)
     old, after = near[0]
     turn = after.camera.rotation @ old.camera.rotation.T

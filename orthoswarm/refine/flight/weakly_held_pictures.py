@@ -1,4 +1,4 @@
-"""Pictures that too few observations hold (water, haze, blur): placed between their neighbours."""
+"""Pictures with too few observations (water, haze, blur), which are placed between their neighbours."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
-    """Well fitting observations of each of the vehicle's cameras: int64 (N,)."""
+    """Number of inlier observations of each of the vehicle's cameras: int64 (N,)."""
     adj = flight.adjustment
     n = len(flight.frames)
     good = (adj.obs_weight > active().flight.held_weight) & (adj.tracks.camera < n)
@@ -18,7 +18,7 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
 
 
 def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
-    """Records (N, 3) in which single positions that leave their leg's course, across or along it, are put back on it.
+    """Records (N, 3) with single outlying positions, across or along their leg's course, put back on it.
 
     Within a long gap a position 5 to 20 m off looks like the aircraft's way when only the gap's ends are compared.
     """
@@ -30,7 +30,7 @@ def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
         if leg[i] < 0 or (leg[i - reach : i + reach + 1] != leg[i]).any():
             continue
         sides = [0.5 * (recorded[i - k, :2] + recorded[i + k, :2]) for k in range(1, reach + 1)]
-        # the nearer of them: a neighbour may be an outlier itself
+        # the smaller distance: a neighbour may be an outlier itself
         middle[i] = min(sides, key=lambda m: float(np.hypot(*(m - recorded[i, :2]))))
         known[i] = True
     away = np.hypot(*(recorded[:, :2] - middle).T)
@@ -41,9 +41,9 @@ def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
 
 
 def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
-    """Interpolate weakly held cameras from strong ones before and after, in place; returns which they are.
+    """Interpolate weak cameras in place from strong ones before and after; returns which were interpolated.
 
-    Positions follow the record's own shape where it agrees with its neighbours, else a straight line in time; the
+    Positions follow the recorded path where it agrees with the neighbours, else a straight line in time; the
     attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance, and with the
     difference of record and line.
     """
@@ -65,10 +65,11 @@ def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         follows = recorded[i] + offset
         gap = float(np.hypot(*(follows - straight)[:2]))
         step = float(np.hypot(*(adj.cameras.position[b] - adj.cameras.position[a])[:2]))
-        turning = flight.leg[a] != flight.leg[b]  # a straight line means nothing there
-        follow_record = a == b or turning or gap < max(c.gap_m, c.gap_share * step)  # a == b: at an end
+        turning = flight.leg[a] != flight.leg[b]  # no straight line to follow there
+        follow_record = a == b or turning or gap < max(c.gap_m, c.gap_share * step)  # a == b at an end
         adj.cameras.position[i] = follows if follow_record else straight
-        adj.cameras.position[i, 2] = follows[2]  # receivers err horizontally; a height far from the others' is real
+        # receivers err mostly horizontally; a height far from the others' is real
+        adj.cameras.position[i, 2] = follows[2]
         near = a if i - a <= b - i else b
         turn = adj.cameras.rotation[near] @ adj.priors.rotation[near].T
         adj.cameras.rotation[i] = turn @ adj.priors.rotation[i]

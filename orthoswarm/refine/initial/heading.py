@@ -1,7 +1,8 @@
-"""Headings of photos from pairs of photos: relative ones by the pictures' turns, absolute ones by the way flown.
+"""Headings of photos: relative ones from the rotation between pictures, absolute ones from the course flown.
 
-Yaw tags flip by 180 degrees, or are relative to the body, or are missing; they are used only for photos whose heading
-no pair gives.
+Yaw tags may be flipped by 180 degrees, relative to the airframe, or missing; they are used only for photos whose
+heading
+cannot be found from pairs.
 """
 
 from dataclasses import dataclass
@@ -19,11 +20,11 @@ from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, I
 
 @dataclass(frozen=True, slots=True)
 class TagHeading:
-    """How one vehicle's recorded angles relate to the pictures' headings.
+    """Relation between one vehicle's recorded angles and the pictures' headings.
 
     Attributes:
         source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
-        offset: constant difference picture - tag, radians. agree: share of photos that agree with it.
+        offset: constant difference picture - tag, radians. agree: share of photos with that offset.
     """
 
     source: str
@@ -32,7 +33,10 @@ class TagHeading:
 
 
 def components(graph: PairGraph, count: int) -> Ints:
-    """Connected parts of the pair graph, int32 (N,), the largest is 0; photos without a pair are parts of their own."""
+    """Connected parts of the pair graph, int32 (N,), the largest is 0.
+
+    A photo without pairs is a component by itself.
+    """
     links = coo_matrix((np.ones(len(graph)), (graph.first, graph.second)), shape=(count, count))
     _, label = connected_components(links, directed=False)
     size = np.bincount(label)
@@ -66,17 +70,17 @@ def chain_headings(graph: PairGraph, count: int) -> Array:
 def course_headings(
     graph: PairGraph, records: PhotoRecords, metres: Array, offset: Complex, offset_sigma_px: Array
 ) -> tuple[Array, Array]:
-    """Absolute headings of the first photo of each pair, from the recorded way and the picture's shift.
+    """Absolute heading of each pair's first photo, from the recorded movement and the picture's shift.
 
     Args:
         graph: E pairs.
         records: of N photos.
         metres: float64 (N,), metres per pixel.
         offset: complex (N,), nadir pixel of each photo.
-        offset_sigma_px: float64 (N,), how well it is known.
+        offset_sigma_px: float64 (N,), one sigma of it.
 
     Returns:
-        Heading (E,) and its one sigma (E,), infinite where the way is too short.
+        Heading (E,) and its one sigma (E,), infinite where the movement is too short.
     """
     config = active().initial
     i, j = graph.first, graph.second
@@ -96,15 +100,15 @@ def course_headings(
 def solve_headings(
     graph: PairGraph, component: Ints, start: Array, course: Array, course_sigma: Array
 ) -> tuple[Array, Flags]:
-    """Headings of all photos, and whether pairs give them.
+    """Headings of all photos, and which of them follow from pairs.
 
-    Each connected part is turned as a whole to the angle that most courses support, then all headings are solved
+    Each connected component is rotated to the angle that most courses support, then all headings are solved
     together, robustly.
 
     Args:
         graph: E pairs.
         component: int32 (N,).
-        start: float64 (N,), relative headings within each part.
+        start: float64 (N,), relative headings within each component.
         course: float64 (E,), absolute headings of the first photos; course_sigma: (E,).
         course_sigma: one sigma of them, infinite where unknown.
     """
@@ -131,7 +135,7 @@ def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Arr
     finite = np.isfinite(course_sigma)
     sigma = np.where(finite, course_sigma, 1.0)
     absolute = np.where(finite, wrap_rad(course - yaw[i]) / sigma, 0.0)
-    # rows are multiplied by the square root of the Geman-McClure weight, on both sides
+    # both sides of each row are multiplied by the square root of its Geman-McClure weight
     w = np.concatenate([1.0 / (1.0 + relative**2 / c), finite / (1.0 + absolute**2 / c)])
     row = np.arange(pairs)
     pull = w[:pairs] / turn_sigma
@@ -148,7 +152,7 @@ def _identity(count: int) -> csr_matrix:
 
 
 def circular_mode(angle: Array, weight: Array) -> float:
-    """The angle that the most weight supports: the densest window, then the mean of what lies near it."""
+    """Mode of weighted angles: the mean around the densest window."""
     config = active().initial
     width = float(np.radians(config.heading_agree_deg))
     tried = angle[:: max(1, len(angle) // config.heading_candidates)]
@@ -162,11 +166,11 @@ def circular_mode(angle: Array, weight: Array) -> float:
 
 
 def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
-    """Which recorded angle of some photos of one vehicle follows the pictures' headings, up to a constant.
+    """Find the recorded angle that follows the pictures' headings, up to a constant, among photos of one vehicle.
 
     Args:
         records: all records.
-        rows: photos of one vehicle whose heading pairs give.
+        rows: photos of one vehicle whose headings follow from pairs.
         yaw: float64 (N,), the pictures' headings.
     """
     config = active().initial

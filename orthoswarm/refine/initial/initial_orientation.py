@@ -1,8 +1,9 @@
 """Initial exterior and interior orientation of every photo from pairs of photos, without a map.
 
-All of it takes milliseconds and needs no tag but positions. The shapes of matches give the tilt and, where the photos
-look several ways, the focal length (`tilt_and_lens`). Level pictures are then similar figures of the ground: turns give
-headings (`heading`), zooms relative heights (`relative_scale`), shifts positions (`planar_network`).
+It takes milliseconds and needs no tags except positions. The shapes of matches give the tilt and, where the photos
+point in several directions, the focal length (`tilt_and_lens`). Level pictures are similar to the ground: rotations
+give
+headings (`heading`), scales give relative heights (`relative_scale`), shifts give positions (`planar_network`).
 """
 
 from collections.abc import Sequence
@@ -58,11 +59,11 @@ class InitialOrientation:
         focal: float64 (L,), pixels. focal_sigma: float64 (L,), relative. k1: float64 (L,).
         tilt_sigma: float64 (S,), radians.
         component: int32 (N,), connected parts of the pair graph, the largest is 0.
-        pair_ok: bool (E,), pairs that agree with the network. gps_ok: bool (N,), records that do.
+        pair_ok: bool (E,), pairs that agree with the network. gps_ok: bool (N,), recorded positions that do.
         gps_residual: complex (N,), recorded minus network's position, lag removed. lag: float64 (V,) seconds.
-        yaw_known: bool (N,), whether pairs give the heading. scale_known: bool (L,), the ground scale.
+        yaw_known: bool (N,), heading found from pairs. scale_known: bool (L,), ground scale found.
         recorded_focal: float64 (L,), focal length that the recorded heights imply, NaN where they are impossible.
-        tags: for each vehicle, which recorded heading follows the pictures.
+        tags: the recorded heading that follows the pictures, for each vehicle.
         graph: pairs between level pictures. misfit: median misfit of pairs in pixels, before and after levelling.
     """
 
@@ -163,7 +164,7 @@ class _Solved:
 
 
 def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
-    """Rounds of tilt and lens, relative scales, headings and network; lens_of: int32 (S,)."""
+    """Solve tilt and lens, relative scales, headings and network in rounds; lens_of: int32 (S,)."""
     config = active().initial
     tilt_floor = float(np.radians(config.tilt_floor_deg))
     count = len(records)
@@ -217,7 +218,7 @@ def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_
 
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
-    """Weighted mean of the log focal lengths by tags and by recorded heights, and its sigma, float64 (L,) both."""
+    """Weighted mean of the log focal lengths from tags and from recorded heights, and its sigma; both float64 (L,)."""
     weight = np.where(np.isfinite(by_height), active().initial.height_focal_sigma ** -2, 0.0)
     total = sigma**-2 + weight
     return (log_focal * sigma**-2 + weight * np.log(np.where(weight > 0, by_height, 1.0))) / total, total**-0.5
@@ -236,7 +237,7 @@ def _network_priors(
     tilt_px: Array,
     by_height: Array,
 ) -> NetworkPriors:
-    """Segments of one lens share its metres per pixel, scaled by their recorded heights where these are possible."""
+    """Priors of the network: segments of one lens share its scale, times their plausible recorded heights."""
     config = active().initial
     link, link_sigma = np.ones(len(metres)), np.full(len(metres), config.link_sigma)
     for k in range(len(by_height)):
@@ -259,7 +260,7 @@ def _network_priors(
 def _fill_headings(
     records: PhotoRecords, yaw: Array, known: Flags, component: Ints, tags: tuple[TagHeading, ...]
 ) -> Array:
-    """Headings of parts that no course fixes: by the tag that follows the pictures elsewhere, else the way flown."""
+    """Fill unknown headings: from the tag that follows the pictures elsewhere, else from the course flown."""
     yaw = yaw.copy()
     velocity = records.velocity()
     course = np.where(

@@ -1,6 +1,6 @@
-"""Whether cameras of one name have one lens: zooms and sister models do not, and the pictures show it.
+"""Decides from the pictures whether cameras of one name share a lens; zooms and similar models do not.
 
-A lens that is shared by cameras of different focal length bends the ground and every camera over it (measured: fields
+One lens model for cameras of different focal lengths deforms the ground and the orientations (measured: fields
 of view of 95 and 105 degrees under one name came out 10 degrees off, heights 24 m off 150 m).
 """
 
@@ -14,20 +14,20 @@ from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, Phot
 
 
 def lens_per_vehicle(records: PhotoRecords) -> PhotoRecords:
-    """The records with a lens for each vehicle."""
+    """The records with a separate lens for each vehicle."""
     first = np.unique(records.vehicle, return_index=True)[1]
     return replace(records, lens=records.vehicle.copy(), fov_hint=records.fov_hint[records.lens[first]])
 
 
 def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> PhotoRecords:
-    """The records with lenses as shared as the pictures allow.
+    """Share lenses between vehicles as far as the pictures allow.
 
     Args:
         records: of vehicles that share lenses by name.
         alone: start values of the same photos with a lens for each vehicle (see `lens_per_vehicle`).
 
     Returns:
-        The same records where no vehicle's focal length is unlike that of others of its name.
+        The same records if no vehicle's focal length differs from that of others with its camera name.
     """
     one_way = active().initial.one_way_concentration
     vehicles = len(alone.focal)
@@ -47,7 +47,7 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
 
 
 def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
-    """Group of each vehicle (V,): the surest first, a new group where a value is unlike all groups there are."""
+    """Group of each vehicle (V,): in order of certainty, with a new group for a value unlike all existing groups."""
     config = active().initial
     group = np.zeros(len(log_focal), np.int32)
     weight, mean = np.zeros(0), np.zeros(0)

@@ -1,7 +1,7 @@
-"""The pair graph of a set of photos: features of all, matches of candidate pairs, initial orientation as it improves.
+"""Builds the pair graph of photos: features, matches of candidate pairs, and the improving initial orientation.
 
-Which pairs are candidates depends on where the photos look, and so on the tilt, which only pairs give: pairs in order
-of time come first, then near ones, then more for photos that have few.
+Candidate pairs depend on where the photos look, hence on the tilt, which is only known from pairs: so pairs in order
+of time are matched first, then near ones, then more for photos with few pairs.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,12 +27,12 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(slots=True)
 class PairGraphBuilder:
-    """Features and matches of N photos, growing.
+    """Features and matches of N photos, extended step by step.
 
     Attributes:
-        frames: the photos. records: what they recorded. read_gray: gives a photo's grey values at any size.
-        run: where features are found and matched; results do not depend on it.
-        progress: called with stage, done, all.
+        frames: the photos. records: what they recorded. read_gray: returns a photo's grey values at any size.
+        run: executes the feature and matching tasks; results do not depend on it.
+        progress: called with stage, number done, total.
         features: of each photo. tried: pair -> match (empty where it failed).
         damaged: photo -> why it cannot be read.
     """
@@ -52,7 +52,7 @@ class PairGraphBuilder:
         self._detect(list(range(len(self.frames))), active().features.sift_pixels)
 
     def try_pairs(self, pairs: Ints) -> None:
-        """Match pairs that were not tried yet."""
+        """Match the pairs that have not been tried yet."""
         fresh = [(int(a), int(b)) for a, b in pairs if (int(a), int(b)) not in self.tried]
         size = active().initial.pairs_per_task
         chunks = [fresh[k : k + size] for k in range(0, len(fresh), size)]
@@ -68,7 +68,7 @@ class PairGraphBuilder:
         return [Pair(a, b, m) for (a, b), m in sorted(self.tried.items()) if len(m)]
 
     def degree(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pairs and matches of each photo, int64 (N,) both."""
+        """Numbers of pairs and of matches of each photo, both int64 (N,)."""
         pairs, matches = np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), np.int64)
         for (a, b), m in self.tried.items():
             for k in (a, b):
@@ -77,17 +77,17 @@ class PairGraphBuilder:
         return pairs, matches
 
     def near(self, start: InitialOrientation, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
-        """Pairs whose pictures should overlap by the initial orientation; of `only` bool (N,) one must be set."""
+        """Pairs that should overlap according to the initial orientation; at least one of each in `only`, bool (N,)."""
         reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
         pairs = nearby(start.middle(), reach, self.records.segment, count)
         return pairs if only is None or not len(pairs) else pairs[only[pairs].any(1)]
 
     def start(self) -> InitialOrientation:
-        """Start values by the pairs found so far."""
+        """Start values from the pairs found so far."""
         return find_initial_orientation(self.records, self.pairs(), self.features)
 
     def redetect(self, weak: NDArray[np.bool_]) -> None:
-        """Find features of weak photos on larger pictures and forget their pairs."""
+        """Detect features of weakly connected photos again on larger pictures, and drop their pairs."""
         self._detect(np.flatnonzero(weak).tolist(), active().features.sift_fine_pixels)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
 
@@ -107,7 +107,7 @@ class PairGraphBuilder:
 
 
 def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features | str:
-    """Features of a photo, or why it cannot be used."""
+    """Features of a photo, or the reason why it cannot be used."""
     try:
         gray = read_gray(frame)
     except PictureError as error:
@@ -119,13 +119,13 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
 
 
 def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
-    """Matches of some pairs; the task holds the pairs and the features of their photos."""
+    """Match some pairs; the task contains the pairs and the features of their photos."""
     pairs, features = task
     return [match_features(features[a], features[b]) for a, b in pairs]
 
 
 def build_pair_graph(builder: PairGraphBuilder) -> InitialOrientation:
-    """Find features, pairs and start values of all photos; the builder holds what was found."""
+    """Find features, pairs and start values of all photos; the results are in the returned builder."""
     config = active().initial
     records = builder.records
     builder.detect_all()

@@ -2,7 +2,7 @@
 
 Given the headings everything is linear: P(second) - P(first) = m R (z - o) of the first minus the same of the second,
 for the centre of a pair's matches, together with recorded positions. A wrong pair disagrees with the network, and so
-does a wrong position; as photos have several neighbours, the one can be distinguished from the other.
+does a wrong position; as photos have several neighbours, the two can be distinguished.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ class NetworkPriors:
     """Priors of the common unknowns of the network (S segments, N photos).
 
     Attributes:
-        metres: float64 (S,), metres per pixel. relief: float64 (N,), its factor for each photo (the photo's height
+        metres: float64 (S,), metres per pixel. relief: float64 (N,), factor on it for each photo (the photo's height
             over its segment's).
         link: float64 (S,), metres per pixel of a segment over its lens's; link_sigma: float64 (S,), relative sigma.
         metres_sigma: relative sigma of each lens's metres per pixel.
@@ -64,7 +64,7 @@ class Network:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Where the unknowns stand: east (N), north (N), m (S), m o real (S), imaginary (S), m of lenses (L), lag (V)."""
+    """Columns of the unknowns: east (N), north (N), m (S), m o real (S), imaginary (S), m of lenses (L), lag (V)."""
 
     photos: int
     segments: int
@@ -94,7 +94,10 @@ class _Columns:
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows of a sparse system in units of one sigma, gathered block by block; a block may share one robust weight."""
+    """Rows of a sparse system in units of one sigma, collected by blocks.
+
+    The rows of a block may share a robust weight.
+    """
 
     size: int
     count: int = 0
@@ -102,7 +105,7 @@ class _Rows:
     rhs: list[Array] = field(default_factory=list)
 
     def block(self, rhs: Array, *terms: tuple[ArrayLike, ArrayLike]) -> None:
-        """Add rows: each term is (columns, values), one of each per row."""
+        """Add rows: each term is (columns, values), with one column and value per row."""
         row = self.count + np.arange(len(rhs))
         for column, value in terms:
             c, v = np.broadcast_arrays(np.asarray(column, np.int64), np.asarray(value, float))
@@ -163,7 +166,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
 
 
 def _norm(residual: Array) -> Array:
-    """Length of residuals stacked as all first, then all second components."""
+    """Lengths of residual vectors stacked as all first, then all second components."""
     return np.asarray(np.hypot(*residual.reshape(2, -1)))
 
 
@@ -207,7 +210,7 @@ def _pair_rows(
 
 
 def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:
-    """Rows of recorded positions along and across the way flown: P - lag v = recorded; returns v (N,)."""
+    """Rows of recorded positions along and across the course: P - lag v = recorded; returns v (N,)."""
     config = active().initial
     velocity = records.velocity()
     speed = np.abs(velocity)

@@ -1,4 +1,4 @@
-"""Photos as similar figures of the ground plane: records, pairs and level pictures as complex numbers.
+"""Level photos as planar similarities of the ground: records, pairs and pictures as complex numbers.
 
 Ground: east + i north. Picture: z = (u - u0) - i (v - v0), pixels about the picture's centre, y up. A level photo shows
 the ground point P + m exp(-i yaw) z: P straight below, m metres per pixel, yaw clockwise from grid north.
@@ -23,7 +23,7 @@ Flags = NDArray[np.bool_]
 class PhotoRecords:
     """Records of N photos of L lenses in S segments; NaN where unknown.
 
-    Photos of a vehicle stand in order of time.
+    Photos of a vehicle are in order of time.
 
     Attributes:
         position: complex (N,), east + i north in metres about some origin.
@@ -80,7 +80,7 @@ class PhotoRecords:
     def tag_level(self) -> Array:
         """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where there are none.
 
-        Tags beyond `tag_tilt_limit_deg` count as none: such a picture could not be matched anyway.
+        Tilts beyond `tag_tilt_limit_deg` are ignored: such a picture could not be matched anyway.
         """
         pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
         roll = np.where(np.isfinite(self.roll), self.roll, 0.0)

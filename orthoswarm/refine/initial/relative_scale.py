@@ -1,4 +1,4 @@
-"""Ground scale of photos and segments: by the way flown, by the zoom between photos, by recorded heights."""
+"""Ground scale of photos and segments from the distance flown, the scale between photos and recorded heights."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ class RecordedHeights:
 
 
 def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
-    """Heights over the segment's median, from heights or, for want of them, from absolute altitudes.
+    """Heights relative to the segment's median, from heights or, if there are none, from absolute altitudes.
 
     Args:
         records: of N photos.
@@ -54,10 +54,12 @@ def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
 
 
 def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: Array) -> tuple[Array, Flags]:
-    """Metres per pixel of each segment (S,) by recorded ways over pictures' shifts, and which lenses (L,) have such.
+    """Metres per pixel of each segment (S,): recorded movement over the pictures' shift.
 
-    Pairs of nearly equal heading, whose shift does not depend on the tilt, count alone where there are any. A lens
-    without a pair takes its recorded height and its focal length.
+    And which lenses (L,) have one.
+
+    Only pairs of nearly equal heading are used if there are any, as their shift does not depend on the tilt. A lens
+    without a pair uses its recorded height and focal length.
 
     Args:
         graph: pairs of level pictures.
@@ -92,9 +94,9 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
 
 
 def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHeights, count: int) -> Array:
-    """Metres per pixel of each photo over its segment's, float64 (N,), from the zoom between level pictures.
+    """Metres per pixel of each photo over its segment's, float64 (N,), from the scale between level pictures.
 
-    One robust adjustment of the zooms within each segment, with the recorded heights as priors.
+    One robust adjustment of the scales within each segment, with the recorded heights as priors.
     """
     config = active().initial
     i, j = graph.first, graph.second
@@ -110,7 +112,7 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
     for c in config.scale_schedule:
         e = (zoom - (x[i] - x[j])) / sigma
         d = (prior - x) / prior_sigma
-        # square roots of the Geman-McClure weights: rows are multiplied by them on both sides
+        # both sides of each row are multiplied by the square root of its Geman-McClure weight
         w = 1.0 / ((1.0 + e * e / c) * sigma)
         v = 1.0 / ((1.0 + d * d / c) * prior_sigma)
         matrix = coo_matrix((np.r_[w, -w], (np.r_[k, k], np.r_[i, j])), shape=(len(inside), count)).tocsr()
@@ -123,7 +125,7 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
 
 
 def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Array, lens_of: Ints) -> Array:
-    """Focal length in pixels of each lens, height over metres per pixel, NaN where that is no lens that exists."""
+    """Focal length of each lens in pixels, height over metres per pixel; NaN where no such lens exists."""
     narrowest, widest = np.radians(active().initial.hint_fov_deg)
     focal = np.full(len(records.fov_hint), np.nan)
     for k in range(len(focal)):
@@ -136,7 +138,7 @@ def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Arr
 
 
 def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
-    """Log of the focal length in pixels of each lens, by its tags or the default, and its sigma, float64 (L,) both."""
+    """Log focal length (pixels) of each lens from its tags or the default, and its sigma; both float64 (L,)."""
     config = active().initial
     narrowest, widest = np.radians(config.hint_fov_deg)
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
@@ -147,7 +149,7 @@ def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
 
 
 def weighted_median(value: Array, weight: Array) -> float:
-    """The value that splits the weight in halves."""
+    """The value that divides the total weight into halves."""
     order = np.argsort(value, kind="stable")
     total = np.cumsum(weight[order])
     return float(value[order][np.searchsorted(total, 0.5 * total[-1])])

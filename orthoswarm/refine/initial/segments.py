@@ -1,4 +1,4 @@
-"""Segments: runs of photos over which attitude bias and altitude offset stay the same."""
+"""Segments: runs of photos with constant attitude bias and altitude offset."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,11 @@ def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, p
     """Number of the segment of each photo, int32 (N,), from 0 in order of first appearance.
 
     A segment ends at a long pause (landing, battery), at a jump of the recorded height and at a jump of the recorded
-    tilt (the gimbal was turned) that exceeds the record's own noise. A jump that the very next photo takes back is a
-    wrong tag and ends nothing.
+    tilt (the gimbal was moved) that exceeds the record's own noise. A jump that the next photo reverses is a
+    wrong tag and does not end a segment.
 
     Args:
-        group: integers (N,), vehicle and lens; photos of a group stand in order of time.
+        group: integers (N,), vehicle and lens; photos of a group are in order of time.
         time_s: float64 (N,), NaN where unknown.
         height_m: float64 (N,), height or altitude, NaN where unknown.
         pitch_rad: float64 (N,), NaN where unknown.
@@ -39,7 +39,7 @@ def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, p
 
 
 def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
-    """Where a sequence leaves its level by more than the limit and does not return at once."""
+    """Where a sequence jumps by more than the limit and does not return with the next value."""
     jump = np.zeros(len(value), bool)
     known = np.flatnonzero(np.isfinite(value))
     v = value[known]
@@ -57,9 +57,9 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
 
 
 def photo_legs(position: NDArray[np.complex128], segment: Ints, time_s: Array) -> Ints:
-    """Leg of each photo, int32 (N,), numbered in order: runs of photos flown straight on; every photo has one.
+    """Leg of each photo, int32 (N,), numbered in order: runs of photos along a straight course; every photo has one.
 
-    Made for photos far apart: two photos are a leg, and the way from the last photo of one to the first of the next
+    For photos far apart: two photos make a leg, and the path from the last photo of one to the first of the next
     belongs to neither.
 
     Args:

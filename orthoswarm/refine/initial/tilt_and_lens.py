@@ -1,9 +1,9 @@
 """Tilt, focal length and radial distortion from the shapes of matches alone: no positions, no tags.
 
-Level pictures of flat ground are similar figures; tilt and radial distortion bend them in ways that no turn, shift or
-zoom explains. The tilt of each segment and the lens are changed until the matches of all pairs fit similarities best:
-Gauss-Newton on what is left after each pair's own similarity is projected out (variable projection, Golub and Pereyra
-1973). Relief disturbs each pair, but not all of them alike.
+Level pictures of flat ground are similar; tilt and radial distortion deform them in ways that no rotation, shift or
+scale explains. The tilt of each segment and the lens are changed until the matches of all pairs fit similarities best:
+Gauss-Newton on the residuals after each pair's own similarity is projected out (variable projection, Golub and Pereyra
+1973). Relief disturbs single pairs, but not all of them in the same way.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class Matches:
 
     @classmethod
     def of(cls, pairs: Sequence[Pair], features: Sequence[Features]) -> "Matches":
-        """Gather the matches, evenly picked where a pair has many."""
+        """Collect the matches, evenly thinned where a pair has many."""
         most = active().initial.shape_most_matches
         z = [centred(f) for f in features]
         picked = [p.match[_spaced(len(p.match), most)] for p in pairs]
@@ -63,7 +63,7 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class TiltAndLens:
-    """Tilt and lens found from shapes.
+    """Tilt and lens found from the shapes of matches.
 
     Attributes:
         level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians.
@@ -93,7 +93,7 @@ def solve_tilt_and_lens(
     log_focal_sigma: Array,
     tilt_sigma: Array,
 ) -> TiltAndLens:
-    """Find tilt, focal length and first radial term that make the matches similar figures.
+    """Find the tilt, focal length and first radial term for which the matches of every pair fit a similarity best.
 
     Args:
         matches: of all pairs.
@@ -199,7 +199,7 @@ def corner_radius(records: PhotoRecords) -> Array:
 
 @kernel
 def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-untyped-def]
-    """Pixel (complex, y up) of a level, undistorted camera; right and up turn it further by small angles.
+    """Pixel (complex, y up) of a level, undistorted camera; right and up rotate it further by small angles.
 
     The distortion is k1 in units of the picture's half diagonal (bend), not of f, so that f and bend are independent.
     """
@@ -211,7 +211,7 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
     a = level[0, 0] * x + level[0, 1] * y + level[0, 2]
     b = level[1, 0] * x + level[1, 1] * y + level[1, 2]
     c = level[2, 0] * x + level[2, 1] * y + level[2, 2]
-    # the nadir at (right, up) comes to the axis: rotation by the vector (-up, -right, 0) in camera axes
+    # rotation that moves the nadir at (right, up) onto the axis: vector (-up, -right, 0) in camera axes
     a, b, c = a - right * c, b + up * c, c + right * a - up * b
     c = max(c, 0.1)
     return complex(focal * a / c, -focal * b / c)
@@ -219,7 +219,9 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
 
 @kernel
 def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
-    """Robust similarity q = a p + b: a, mean p, mean q, scale of the misfit; weights are left in w.
+    """Fit a robust similarity q = a p + b; returns a, mean p, mean q and the scale of the misfit.
+
+    W receives the weights.
 
     floor: least scale. rounds: of reweighting. robust: scale of the kernel in scales of the misfit.
     """
@@ -264,7 +266,7 @@ def _derivatives(z, flat, level, focal, bend, radius2, factor, g):  # type: igno
 
 @kernel
 def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
-    """Take from g (n,) the similarity of p (n,), whose weighted mean is cp, that fits it best."""
+    """Subtract from g (n,) the best-fitting similarity of p (n,), whose weighted mean is cp."""
     mean, total = 0.0j, 0.0
     for k in range(n):
         mean += w[k] * g[k]

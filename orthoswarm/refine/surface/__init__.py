@@ -1,1 +1,1 @@
-"""The ground below the pictures: terrain, dense points, given height models, tall things."""
+"""The ground below the pictures: terrain, dense points, user height models, tall surfaces."""

@@ -1,9 +1,9 @@
-"""Ground whose shape comes from a height model (DEM) of the user, corrected where the pictures contradict it.
+"""Ground shaped by the user's height model (DEM), corrected where the pictures contradict it.
 
-The model's vertical datum differs from heights over the takeoff, and it may be old (a debris flow lies on it now),
-coarse, or end in the middle of the area. So a smooth surface is fitted to the points' heights over the model. Where
-that surface is level, as over a right model, it is one vertical shift and the model's own shape stays; where it is not,
-the pictures are right. A model that explains nothing is not used at all.
+The model's vertical datum differs from heights above takeoff, and it may be old (before a debris flow),
+coarse, or not cover the area. So a smooth surface is fitted to the points' heights above the model. Where
+that surface is level, as with a correct model, it is one vertical shift and the model's shape is used; where it is not,
+the pictures are used. A model that explains none of the relief is ignored.
 """
 
 from dataclasses import dataclass, field, replace
@@ -35,7 +35,7 @@ class LocalDem:
     origin: tuple[float, float]
 
     def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
-        """Heights over the model's zero on bounds, both in the local frame."""
+        """Heights above the model's zero within bounds; both in the local frame."""
         c = active().surface
         block = c.dem_block_m
         low = [float(np.floor((v + o) / block) * block) for v, o in zip(bounds[:2], self.origin)]
@@ -45,7 +45,7 @@ class LocalDem:
         return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
 
     def height(self, xy: Array) -> Array:
-        """Heights (M,) over the model's zero at positions (M, 2)."""
+        """Heights (M,) above the model's zero at positions (M, 2)."""
         ok: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
         if not ok.any():
             return np.zeros(len(xy))
@@ -68,15 +68,15 @@ class SurfaceSum:
 
 @dataclass(frozen=True)
 class DemFit:
-    """A height model at the points' level; takes the place of a TerrainFit.
+    """A height model shifted to the points' level; used in place of a TerrainFit.
 
     Attributes:
-        dem: the height model. bounds: of the nodes, local frame. most_nodes: of the model, at most.
-        shift_m: what has to be added to the model's heights.
-        rest: where and by how much the ground differs from the model so shifted.
+        dem: the height model. bounds: of the nodes, local frame. most_nodes: most nodes read from the model.
+        shift_m: added to the model's heights.
+        rest: difference between the ground and the shifted model.
         points_above_m: how far the robust centre of the points lies over the ground (see TerrainFit).
         sd_m: standard deviation of the ground over nodes with data.
-        beyond: ground over the model's zero where the model has no heights.
+        beyond: ground above the model's zero where the model has no heights.
     """
 
     dem: LocalDem
@@ -90,7 +90,7 @@ class DemFit:
     _made: dict[str, Terrain] = field(default_factory=dict, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the nodes, which are read again from the file where they are needed."""
+        """Pickle without the nodes, which are read again from the file."""
         return {**self.__dict__, "_made": {}}
 
     def prior(self, z0_m: float = 0.0) -> SurfaceSum:
@@ -121,14 +121,14 @@ def fit_over_dem(
     settings: FitSettings | None = None,
     most_nodes: int | None = None,
 ) -> tuple[DemFit | None, float]:
-    """Fit the ground under points over a height model (see `fit_terrain` for what is not said here).
+    """Fit the ground under points over a height model (see `fit_terrain` for the other arguments).
 
     Args:
         dem: the model. points: float64 (P, 3), local frame. bounds: what the ground must cover.
-        most_nodes: how finely the model is read.
+        most_nodes: most nodes read from the model.
 
     Returns:
-        The fit, None where the model contradicts the points (or has no heights there); and how far the ground differs
+        The fit, None if the model contradicts the points (or has no heights there); and how far the ground differs
         from the model, the median over nodes with data.
     """
     c = active().surface
@@ -173,10 +173,10 @@ def fit_over_dem(
 
 
 def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
-    """Share (rows, columns) of a difference from the model that is taken over: none where it is small around a node.
+    """Share (rows, columns) of the difference from the model to apply: none where it is small around a node.
 
-    A surface through points errs by decimetres, most where they end; a model that agrees with it nearly everywhere is
-    better than that. One that seldom agrees is not.
+    A surface through points errs by decimetres, most at its border; a model that agrees with it nearly everywhere is
+    more accurate. A model that seldom agrees is not.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -202,7 +202,7 @@ def _nodes(terrain: Terrain) -> Array:
 
 
 def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
-    """The model's heights, and where it has none other ground, brought to the model's level at the border."""
+    """The model's heights, filled with other ground where it has none, shifted to the model's level at the border."""
     t, known = ground.terrain, ground.known
     if beyond is None or known.all():
         return t

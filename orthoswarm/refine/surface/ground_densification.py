@@ -1,4 +1,4 @@
-"""Ground between the tracks of one vehicle: heights at free positions for its terrain, and a dense grid of them."""
+"""Ground between the tie points of one vehicle: heights at free positions for its terrain, and a dense grid."""
 
 from dataclasses import replace
 
@@ -16,10 +16,10 @@ Array = NDArray[np.float64]
 
 
 def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
-    """The ground fitted to the points now and to heights at free positions between them.
+    """Fit the ground again, to the present points and to heights at free positions between them.
 
-    Corners sit on raised things; small patches at free positions measure the ground itself, so that the offset that is
-    left is small and becomes 0. as_smooth: the ground stays as smooth as it is, which saves the search.
+    Corners lie on raised objects; small patches at free positions measure the ground itself, so that the remaining
+    offset is small and set to 0. as_smooth: keep the present smoothness, which saves the search.
     """
     if surface.fit is None:
         surface = fit_surface(flight.adjustment, surface)
@@ -35,7 +35,7 @@ def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = Fals
 
 
 def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Array]:
-    """Ground points (K, 3) and their sigmas, one in each cell that shows its height; points (H, 3) high above it."""
+    """Ground points (K, 3) and their sigmas, one per cell where a height was found; and points (H, 3) high above it."""
     c = active().surface
     cameras, height = flight.cameras(), flying_height(flight, surface)
     cells = cells_near(cameras.position[:, :2], dense_cell(height), sight_reach(flight))
@@ -56,9 +56,9 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
 
 
 def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
-    """The pictures from which `dense_points` takes heights, bool (N,), and those between legs.
+    """Pictures used by `dense_points`, and those between legs: bool (N,).
 
-    They show all the ground there is to see; whatever needs no more than these has fewer pictures to decode.
+    They cover all visible ground; steps limited to them decode fewer pictures.
     """
     spacing_m = Sweep.small().at_height(flying_height(flight, surface)).spacing_m
     _, camera, _ = spaced_cameras(flight.cameras(), flight.leg, spacing_m)
@@ -68,13 +68,13 @@ def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
 
 
 def dense_cell(height_m: float) -> float:
-    """Distance of the cells at a flying height, metres."""
+    """Spacing of the cells at a flying height, metres."""
     c = active().surface
     return c.dense_cell_m * height_m / c.reference_height_m
 
 
 def sight_reach(flight: Flight) -> float:
-    """How far from below the camera a vehicle's pictures show the ground, to their corners, metres."""
+    """Distance from the nadir point to the corners of a vehicle's pictures on the ground, metres."""
     cameras = flight.cameras()
     diagonal = float(np.hypot(*flight.pictures.size))
     return float(0.5 * diagonal / cameras.lens[0, 0] * np.median(cameras.position[:, 2]))

@@ -1,7 +1,8 @@
-"""How far the open ground lies from a surface through corner points.
+"""Height of the open ground relative to a surface through corner points.
 
-Corners sit at the edges of raised things, so a surface through them lies a little above the open ground, although every
-point is right: all that is rectified on it and compared with the map is then shifted by that height times the lean of
+Corners lie at the edges of raised objects, so a surface through them is a little above the open ground, although every
+point is right: pictures rectified on it and compared with the map are then shifted by that height times the obliquity
+of
 the view. Small patches at free positions, not at corners, measure the ground itself.
 """
 
@@ -19,21 +20,21 @@ Array = NDArray[np.float64]
 
 
 def near_surface() -> Sweep:
-    """Small patches searched near the surface; a large one straddles rubble and finds only half of the offset."""
+    """A sweep of small patches near the surface; a large patch includes rubble and finds only half of the offset."""
     c = active().surface
     return replace(Sweep.small(), reach_m=c.offset_reach_m, height_step_m=c.offset_height_step_m, rival_m=np.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class GroundOffset:
-    """Level of the open ground against a surface.
+    """Level of the open ground relative to a surface.
 
     Attributes:
-        ground_offset_m: to be added to the surface wherever height above ground matters (usually negative).
-        count: heights found; with too few the offset is 0.
-        points: the heights found. They are good ground points: a surface fitted to them and the tracks together
-            follows the ground where the offset differs from place to place (rubble here, streets there), and then the
-            offset that is left is a few centimetres.
+        ground_offset_m: added to the surface to get the open ground (usually negative).
+        count: number of heights found; with too few the offset is 0.
+        points: the heights found. They are good ground points: a surface fitted to them together with the tie points
+            follows the ground where the offset varies (rubble, streets), and then the
+            remaining offset is a few centimetres.
     """
 
     ground_offset_m: float
@@ -44,7 +45,7 @@ class GroundOffset:
 def draw_positions(camera_xy: Array, height_m: float, *, seed: int = 0) -> Array:
     """Free positions, float64 (K, 2): around pictures' positions (N, 2) evenly in a square that grows with the height.
 
-    The same for the same cameras, so that the offset changes with the surface and not with the draw.
+    Deterministic for the same cameras, so that the offset depends on the surface and not on the draw.
     """
     c = active().surface
     count, spread_m = c.offset_positions, c.offset_spread_m * height_m / c.reference_height_m
@@ -61,7 +62,7 @@ def measure_ground_offset(
     leg_of_camera: NDArray[np.integer],
     sweep: Sweep | None = None,
 ) -> GroundOffset:
-    """Level of the ground over the terrain at free positions (see `draw_positions`), with small patches.
+    """Measure the level of the ground above the terrain at free positions (see `draw_positions`), with small patches.
 
     Args:
         cameras: cameras.

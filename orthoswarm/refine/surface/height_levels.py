@@ -1,4 +1,4 @@
-"""One height level for vehicles that were solved alone: a small network of their differences over common ground."""
+"""A common height level for vehicles solved separately: a levelling network of their differences on common ground."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ class LevelNetwork:
         sigma_m: float64 (V,), one sigma of each against the mean of its component; NaN without common ground.
         component: int64 (V,), number of the connected component that each vehicle belongs to.
         pairs: int64 (E, 2), pairs with enough common ground.
-        difference_m: float64 (E,), height of the first over the second there.
-        residual_m: float64 (E,), what the network does not explain of it.
+        difference_m: float64 (E,), height of the first above the second there.
+        residual_m: float64 (E,), its residual in the network.
     """
 
     correction_m: Array
@@ -37,12 +37,13 @@ class LevelNetwork:
 def level_network(ground: Sequence[Array]) -> LevelNetwork:
     """Level vehicles on each other by their ground points: a least-squares levelling network.
 
-    Every vehicle's own datum holds the mode of ITS points at the takeoff level. Rubble and bushes raise that mode
-    over the ground, so a vehicle's ground can only come out too low: where the levels differ little, the vehicle
-    that needs the least correction is right and stays (a low quantile of many, as the lowest of many is noise).
-    Large differences come from relief, where each vehicle took the median of its own piece for the takeoff level:
-    then the mean is the best guess. Between the two the anchor moves from one to the other, so that it does not jump
-    when a vehicle joins. Levels are never chained from the first vehicle: that more than doubled the map's error.
+    Each vehicle's datum puts the mode of its own points at the takeoff level. Rubble and bushes raise that mode
+    above the ground, so a vehicle's ground can only be too low: where the levels differ little, the vehicle
+    with the lowest correction is right and stays (a low quantile if there are many, as their lowest is noise).
+    Large differences come from relief, where each vehicle put the median of its own ground at the takeoff level:
+    then the mean is the best guess. In between, the anchor changes gradually from one to the other, so that it does not
+    jump
+    when a vehicle is added. Levels are not chained from the first vehicle, which more than doubled the map's error.
 
     Args:
         ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame.
@@ -66,10 +67,10 @@ def level_network(ground: Sequence[Array]) -> LevelNetwork:
 
 
 def _common_difference(a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTree | None) -> Array:
-    """Heights of a over b, at the points of both where they meet.
+    """Heights of a above b, at the points of both in their common area.
 
-    At the border all neighbours lie on one side and a slope would count as a difference: the half of the points
-    that lie nearest to the middle of their neighbours is used.
+    At the border all neighbours lie on one side, where a slope would look like a difference: so the half of the points
+    nearest to the centre of their neighbours is used.
     """
     if tree_a is None or tree_b is None:
         return np.empty(0)
@@ -119,7 +120,7 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
 
 
 def _anchor(correction: Array) -> float:
-    """Which of the corrections (about their mean) becomes zero."""
+    """The correction (relative to their mean) that becomes zero."""
     c = active().surface
     tail = c.level_quantile if len(correction) > c.level_many_vehicles else 0.0
     lowest = float(np.quantile(correction, tail))

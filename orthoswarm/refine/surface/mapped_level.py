@@ -16,14 +16,15 @@ Array = NDArray[np.float64]
 def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: Sequence[Array]) -> float:
     """Median height of the mapped ground, metres, in the datum of the cameras.
 
-    Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is the lower
-    flank of their heights (`lower_flank`). On level ground these are heights over zero, else heights over the terrain,
+    Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is at the lower
+    flank of their heights (`lower_flank`). On level ground these are heights above zero, else heights above the
+    terrain,
     whose median below the cameras and around them is added.
 
     Args:
         terrain: the ground, in the frame of the cameras; None: 0.
         camera_position: float64 (N, 3).
-        dense: ground points (K, 3) at free positions (not at corners), of each vehicle.
+        dense: ground points (K, 3) at free positions (not at corners), one array per vehicle.
     """
     if terrain is None or not len(camera_position):
         return 0.0

@@ -1,4 +1,4 @@
-"""A smooth surface on regular nodes below points: the least-squares fit behind the terrain.
+"""A smooth surface on regular nodes, fitted to points from below by least squares.
 
 Unknowns are the heights of the nodes. Points observe them by bilinear interpolation, with a robust kernel that is wider
 below the surface than above; second differences (xx, yy, sqrt 2 xy) and first differences have a prior at zero. The
@@ -24,19 +24,19 @@ distances it is scaled, so that it means the same ground."""
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """How a surface is fitted: the values of `config.SurfaceConfig` by default, or others for drawing.
+    """Settings of a surface fit: by default those of `config.SurfaceConfig`, others for drawing.
 
     Attributes:
-        step_m: distance of the nodes.
+        step_m: spacing of the nodes.
         floor_sigma_m: added in squares to every point's own sigma.
         scale_start_m, scale_end_m: robust scale above the surface in the first and the last solve.
         below_factor, below_min_m: the scale below the surface is this multiple, but never less than the minimum.
         solves: number of solves over which the scale shrinks.
         slope_sigma_m: sigma of first differences.
         level_ratio: sigma of first differences next to nodes without data, as a multiple of kappa.
-        flat_sd_m: relief of this standard deviation or less is taken for noise by the height prior.
+        flat_sd_m: the height prior treats relief of this standard deviation or less as noise.
         render_flat_sd_m: the same for drawing.
-        held_out_se: the smoothest surface is taken whose error at points left out is within so many standard errors
+        held_out_se: choose the smoothest surface whose error at held-out points is within so many standard errors
             of the best.
     """
 
@@ -55,7 +55,7 @@ class FitSettings:
 
     @classmethod
     def configured(cls, **changes: Any) -> "FitSettings":
-        """The configuration in force, with some fields changed."""
+        """The active configuration with some fields changed."""
         c = active().surface
         settings = cls(
             step_m=c.node_spacing_m, floor_sigma_m=c.point_sigma_floor_m, scale_start_m=c.robust_start_m,
@@ -68,7 +68,7 @@ class FitSettings:
 
     @classmethod
     def for_drawing(cls, *, on_map: bool) -> "FitSettings":
-        """Of the surface that pictures are drawn on; on_map: heights by the map are among its points."""
+        """Settings for the surface that pictures are drawn on; on_map: its points include heights from the map."""
         c = active().surface
         drawn = cls.configured(held_out_se=c.drawn_hold_out_standard_errors)
         if not on_map:
@@ -78,7 +78,7 @@ class FitSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Where nodes lie: the first one, their distance and number."""
+    """A grid of nodes: the first one, their spacing and number."""
 
     west: float
     south: float
@@ -94,13 +94,13 @@ class _Grid:
         return cls(west, south, step, max(3, columns), max(3, rows))
 
     def window(self, column: int, row: int, count: int) -> "_Grid":
-        """At most count cells each way from a node on, within this grid."""
+        """At most count cells in each direction from a node on, within this grid."""
         c, r = max(column, 0), max(row, 0)
         columns, rows = min(column + count, self.columns - 1) - c + 1, min(row + count, self.rows - 1) - r + 1
         return _Grid(self.west + c * self.step, self.south + r * self.step, self.step, max(columns, 3), max(rows, 3))
 
     def holds(self, points: Array) -> NDArray[np.bool_]:
-        """Which points (P, 3) lie within and have a height."""
+        """Which points (P, 3) lie inside and have a height."""
         c, r = (points[:, 0] - self.west) / self.step, (points[:, 1] - self.south) / self.step
         inside = (c >= 0) & (r >= 0) & (c < self.columns - 1) & (r < self.rows - 1) & np.isfinite(points[:, 2])
         return np.asarray(inside, np.bool_)
@@ -108,12 +108,12 @@ class _Grid:
 
 @dataclass(slots=True)
 class Surface:
-    """Points on a grid of nodes, ready to be solved for any smoothness; inner is the shorter side of the grid.
+    """Points on a grid of nodes, prepared for solving with any smoothness; "inner" is the shorter side of the grid.
 
     Attributes:
         columns, rows: number of nodes.
         cell: int32 (P,), first node of the cell of each point, in the solver's order.
-        share: float64 (P, 2), place within the cell, inner and outer.
+        share: float64 (P, 2), position within the cell (0 to 1), inner and outer.
         z: float64 (P,), heights; sigma: their sigma.
         base: float64 (P,), weight of a point on the surface; 0 for points that do not count.
         support: bool (N,), nodes that have data in a cell next to them.
@@ -135,7 +135,7 @@ class Surface:
 
     @classmethod
     def over(cls, points: Array, sigma_z: Array, grid: _Grid, s: FitSettings) -> "Surface":
-        """Set up the nodes of a grid; points (P, 3) outside or without a sigma do not count."""
+        """Set up the nodes of a grid; points (P, 3) outside or without a sigma are ignored."""
         columns, rows = grid.columns, grid.rows
         c, r = (points[:, 0] - grid.west) / s.step_m, (points[:, 1] - grid.south) / s.step_m
         good = grid.holds(points) & (sigma_z > 0)
@@ -160,7 +160,7 @@ class Surface:
 
     @property
     def inner(self) -> int:
-        """Nodes along the shorter side."""
+        """Number of nodes along the shorter side."""
         return min(self.columns, self.rows)
 
     def grid(self, nodes: NDArray[Any]) -> NDArray[Any]:
@@ -188,9 +188,9 @@ class Surface:
         return z
 
     def choose_kappa(self) -> float:
-        """The smoothest surface whose error at points left out is about that of the best (settings.held_out_se).
+        """Choose the smoothest surface whose error at held-out points is about that of the best (settings.held_out_se).
 
-        The best itself would be too rough: rubble is rough and real, but no ground.
+        The best itself would be too rough: it would follow rubble, which is not ground.
         """
         s, c = self.settings, active().surface
         out = np.flatnonzero(self.base > 0)[c.hold_out_every - 1 :: c.hold_out_every]
@@ -206,7 +206,7 @@ class Surface:
             q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
             costs.append(q / (1.0 + q))
             mean.append(float(costs[-1].mean()))
-            if min(mean[-2:]) > min(mean):  # two rougher ones were no better
+            if min(mean[-2:]) > min(mean):  # two rougher surfaces were no better
                 break
         best = int(np.argmin(mean))
         limit = mean[best] + s.held_out_se * float(costs[best].std()) / np.sqrt(len(out))
@@ -215,7 +215,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """A solved surface: first node, heights (rows, columns; rows go north), nodes that have data next to them."""
+    """A solved surface: first node, heights (rows, columns; rows go north), which nodes have data next to them."""
 
     west: float
     south: float
@@ -235,7 +235,7 @@ def fit_nodes(
 ) -> Nodes | None:
     """Solve for nodes that cover bounds; None without a point. Large areas in overlapping tiles, blended.
 
-    The smoothness of tiles is the median of what the fullest ask for. tile_nodes: other than configured, for tests.
+    All tiles use the median smoothness of those with most points. tile_nodes: overrides the configuration, for tests.
     """
     config = active().surface
     core, overlap = tile_nodes or config.tile_nodes, config.tile_overlap_nodes
@@ -298,7 +298,7 @@ def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) ->
 def solve_banded(a, width, x):  # type: ignore[no-untyped-def]
     """Solve a symmetric positive definite banded system in place: Cholesky, four columns at a time.
 
-    A kernel of its own because a threaded LAPACK is slow on small bands and rounds differently with each number of
+    Own kernel, because a threaded LAPACK is slow on small bands and rounds differently with each number of
     threads.
 
     Args:

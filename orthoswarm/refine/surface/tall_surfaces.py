@@ -1,8 +1,8 @@
-"""What stands on the ground and is as wide as a hall, a grandstand or a wood: pictures are drawn on its top.
+"""Tops of wide tall objects (halls, grandstands, woods), on which pictures are drawn.
 
-The ground is fitted from below, which is right for houses and single trees: drawn on the ground they lean, and the
-streets next to them lie where they are. Over something wide no ground is seen at all, and its top, 10 m over the ground
-and seen 40 degrees off the vertical, would be drawn 8 m from its place.
+The ground is fitted from below, which suits houses and single trees: drawn on the ground they lean, and the
+streets next to them are in place. Under a wide object no ground is visible, and its top, 10 m above the ground
+and seen 40 degrees off nadir, would be drawn 8 m from its place.
 """
 
 from collections.abc import Iterator
@@ -24,11 +24,11 @@ _AT_ONCE = 20_000
 
 
 def with_tall_surfaces(ground: Terrain, points: Array, cell_m: float, most_nodes: int) -> Terrain:
-    """The ground with the tops of tall surfaces, as the pictures show it from above.
+    """The ground plus the tops of tall surfaces.
 
     Args:
         ground: bare ground.
-        points: float64 (K, 3) at free positions about cell_m apart, on whatever is seen there.
+        points: float64 (K, 3) at free positions about cell_m apart, on the visible surface.
         cell_m: their distance. most_nodes: the ground gets no more nodes than this.
     """
     c = active().surface
@@ -45,7 +45,7 @@ def with_tall_surfaces(ground: Terrain, points: Array, cell_m: float, most_nodes
 
 
 def _tall_points(xy: Array, over: Array, reach_m: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Smoothed height over the ground at each point (0 on it), and which points count; lone raised ones do not."""
+    """Smoothed height above ground of each point (0 on it), and which points are used; isolated raised ones are not."""
     c = active().surface
     tree = cKDTree(xy)
     raised = np.abs(over) > c.tall_from_m
@@ -72,14 +72,14 @@ def _parts(index: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
 
 
 def _pairs(tree: cKDTree, xy: Array, reach_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Positions (by index) and the tree's points within reach of them."""
+    """Index pairs of positions and of the tree's points within reach of them."""
     near: Any = tree.query_ball_point(xy, reach_m)
     own = np.repeat(np.arange(len(xy)), [len(n) for n in near])
     return own, np.concatenate(near).astype(np.intp)
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:
-    """The same ground with each step divided into so many."""
+    """The same ground with each step subdivided."""
     rows, columns = ((n - 1) * parts + 1 for n in ground.z.shape)
     step = ground.step_m / parts
     east, north = ground.west + step * np.arange(columns), ground.south + step * np.arange(rows)
@@ -90,7 +90,7 @@ def _finer(ground: Terrain, parts: int) -> Terrain:
 
 
 def _spread(xy: Array, top: Array, nodes: Terrain, reach_m: float) -> NDArray[np.float32]:
-    """What to add at each node: the median of the nearest points' tops, nothing far from all of them."""
+    """Height to add at each node: the median top of the nearest points, 0 far from all of them."""
     c = active().surface
     tree, (rows, columns) = cKDTree(xy), nodes.z.shape
     add = np.zeros((rows, columns))

@@ -1,7 +1,7 @@
-"""The ground under the pictures: a smooth surface below the points, and whether it is more than a plane.
+"""The ground under the pictures: a smooth surface fitted below the points, and its significance against a plane.
 
-Points of a reconstruction lie on the ground and on everything that stands on it, so the surface is fitted from
-below: far points above it lose their weight first. Heights and the nodes share the datum of the cameras.
+Points of a reconstruction lie on the ground and on objects above it, so the surface is fitted from
+below: points far above it lose their weight first. Heights and nodes are in the cameras' datum.
 """
 
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ HALF_MAXIMUM_SIGMAS = 1.1774
 
 @dataclass(frozen=True, slots=True)
 class TerrainFit:
-    """A fitted surface and what the adjustment and the renderer make of it.
+    """A fitted surface, with the height prior for the adjustment and the ground for rendering.
 
     Attributes:
         terrain: the surface T as fitted (not shrunk).
@@ -32,10 +32,10 @@ class TerrainFit:
         sd_m: standard deviation of T over nodes with data; median_m: its median there.
         ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
             the mode of the heights (rubble, cars and bushes only raise points).
-        points_above_m: how far the robust centre of the points lies over that ground; with a height prior around
-            level + points_above_m the ground itself comes to lie at the level.
-        support: bool (rows, columns), nodes that have data in a cell next to them.
-        settings: how it was fitted.
+        points_above_m: height of the points' robust centre above that ground; with a height prior around
+            level + points_above_m the ground itself is at the level.
+        support: bool (rows, columns), nodes with data in an adjacent cell.
+        settings: of the fit.
     """
 
     terrain: Terrain
@@ -55,13 +55,13 @@ class TerrainFit:
 
     @property
     def is_flat(self) -> bool:
-        """True where the relief cannot be told from noise, so that the prior is a level plane."""
+        """True if the relief cannot be distinguished from noise, so that the prior is a level plane."""
         return self.shrink == 0.0
 
     def prior(self, z0_m: float = 0.0) -> Terrain:
         """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
 
-        With z0 = level + points_above_m the ground itself comes to lie at the level, not the centre of all points.
+        With z0 = level + points_above_m the ground itself is at the level, not the centre of all points.
         """
         return _about(self.terrain, self.median_m, self.shrink, z0_m)
 
@@ -125,11 +125,11 @@ def fit_terrain(
 
 
 def lower_flank(height: Array, sigma: Array | None = None) -> float:
-    """Level of the ground among heights most of which are on it and the rest above it.
+    """Level of the ground from heights of points that lie mostly on it and partly above it.
 
     The half-maximum point on the lower side of the mode, moved up by the half width that a peak of the heights' own
-    noise would have: a symmetric peak returns its mode, one that is smeared upwards returns its lower edge. Of
-    several peaks the lowest one of sufficient density counts: corners crowd on car roofs.
+    noise would have: a symmetric peak returns its mode, a peak skewed upwards returns its lower edge. Of
+    several peaks the lowest one of sufficient density is used, as many corners lie on car roofs.
     """
     c = active().surface
     window_m, bin_m, kernel_m = c.ground_mode_window_m, c.ground_mode_bin_m, c.ground_mode_kernel_m

@@ -21,13 +21,13 @@ class GroundModel:
     """The present estimate of the ground.
 
     Attributes:
-        fit: the fitted terrain, None before there are enough points (then the ground is level at `level_m`, or has
-            the given shape).
-        level_m: height that the middle of the ground should have (0: the takeoff level).
-        ground_offset_m: height of the open ground over the surface through the corners; corners sit on raised things,
+        fit: the fitted terrain, None until there are enough points (then the ground is level at `level_m`, or has
+            the shape of the height model).
+        level_m: height of the ground's median (0: the takeoff level).
+        ground_offset_m: height of the open ground above the surface through the corners; corners lie on raised objects,
             so it is usually negative.
-        dem: height model that gives the ground's shape, None to find it from the points.
-        contradicted_m: median difference from a height model that is not used any more, as it contradicts the points.
+        dem: height model for the ground's shape, None to find it from the points.
+        contradicted_m: median difference from a height model that was dropped because it contradicts the points.
     """
 
     fit: TerrainFit | DemFit | None = None
@@ -47,7 +47,7 @@ class GroundModel:
         return Terrain.flat(self.level_m) if self.fit is None else self.fit.rendering(self.ground_offset_m)
 
     def height_prior(self, points: Array, sigma_m: float | None = None, robust_c: float | None = None) -> HeightPrior:
-        """The height prior of points (P, 3); sigma and robust scale are the configuration's unless given."""
+        """The height prior of points (P, 3); sigma and robust scale default to the configuration's."""
         config = active().surface
         if self.fit is None:
             expected = self._initial_height(points[:, :2])
@@ -66,7 +66,7 @@ class GroundModel:
 
 
 def ground_points(adjustment: Adjustment) -> tuple[Array, Array]:
-    """Points fit for the terrain, float64 (K, 3), and one sigma of their heights (K,)."""
+    """Points suitable for the terrain, float64 (K, 3), and one sigma of their heights (K,)."""
     c = active().surface
     n = len(adjustment.points)
     point = adjustment.tracks.point
@@ -102,9 +102,9 @@ def fit_ground(
     kappa: float | None = None,
     settings: FitSettings | None = None,
 ) -> GroundModel:
-    """Fit the ground below cameras (N, 3) to points (P, 3) with sigmas (P,); too few points leave it as it was.
+    """Fit the ground below cameras (N, 3) to points (P, 3) with sigmas (P,); with too few points it stays unchanged.
 
-    A height model that contradicts the points is not used from then on.
+    A height model that contradicts the points is dropped for good.
     """
     c = active().surface
     if len(points) < c.terrain_points:

@@ -22,9 +22,9 @@ def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped
 def choose(  # type: ignore[no-untyped-def]
     position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, enough, ref, partner
 ):
-    """For each cell the nearest-nadir picture and its partners: those closest to the wished signed baselines.
+    """For each cell the picture nearest to nadir and its partners: those closest to the desired signed baselines.
 
-    least: shortest baseline. enough: with fewer partners pictures of other legs are added.
+    least: shortest baseline. enough: below this number of partners, pictures of other legs are added.
     """
     for c in range(len(cells)):
         x, y, z = cells[c, 0], cells[c, 1], plane[c, 0]
@@ -64,7 +64,7 @@ def choose(  # type: ignore[no-untyped-def]
 def _fill_from_other_legs(  # type: ignore[no-untyped-def]
     position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner
 ):
-    """Where the reference's own leg ends before enough partners are found, those of other legs nearest above."""
+    """Add the nearest pictures of other legs where the reference's own leg ends before enough partners are found."""
     count, reach = 0, 0.0
     for w in range(len(wished)):
         count += partner[w] >= 0
@@ -96,7 +96,7 @@ def _fill_from_other_legs(  # type: ignore[no-untyped-def]
 
 @kernel
 def _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, h):  # type: ignore[no-untyped-def]
-    """Where a partner's (p) ray meets the plane, for the point at height h over it on the reference's (c) ray.
+    """Where a partner's (p) ray meets the plane, for the point at height h above it on the reference's (c) ray.
 
     The plane goes through (x, y, z) with slope (gx, gy), and the reference's ray through that point.
     """
@@ -161,7 +161,7 @@ def _inside(i, half_u, um, ua, ub, vm, va, vb, rows, columns):  # type: ignore[n
 
 @kernel
 def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-untyped-def]
-    """True where a row that begins and ends in the picture bends out of it in between (on a cliff)."""
+    """True if a row that begins and ends inside the picture leaves it in between (at a cliff)."""
     if bend == 0.0:
         return False
     s = -0.5 * slope / bend
@@ -217,13 +217,13 @@ def _pair(  # type: ignore[no-untyped-def]
     total,
     seen,
 ):
-    """Add one partner's correlation at each height to `total` and count it in `seen`."""
+    """Add one partner's correlation at each height to `total`, and count it in `seen`."""
     n, top = 2 * half + 1, heights[-1]
     cx, cy, cz = position[r]
     px, py, pz = position[p]
     z, gx, gy = plane
     lowest = min(cz - gx * (cx - x) - gy * (cy - y), pz - gx * (px - x) - gy * (py - y)) - z
-    if lowest < 1.5 * top:  # the sweep would pass the cameras
+    if lowest < 1.5 * top:  # the sweep would reach the cameras' height
         return
     ax, ay = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, -top)
     bx, by = _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, top)
@@ -298,9 +298,9 @@ def correlate(  # type: ignore[no-untyped-def]
 
 @kernel
 def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyped-def]
-    """Height and score of each curve's peak; score -1 where it lies at the end, or where a rival is as good.
+    """Height and score of each curve's peak; score -1 if it lies at an end or if another peak is about as high.
 
-    Neither counts a curve that is not known over the inner half of the heights: its true peak may be in the gap.
+    Also -1 for a curve with gaps in the inner half of the heights, where the true peak may be.
     """
     step = heights[1] - heights[0]
     for c in range(len(curve)):
@@ -327,7 +327,7 @@ def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyp
 
 @kernel
 def raise_points(position, ref, cells, plane, height, points):  # type: ignore[no-untyped-def]
-    """Points at heights over the cells' planes, on the rays of the reference cameras through the cells."""
+    """Points at heights above the cells' planes, on the reference cameras' rays through the cells."""
     for m in range(len(cells)):
         cx, cy, cz = position[ref[m]]
         x, y, z, gx, gy = cells[m, 0], cells[m, 1], plane[m, 0], plane[m, 1], plane[m, 2]

@@ -1,10 +1,10 @@
-"""Ground points where tracks are missing: the vertical line locus method with several pictures.
+"""Ground points between tie points: the vertical line locus method with several pictures.
 
-At a free position the picture nearest to the vertical is the reference. Partners before and behind it on the same leg
-are compared with it for every height, and where the leg ends too early pictures of other legs. A patch of the reference
+At a free position the picture nearest to nadir is the reference. Partners before and behind it on the same leg
+(where the leg ends too early, pictures of other legs) are compared with it at every height. A patch of the reference
 is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on that plane:
-there a change of height is a shift, so each picture is sampled once and all heights are tried by one correlation along
-the strip. Pictures are read one after the other along the legs, and only a window of them is held.
+there a change of height is a shift, so each picture is sampled once and all heights are tested by one correlation along
+the strip. Pictures are read one after the other along the legs, with only a window of them in memory.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,19 +25,19 @@ Gray = Callable[[int], NDArray[np.uint8]]
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """How heights are searched. Lengths in metres, for the reference height above ground; see `at_height`.
+    """Settings of the height search. Lengths in metres, for the reference height above ground; see `at_height`.
 
     Attributes:
         half: half width of the square patch in samples (7: 15 x 15 samples).
-        step_m: distance of samples.
-        reach_m: heights searched above and below the terrain; height_step_m: their distance (peaks are
+        step_m: spacing of samples.
+        reach_m: range searched above and below the terrain; height_step_m: step of the heights (peaks are
             interpolated by a parabola).
         min_score: least mean normalised correlation.
         rival_m: a second peak farther than this from the best one, above rival_share of it, makes the height
             ambiguous; infinite switches the test off.
         sigma_m: one sigma of a height on open ground, for the fit.
-        baselines_m: wished distances of the partners, on both sides of the reference.
-        spacing_m: only pictures this far apart along a leg are used, so that few have to be decoded.
+        baselines_m: desired distances of the partners, on both sides of the reference.
+        spacing_m: only pictures this far apart along a leg are used, to limit decoding.
     """
 
     half: int
@@ -53,13 +53,13 @@ class Sweep:
 
     @classmethod
     def small(cls) -> "Sweep":
-        """Small patches, which fit between cars, bushes and houses: most of their heights are those of bare ground."""
+        """Small patches, which fit between cars, bushes and houses, so that most of their heights are bare ground."""
         c = active().surface
         return cls._with_patch(c.small_patch_half, c.small_patch_step_m, c.small_patch_score, c.small_patch_sigma_m)
 
     @classmethod
     def large(cls) -> "Sweep":
-        """Large patches, which find heights on ground with little texture."""
+        """Large patches, for ground with little texture."""
         c = active().surface
         return cls._with_patch(c.large_patch_half, c.large_patch_step_m, c.large_patch_score, c.large_patch_sigma_m)
 
@@ -73,7 +73,7 @@ class Sweep:
         )  # fmt: skip
 
     def at_height(self, height_m: float) -> "Sweep":
-        """The same sweep for cameras at another height above ground: all but the reach scales."""
+        """The same sweep for cameras at another height above ground: all lengths but the reach are scaled."""
         k = height_m / active().surface.reference_height_m
         return replace(
             self,
@@ -87,17 +87,17 @@ class Sweep:
 
     @property
     def heights(self) -> Array:
-        """The heights searched, about zero."""
+        """The heights to test, relative to the terrain."""
         count = int(np.ceil(self.reach_m / self.height_step_m))
         return np.asarray(np.arange(-count, count + 1) * self.height_step_m, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class LocusPoints:
-    """Points that a sweep found.
+    """Points found by a sweep.
 
     Attributes:
-        points: float64 (M, 3), on the reference's ray through the position, so slightly off it.
+        points: float64 (M, 3), on the reference's ray through the position, so slightly off the position.
         sigma_z: float64 (M,), one sigma of each height.
         score: float64 (M,), mean normalised correlation at the peak.
         cell: int64 (M,), which of the positions each point belongs to, ascending.
@@ -119,18 +119,18 @@ def dense_ground(
     *,
     slots: int | None = None,
 ) -> LocusPoints:
-    """Heights at free positions from correlation between pictures, of one leg where there are enough.
+    """Heights at free positions from correlation between pictures, preferably of one leg.
 
     Args:
         cameras: cameras of one or several vehicles.
         gray: picture of a camera by its index, uint8 (rows, columns) as its lens says; called in the order of the
-            legs, once a picture unless a window of `slots` pictures is too short for it.
+            legs, once per picture unless a window of `slots` pictures is too short.
         cells: float64 (C, 2), positions, east and north.
-        terrain: where heights are searched around; its slope tilts the patches.
+        terrain: surface around which heights are searched; its slope tilts the patches.
         leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
-        sweeps: how to search, one after the other, each at the positions where those before found nothing. Baselines
+        sweeps: applied in order, each to the positions where those before found nothing. Baselines
             and spacing are the first one's. None: small patches, then large, for the cameras' height above the terrain.
-        slots: pictures held at a time (more only where the cells of one reference need more); None: as configured.
+        slots: pictures in memory at a time (more only if the cells of one reference need more); None: as configured.
     """
     c = active().surface
     if sweeps is None:
@@ -169,7 +169,10 @@ def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _UsableCameras:
-    """Cameras used as reference or partner, sorted by leg and way along it; order: rank of every camera, -1 unused."""
+    """Cameras used as reference or partner, sorted by leg and distance along it.
+
+    Order: rank of every camera, -1 unused.
+    """
 
     camera: NDArray[np.int32]
     leg: NDArray[np.int64]
@@ -180,7 +183,7 @@ class _UsableCameras:
 def spaced_cameras(
     cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
-    """Cameras at least so far apart along their legs, and each leg's last one: leg, camera and way along it, sorted."""
+    """Cameras spaced along their legs, and each leg's last one: leg, camera and distance along it, sorted."""
     camera: list[int] = []
     leg: list[int] = []
     along: list[float] = []
@@ -231,9 +234,9 @@ def _sweep_in_windows(
     slots: int,
     found: Array,
 ) -> None:
-    """Search all cells in the order of the legs, the pictures held in a bounded stack.
+    """Search all cells in the order of the legs, with a bounded stack of pictures in memory.
 
-    found: float64 (C, 3), height over the plane, score, sigma of each cell; untouched where nothing is found.
+    found: float64 (C, 3), height over the plane, score, sigma of each cell; unchanged where nothing is found.
     """
     usable = np.flatnonzero(ref >= 0)
     if len(usable) == 0:
@@ -272,7 +275,7 @@ def _sweep_in_windows(
 
 
 class _Window:
-    """The pictures held at a time, shrunk to what the sweep needs: a stack, and the slot of each camera in it."""
+    """The pictures in memory, reduced to the needed resolution: a stack, and each camera's slot in it."""
 
     def __init__(self, cameras: CameraBlock, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
         self.factor = factor
@@ -282,7 +285,7 @@ class _Window:
         self._lens_id, self._gray, self._free = cameras.lens_id, gray, list(range(slots))
 
     def hold(self, wanted: list[int]) -> None:
-        """Read the pictures that are not held yet, into the places of those no longer needed."""
+        """Read the pictures that are not in memory yet, into the slots of those no longer needed."""
         for camera in set(np.flatnonzero(self.slot >= 0).tolist()).difference(wanted):
             self._free.append(int(self.slot[camera]))
             self.slot[camera] = -1
@@ -295,7 +298,7 @@ class _Window:
 
 
 def _reduction(cameras: CameraBlock, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
-    """Whole number by which each lens's pictures are shrunk, so that a pixel is not finer than a sample needs."""
+    """Integer by which each lens's pictures are reduced, so that pixels are not finer than the samples."""
     above = float(np.median(cameras.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
     gsd = max(above, 1.0) / cameras.lens[:, F]
     return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
