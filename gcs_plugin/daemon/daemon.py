@@ -166,7 +166,9 @@ class Daemon:
             if settings.dem is not None:
                 self.terrain = TerrainData(settings.dem, self.links.fleet)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
-        self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
+        self.gap_flights = GapFlights(
+            self.coverage, self.plans, self.links, lambda: {} if self.takeoffs is None else self.takeoffs.rows()
+        )
         self.sources = [
             Source(
                 v.id,

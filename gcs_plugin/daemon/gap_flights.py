@@ -1,7 +1,8 @@
 """Flights over what was missed: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
@@ -13,6 +14,10 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 _NARROWER: Final = 0.995
 """The solved field of view is taken a little narrower."""
 _LONGEST_MIN: Final = 600.0
+_ON_ITS_WAY: Final = frozenset({"on mission", "paused", "holding", "flying"})
+_EARTH_M: Final = 6_371_000.0
+_HOME_M_S: Final = 5.0
+"""A plan ends where a vehicle in the air began it; from there it still flies home, at least so fast."""
 
 
 class GapFlights:
@@ -20,23 +25,34 @@ class GapFlights:
 
     Args:
         coverage: whose gaps. plans: of the workspace. links: the vehicles, None without links.
+        takeoffs: gives a row for each vehicle whose takeoff waits (`Takeoffs.rows`).
     """
 
-    def __init__(self, coverage: LiveCoverage, plans: Plans, links: VehicleLinks | None) -> None:
-        self._coverage, self._plans, self._links = coverage, plans, links
+    def __init__(
+        self,
+        coverage: LiveCoverage,
+        plans: Plans,
+        links: VehicleLinks | None,
+        takeoffs: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
+    ) -> None:
+        self._coverage, self._plans, self._links, self._takeoffs = coverage, plans, links, takeoffs
 
     def vehicles(self) -> list[dict[str, Any]]:
         """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: to be asked), `busy` (why not now).
 
-        Minutes are those until the reserve, by what the vehicle's flight so far has cost.
+        Minutes are those until the reserve, by what the vehicle's flight so far has cost. `in_air` is true for a busy
+        one that may be given the gaps in the air, if the operator says so for this vehicle.
         """
-        rows = []
+        rows: list[dict[str, Any]] = []
+        due = [vehicle for vehicle, takeoff in self._takeoffs().items() if "in_s" in takeoff]
         for row in [] if self._links is None else self._links.rows():
             seconds = self._coverage.battery.seconds(str(row["id"]), RESERVE)
             rows.append({
                 "id": row["id"], "battery": row["battery"],
-                "minutes": None if seconds is None else round(seconds / 60.0, 1), "busy": _busy(row),
-                "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"],
+                "minutes": None if seconds is None else round(seconds / 60.0, 1),
+                "busy": "its takeoff is due; cancel it first" if row["id"] in due else _busy(row),
+                "in_air": self._plans.dem is None and _may_go_on(row),
+                "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"], "home": row["home"],
             })  # fmt: skip
         return rows
 
@@ -45,7 +61,8 @@ class GapFlights:
 
         Args:
             body: `vehicles` {id: minutes that it can fly, or null for what its battery says}; `altitude_m`, that of the
-                plan before unless given; `fly_not_arrived`: gaps, too, whose pictures were taken and have not arrived.
+                plan before unless given; `fly_not_arrived`: gaps, too, whose pictures were taken and have not arrived;
+                `in_air`: vehicles that may be given the gaps in the air: to be paused, then uploaded to and started.
 
         Returns:
             The plan's figures with its `id`, and `names`: the plan's vehicle -> the daemon's.
@@ -55,7 +72,7 @@ class GapFlights:
             OrthoSwarmError: a vehicle is still flying.
         """
         known = {row["id"]: row for row in self.vehicles()}
-        chosen = _minutes(body.get("vehicles"), known)
+        chosen = _minutes(body.get("vehicles"), known, body.get("in_air", ()))
         fov_deg, altitude_m, notes = self._camera(list(chosen), body)
         ordered = sorted(chosen, key=lambda vehicle: -chosen[vehicle])
         values = {
@@ -94,17 +111,27 @@ def _busy(row: Mapping[str, Any]) -> str:
     if row["state"] == "lost":
         return "its link is lost"
     if row["armed"]:
-        return "it is still flying; bring it home first"
+        return "it is still flying; bring it home first" + (
+            ", or confirm that it gets another mission in the air" if _may_go_on(row) else ""
+        )
     return "" if row["lat_deg"] is not None else "it has no position"
 
 
-def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Vehicle -> minutes that it can fly.
+def _may_go_on(row: Mapping[str, Any]) -> bool:
+    """Whether a vehicle is in the air in a state from which another mission can be begun."""
+    ready = row["armed"] and row["state"] == "found" and row["flight"]["state"] in _ON_ITS_WAY
+    return bool(ready and row["lat_deg"] is not None and row.get("home"))
+
+
+def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -> dict[str, float]:
+    """Vehicle -> minutes that it can fly; for one in the air less the way from where it is to its home.
 
     Raises:
         InputError: no vehicle, an unknown one, or one whose battery is not known.
         OrthoSwarmError: a vehicle is still flying, or lost.
     """
+    if not isinstance(in_air, list | tuple) or not all(isinstance(vehicle, str) for vehicle in in_air):
+        raise InputError('in_air is no list of vehicles; send for example ["v1"], or nothing')
     if not isinstance(wanted, dict) or not wanted:
         raise InputError('vehicles is missing; send for example {"v1": null, "v2": 12}')
     chosen = {}
@@ -112,12 +139,23 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]]) -> dict[str, f
         row = known.get(vehicle)
         if row is None:
             raise InputError(f"{vehicle} is not on the links; see /api/coverage/vehicles")
-        if row["busy"]:
+        goes_on = row["in_air"] and vehicle in in_air
+        if row["busy"] and not goes_on:
             raise OrthoSwarmError(f"{vehicle} gets no other flight: {row['busy']}")
         minutes = row["minutes"] if given is None else given
         if minutes is None:
             raise InputError(f"how long {vehicle} can fly is not known; send its minutes, it is not guessed")
         if isinstance(minutes, bool) or not isinstance(minutes, int | float) or not 0.0 < minutes <= _LONGEST_MIN:
             raise InputError(f"{vehicle} cannot fly for {minutes} minutes; send a number from 1 to {_LONGEST_MIN:g}")
-        chosen[str(vehicle)] = float(minutes)
+        chosen[str(vehicle)] = float(minutes) - (_home_min(row) if goes_on else 0.0)
+        if chosen[str(vehicle)] <= 0.0:
+            raise InputError(f"{vehicle} cannot fly for {minutes} minutes more and come home; bring it home now")
     return chosen
+
+
+def _home_min(row: Mapping[str, Any]) -> float:
+    """Minutes home from where a vehicle is."""
+    lat, lon = math.radians(row["lat_deg"]), math.radians(row["lon_deg"])
+    home_lat, home_lon = (math.radians(v) for v in row["home"][:2])
+    away_m = _EARTH_M * math.hypot(home_lat - lat, (home_lon - lon) * math.cos(lat))
+    return away_m / _HOME_M_S / 60.0

@@ -19,7 +19,7 @@ from orthoswarm.model.errors import InputError
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
 _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
-    "clearance_m", "height_tolerance_m",
+    "clearance_m", "height_tolerance_m", "wait_min",
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6
 _NO_FLY_FILE: Final = "no-fly.geojson"
@@ -38,7 +38,7 @@ class Plans:
     """
 
     def __init__(self, folder: Path, dem: Path | None = None) -> None:
-        self.folder, self._dem = folder, dem
+        self.folder, self.dem = folder, dem
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,7 +88,7 @@ class Plans:
                 no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
                 figures: dict[str, Any] = pool.run(
-                    plan_into, PlanRequest(area=path / name, no_fly=no_fly, dem=self._dem, **values)
+                    plan_into, PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, **values)
                 )
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)

@@ -8,7 +8,7 @@ does, as line 0.
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from orthoswarm.model.errors import InputError
@@ -18,7 +18,7 @@ Autopilot = Literal["ardupilot", "px4"]
 LatLon = tuple[float, float]
 
 FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE, FRAME_TERRAIN = 0, 2, 3, 10
-NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 17, 20, 21, 22, 82
+NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_LOITER_TIME, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 17, 19, 20, 21, 22, 82
 DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
 _FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
 _GROUND_SPEED = 1.0
@@ -131,6 +131,8 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
         if point.camera is not None:
             distance, at_once = (plan.trigger_m, 1.0) if point.camera else (0.0, 0.0)
             items.append(MissionItem(DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
+        if point.wait_s:
+            items.append(replace(fly_to(point), command=NAV_LOITER_TIME, params=(point.wait_s, 0.0, 0.0, yaw)))
     if plan.end == "rtl":
         items.append(MissionItem(NAV_RTL))
     elif plan.end == "land":

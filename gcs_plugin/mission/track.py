@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
+from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, LOITER_TIME, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
@@ -43,13 +43,14 @@ class Track:
         return np.asarray(np.hypot(*(self.places[:, :2] - self.places[0, :2]).T) < radius_m)
 
 
-def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, float]:
-    """The points of a mission, float64 (n, 3): east, north, height in metres; and its speed in m/s.
+def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, Array, float]:
+    """The points of a mission, float64 (n, 3): east, north, height in metres; the wait before each, s; speed in m/s.
 
     Args:
         mission: the mission. origin: latitude and longitude in degrees of east 0, north 0.
     """
     points: list[tuple[float, float, float]] = []
+    waits: dict[int, float] = {}
     home, speed = _home_of(mission), _SPEED_M_S
     base = _ground_m(mission)
     if home is not None:
@@ -69,17 +70,21 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
                 points.append((*_metres(*place, origin), points[-1][2]))
                 height = 0.0
             points.append((*_metres(*place, origin), height))
-    return np.array(points, float).reshape(-1, 3), speed
+            if item.command == LOITER_TIME:
+                points.append(points[-1])
+                waits[len(points) - 1] = item.params[0]
+    before = np.array([waits.get(k, 0.0) for k in range(len(points))])
+    return np.array(points, float).reshape(-1, 3), before, speed
 
 
 def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     """A mission as positions over time."""
     from orthoswarm.planning.sorties.flight_time import Motion
 
-    points, speed = flight_path(mission, origin)
+    points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points)
-    times = Motion(speed_m_s=speed).times(points)
+    times = Motion(speed_m_s=speed).times(points) + np.cumsum(waits)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
 

@@ -85,6 +85,7 @@ def _vehicle(vehicle: VehiclePlan) -> dict[str, Any]:
             "turns": sortie.turns,
             "photos": sortie.photos,
             "legs": len(sortie.legs),
+            "wait_s": max((point.wait_s for point in sortie.waypoints), default=0.0),
             "takeoff_height_m": sortie.takeoff_height_m,
         }
         for index, sortie in enumerate(vehicle.sorties)

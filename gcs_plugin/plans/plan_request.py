@@ -53,6 +53,7 @@ class PlanRequest:
         endurance_min: longest flight, None without a limit. endurances_min: of each vehicle, where they differ.
             swap_min: time to change a battery.
         side_overlap, forward_overlap: shares of a picture. aspect: a picture's width over its height.
+        wait_min: how long a vehicle stays at the end of its last leg, as far as its endurance allows.
         clearance_m: distance to no-fly zones, None for the default. separation_m: between vehicles.
         height_step_m: between the heights of ways out and home. ceiling_m: the highest of them, None for four steps
             above the lines.
@@ -79,6 +80,7 @@ class PlanRequest:
     endurance_min: float | None = None
     endurances_min: Sequence[float] = ()
     swap_min: float = 2.0
+    wait_min: float = 0.0
     side_overlap: float = 0.4
     forward_overlap: float = 0.8
     aspect: float = 4.0 / 3.0
@@ -126,6 +128,7 @@ class PlanRequest:
             separation=Separation(self.separation_m, step, layers, swap_s=60.0 * self.swap_min),
             most_items=MOST_ITEMS[self.autopilot],
             run_in_m=self.run_in_m,
+            wait_s=60.0 * self.wait_min,
         )
 
 

@@ -1,6 +1,7 @@
 """How a simulated vehicle flies its mission: item by item, with the camera, and ending it as its autopilot does."""
 
 import enum
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from random import Random
 from typing import Final
@@ -89,6 +90,7 @@ class Flight:
         seq: current item; state: MISSION_STATE.
         landed: MAV_LANDED_STATE.
         reached: items reached since the last look; texts: texts since then; exposures: all pictures.
+        triggers: how often the camera was triggered; at those in misfires it took no picture.
     """
 
     autopilot: Autopilot
@@ -103,6 +105,8 @@ class Flight:
     reached: list[int] = field(default_factory=list)
     texts: list[str] = field(default_factory=list)
     exposures: list[Exposure] = field(default_factory=list)
+    triggers: int = 0
+    misfires: Collection[int] = ()
     time_s: float = 0.0
     paused: bool = False
     _task: Task = Task.STAND
@@ -392,5 +396,8 @@ class Flight:
         if last is not None and (north - last[0]) ** 2 + (east - last[1]) ** 2 < self._trigger_m**2:
             return
         self._last_photo = (north, east)
+        self.triggers += 1
+        if self.triggers in self.misfires:
+            return
         lat, lon = self.motion.chart.to_degrees(north, east)
         self.exposures.append(Exposure(len(self.exposures), self.time_s, self.motion.pose(self.time_s), lat, lon))

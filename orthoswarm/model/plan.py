@@ -23,6 +23,7 @@ class Waypoint:
             last point (they stop), None where nothing changes.
         above_ground_m: nominal height above the ground where heights follow it, else None.
         between: the point lies on a straight way and was put in for its height alone.
+        wait_s: how long the vehicle stays there before it flies on.
     """
 
     lat_deg: float
@@ -31,6 +32,7 @@ class Waypoint:
     camera: bool | None = None
     above_ground_m: float | None = None
     between: bool = False
+    wait_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

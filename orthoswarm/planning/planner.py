@@ -303,6 +303,7 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
             marks[int(flight.camera[k])],
             None if np.isnan(flight.above_m[k]) else float(flight.above_m[k]),
             bool(flight.between[k]),
+            flight.wait_s if k == flight.last_leg_end else 0.0,
         )
         for k in range(len(places))
     )

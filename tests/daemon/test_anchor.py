@@ -6,8 +6,8 @@ import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
 from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
-from tests.daemon.test_daemon_flight import square
 from tests.kit.daemon_kit import Shot, camera_at, jpeg, line, pose_of, serving, tile_over
+from tests.kit.sim_cameras import square
 
 
 def moved(shots, lat_deg, lon_deg, **more):

@@ -8,8 +8,8 @@ import types
 import pytest
 
 from gcs_plugin.mavproxy.daemon_client import Client, Commands
-from tests.daemon.test_daemon_flight import square
 from tests.kit.daemon_kit import line, serving
+from tests.kit.sim_cameras import square
 
 
 @pytest.fixture(scope="module")

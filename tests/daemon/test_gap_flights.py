@@ -23,6 +23,7 @@ def _row(vehicle: str, doing: str = "on mission", **more: Any) -> dict[str, Any]
     return {
         "id": vehicle, "state": "found", "armed": True, "battery": 0.8, "flight": {"state": doing},
         "mission": {"phase": "active"}, "lat_deg": float(lat), "lon_deg": float(lon),
+        "home": [float(lat), float(lon)],
     } | more  # fmt: skip
 
 
@@ -48,6 +49,14 @@ def test_a_leg_is_over_once_it_was_left_after_its_end() -> None:
     _fly(flown, "v1", [(0.0, -30.0), (0.0, 295.0)])
     assert not flown.over.any()
     _fly(flown, "v1", [(0.0, 300.0), (50.0, 330.0)])
+    assert flown.over.tolist() == [True, False, False, False]
+
+
+def test_a_leg_is_over_while_its_vehicle_waits_at_its_end() -> None:
+    flown = FlownLegs(_legs(), 20.0, 15.0)
+    _fly(flown, "v1", [(0.0, -30.0), (0.0, 290.0)])
+    assert not flown.over.any()
+    _fly(flown, "v1", [(0.0, 290.0), (0.0, 299.5), (0.0, 299.5)])
     assert flown.over.tolist() == [True, False, False, False]
 
 
@@ -157,3 +166,26 @@ def test_who_cannot_or_must_not_fly_is_refused_in_a_sentence(
 ) -> None:
     with pytest.raises(error, match=said):
         _flights(tmp_path, [row]).plan({"vehicles": {"v1": minutes}, "altitude_m": 60.0})
+
+
+def test_a_vehicle_in_the_air_gets_another_mission_only_if_that_was_confirmed_for_it(tmp_path: Path) -> None:
+    lat, lon = LocalGrid(EPSG).to_geographic(CORNER + np.array([600.0, 0.0]))
+    flights = _flights(tmp_path, [_row("v1", home=[float(lat), float(lon)]), _row("v2", "landing")])
+    assert [row["in_air"] for row in flights.vehicles()] == [True, False]
+    wanted = {"vehicles": {"v1": 9.0}, "altitude_m": 60.0}
+    with pytest.raises(OrthoSwarmError, match="still flying"):
+        flights.plan(wanted)
+    with pytest.raises(OrthoSwarmError, match="still flying"):
+        flights.plan(wanted | {"vehicles": {"v2": 9.0}, "in_air": ["v2"]})
+    made = flights.plan(wanted | {"in_air": ["v1"]})
+    # 600 m to its home at 5 m/s are kept back: 9 min less 2
+    assert max(f["time_s"] for f in made["vehicles"][0]["flights"]) <= 7 * 60.0
+    with pytest.raises(InputError, match="bring it home now"):
+        flights.plan(wanted | {"vehicles": {"v1": 1.5}, "in_air": ["v1"]})
+
+
+def test_a_vehicle_whose_takeoff_is_due_gets_no_other_mission(tmp_path: Path) -> None:
+    links = _Links([_landed("v1")])
+    flights = GapFlights(_Coverage(None), Plans(tmp_path / "p"), links, lambda: {"v1": {"in_s": 4.0}})  # type: ignore[arg-type]
+    with pytest.raises(OrthoSwarmError, match="takeoff is due"):
+        flights.plan({"vehicles": {"v1": 9.0}, "altitude_m": 60.0})

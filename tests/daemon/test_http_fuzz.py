@@ -16,9 +16,9 @@ import httpx
 import pytest
 
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from tests.daemon.test_daemon_flight import square
 from tests.kit.daemon_kit import GRID, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
+from tests.kit.sim_cameras import square
 
 COUNT = int(os.environ.get("ORTHOSWARM_FUZZ", "3000"))
 LIMIT_S = float(os.environ.get("ORTHOSWARM_FUZZ_S", "inf"))

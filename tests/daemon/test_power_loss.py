@@ -23,8 +23,8 @@ from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.web.guard import take_token
 from orthoswarm.model.errors import InputError
 from tests.daemon.test_daemon_crash import check, post_until_gone
-from tests.daemon.test_daemon_flight import square
 from tests.kit.daemon_kit import line, serving, start, stop, tile_over
+from tests.kit.sim_cameras import square
 
 # Loaded by every interpreter of the daemon: notes what was synced, and how long it was then.
 SPY = """

@@ -66,3 +66,32 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             page.click("text=Upload, then check and start…")
             page.wait_for_selector("#preflight-title >> visible=true")
             assert _posts(station)[1].endswith("/v1/upload") and not any(p.endswith("/start") for p in _posts(station))
+
+
+def test_a_vehicle_in_the_air_is_ticked_by_hand_and_paused_before_it_gets_another_mission(browser):
+    with standing(vehicle(1, armed=True)) as station:
+        row = {"id": "v1", "battery": 0.8, "minutes": 9.0, "busy": "it is still flying", "in_air": True}
+        station.gets |= {
+            "/api/coverage": COVERAGE, "/api/plans/plan-1/map": {"features": []}, "/api/coverage/vehicles": [row],
+        }  # fmt: skip
+
+        def answer(method, path, body):
+            if path.endswith("/pause"):
+                return 200, {"id": body["id"], "vehicle": "v1", "command": "pause", "outcome": "done", "reason": ""}
+            return _answer(method, path, body)
+
+        station.answer = answer
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            page.wait_for_function("document.querySelector('.gaps button')?.textContent.includes('not triggered')")
+            page.click("text=Fly the gaps…")
+            box = page.locator(".gap-vehicles input[type=checkbox]")
+            box.wait_for()
+            assert box.is_enabled() and not box.is_checked()
+            box.check()
+            page.click("dialog[open] button:text-is('Plan')")
+            page.wait_for_selector("text=it is paused before it gets the new mission")
+            assert station.heard[-1][2] == {"vehicles": {"v1": 9}, "in_air": ["v1"]}
+            page.click("text=Upload, then check and start…")
+            page.wait_for_selector("#preflight-title >> visible=true")
+            assert [path.rsplit("/", 1)[-1] for path in _posts(station)][1:3] == ["pause", "upload"]

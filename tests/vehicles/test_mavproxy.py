@@ -25,9 +25,9 @@ from gcs_plugin.mavproxy.daemon_client import Commands
 from gcs_plugin.mavproxy.packet_feed import Feed
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from tests.daemon.test_daemon_flight import Cameras, square
 from tests.kit.daemon_kit import GRID, Served, _end_with_us
 from tests.kit.mosaic_scene import EAST, NORTH
+from tests.kit.sim_cameras import Cameras, square
 
 PROGRAM = Path(sys.executable).with_name("mavproxy.py")
 

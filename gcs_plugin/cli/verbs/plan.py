@@ -65,6 +65,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     wind_help = "where it comes from, degrees clockwise from north; --speed is then the speed through the air"
     flight.add_argument("--wind-from", type=float, default=0.0, metavar="DEG", help=wind_help)
     flight.add_argument("--swap", type=float, default=2.0, metavar="MIN", help="time to change a battery (default 2)")
+    wait_help = "stay at the end of the last line for the coverage to be known, within --endurance, then come home"
+    flight.add_argument("--wait", type=float, default=0.0, metavar="MIN", help=wait_help)
     camera = parser.add_argument_group("pictures")
     camera.add_argument("--side-overlap", type=float, default=0.4, metavar="SHARE", help="between lines (default 0.4)")
     camera.add_argument("--forward-overlap", type=float, default=0.8, metavar="SHARE", help="along lines (default 0.8)")
@@ -137,6 +139,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         wind_m_s=args.wind_m_s,
         wind_from_deg=args.wind_from,
         swap_min=args.swap,
+        wait_min=args.wait,
         side_overlap=args.side_overlap,
         forward_overlap=args.forward_overlap,
         aspect=_aspect(args.aspect),

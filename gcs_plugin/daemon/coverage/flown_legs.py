@@ -11,6 +11,8 @@ from gcs_plugin.daemon.coverage.planned_area import PlannedLegs
 
 Array = NDArray[np.float64]
 _LEAST_REACH_M: Final = 12.0
+_ARRIVED_M: Final = 3.0
+"""A vehicle so near the end of a leg has flown it, though it waits there."""
 _IDLE_S: Final = 60.0
 _MISSION_OVER: Final = ("complete", "aborted")
 
@@ -19,8 +21,8 @@ _MISSION_OVER: Final = ("complete", "aborted")
 class FlownLegs:
     """Follows vehicles along the legs of a plan.
 
-    A leg is over once a vehicle has flown along it from end to end, or the vehicle that is to fly it has ended that
-    flight. When nobody flies and no picture has come for a minute, all that was not seen is missed.
+    A leg is over once a vehicle has flown along it from end to end (it may wait there), or the vehicle that is to fly
+    it has ended that flight. When nobody flies and no picture has come for a minute, all that was not seen is missed.
 
     Attributes:
         legs: of the plan. reach_m: how far beside a leg a vehicle still flies along it.
@@ -80,7 +82,7 @@ class FlownLegs:
         on = (across < self._reach) & (along > -self._ahead) & (along < self._length + self._ahead)
         seen = self._along.setdefault(vehicle, np.stack([np.full(len(on), np.inf), np.full(len(on), -np.inf)]))
         through = (seen[0] < self._ahead) & (seen[1] > self._length - self._ahead)
-        self.flown |= through & ~on
+        self.flown |= through & (~on | (along > self._length - _ARRIVED_M))
         seen[0] = np.where(on, np.minimum(seen[0], along), np.inf)
         seen[1] = np.where(on, np.maximum(seen[1], along), -np.inf)
 

@@ -28,6 +28,7 @@ _SPARE_ITEMS = 40
 _FARTHEST_M = 100_000.0
 _SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
 _LONGEST_RUN_IN_M = 200.0
+_LONGEST_WAIT_S = 3600.0
 _MOST_WIND = 0.8  # of the speed through the air
 _FAIR, _UNFAIR = 1.15, 1.22
 
@@ -48,6 +49,8 @@ class Options:
         separation: how far apart vehicles stay.
         most_items: mission items that the autopilot can hold.
         run_in_m: straight flight in line with a leg before its first picture, so that the vehicle is out of its turn.
+        wait_s: how long a vehicle stays at the end of its last flight's last leg before it comes home, as far as its
+            endurance allows.
     """
 
     motion: Motion = field(default_factory=Motion)
@@ -59,6 +62,7 @@ class Options:
     separation: Separation = field(default_factory=Separation)
     most_items: int = 650
     run_in_m: float = 0.0
+    wait_s: float = 0.0
 
     def check(self) -> None:
         """Refuse values that mean nothing.
@@ -86,6 +90,10 @@ class Options:
                 raise InputError(f"the {name} is {value:g} {unit}; give a number larger than 0")
         if not 0.0 <= self.run_in_m <= _LONGEST_RUN_IN_M:
             raise InputError(f"the run-in is {self.run_in_m:g} m; give 0 to {_LONGEST_RUN_IN_M:g}")
+        if not 0.0 <= self.wait_s <= _LONGEST_WAIT_S:
+            raise InputError(f"the wait is {self.wait_s / 60:g} min; give 0 to {_LONGEST_WAIT_S / 60:g}")
+        if self.wait_s and self.end == "hover":
+            raise InputError("a vehicle that hovers at the end needs no wait; let it end with rtl or land")
         for name in ("clearance", "separation", "height step"):
             if not math.isfinite(positive[name][0]):
                 raise InputError(f"the {name} is not finite; give a number of metres")
@@ -200,15 +208,24 @@ class Crew:
 
     def schedule(self, work: Work) -> list[list[Slot]]:
         """Layers and takeoff times of all sorties, so that vehicles stay apart."""
-        makers: list[list[Maker]] = [
-            [partial(self._flight, legs, home) for legs in flown]
-            for flown, home in zip(work.sorties, work.homes, strict=True)
-        ]
+        makers: list[list[Maker]] = []
+        for vehicle, (flown, home) in enumerate(zip(work.sorties, work.homes, strict=True)):
+            waits = [0.0] * (len(flown) - 1) + [self._wait_s(flown[-1], home, float(self._endurances_s[vehicle]))]
+            makers.append([partial(self._flight, f, home, wait_s=w) for f, w in zip(flown, waits, strict=True)])
         return separate(makers, self._options.motion, self._options.separation)
 
-    def _flight(self, legs: Array, home: Array, out_m: float, home_m: float) -> Flight:
+    def _wait_s(self, legs: Array, home: Array, endurance_s: float) -> float:
+        """How long a vehicle can stay at the end of a flight: as long as is asked for and its endurance allows."""
+        if not self._options.wait_s:
+            return 0.0
+        top = self._options.separation.layers * self._options.separation.height_m
+        left = endurance_s - self._flight(legs, home, top, top).time_s(self._options.motion)
+        return float(np.floor(np.clip(left, 0.0, self._options.wait_s)))
+
+    def _flight(self, legs: Array, home: Array, out_m: float, home_m: float, wait_s: float = 0.0) -> Flight:
         run_in = self._options.run_in_m
-        return make_flight(legs, home, self._heights, self._router, self._returns, out_m, home_m, run_in)
+        flight = make_flight(legs, home, self._heights, self._router, self._returns, out_m, home_m, run_in)
+        return replace(flight, wait_s=wait_s) if wait_s else flight
 
     @property
     def _least_leg_m(self) -> float:

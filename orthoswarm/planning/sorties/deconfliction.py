@@ -76,7 +76,10 @@ class _Track:
 
 def _sampled(flight: Flight, motion: Motion, pad_m: float) -> _Track:
     track = flight.track()
-    times = motion.times(track)
+    times = flight.times(motion)
+    if flight.wait_s > 0.0:  # it comes to where it waits, and stays there
+        at = 2 + flight.last_leg_end
+        track, times = np.insert(track, at, track[at], axis=0), np.insert(times, at, times[at] - flight.wait_s)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     places = np.stack([np.interp(moments, times, track[:, axis]) for axis in range(3)], axis=1)
     flying = np.flatnonzero(places[:, 2] > flight.home_z_m + _GROUND_M)

@@ -29,6 +29,7 @@ class Flight:
         above_m: float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the
             ground.
         between: bool (n,), points on a straight way, put in for their height alone.
+        wait_s: how long it stays where its last leg ends before it comes home.
         ground_by_vehicle: the vehicle keeps its height above the ground by itself, without those points.
     """
 
@@ -41,6 +42,7 @@ class Flight:
     above_m: Array
     between: NDArray[np.bool_]
     ground_by_vehicle: bool = False
+    wait_s: float = 0.0
 
     def track(self) -> Array:
         """The whole path from the ground on, (n, 3)."""
@@ -48,9 +50,20 @@ class Flight:
         down = [[*self.home, self.home_z_m]] if self.returns else np.empty((0, 3))
         return np.concatenate([up, self.points, down])
 
+    def times(self, motion: Motion) -> Array:
+        """When each point of `track` is left, seconds after takeoff; where it waits, that is after the wait."""
+        times = motion.times(self.track())
+        times[2 + self.last_leg_end :] += self.wait_s  # behind the ground and the point above home
+        return times
+
+    @property
+    def last_leg_end(self) -> int:
+        """Index of the point at which the last leg ends."""
+        return int(np.flatnonzero(self.camera == -1)[-1])
+
     def time_s(self, motion: Motion) -> float:
         """Seconds from takeoff to the end."""
-        return float(motion.times(self.track())[-1])
+        return float(self.times(motion)[-1])
 
     @property
     def length_m(self) -> float:
@@ -66,7 +79,7 @@ class Flight:
     def items(self) -> int:
         """Mission items that it needs: waypoints, camera commands, home, takeoff, speed and the end."""
         points = np.count_nonzero(~self.between) if self.ground_by_vehicle else len(self.points)
-        return int(points) + int(np.count_nonzero(self.camera)) + 4
+        return int(points) + int(np.count_nonzero(self.camera)) + 4 + (self.wait_s > 0.0)
 
 
 def make_flight(

@@ -1,5 +1,6 @@
 // "Fly the gaps": who flies and for how long, the plan, and one confirmation that uploads it and opens the check before
-// the start. Nothing is uploaded before it is confirmed.
+// the start. Nothing is uploaded before it is confirmed. A vehicle in the air takes part only if its box is ticked: the
+// confirmation then pauses it first.
 
 import { get, post } from "/static/core/api.js";
 import { dialogBox } from "/static/core/dialog.js";
@@ -32,7 +33,8 @@ function setPlan(made) {
   go.disabled = !plan;
   setHidden(summary, !plan);
   summary.replaceChildren(...(plan?.vehicles ?? []).map((row) => make("li", {}, t("gapflight.part", { name: nameOf(plan.names[row.id]), length: units.distance(row.length_m), time: units.clock(row.time_s), photos: row.photos, sorties: row.sorties }))));
-  warnings.replaceChildren(...(plan?.warnings ?? []).map((text) => make("li", {}, text)));
+  const paused = (plan?.inAir ?? []).map((id) => t("gapflight.pauses", { name: nameOf(id) }));
+  warnings.replaceChildren(...[...paused, ...(plan?.warnings ?? [])].map((text) => make("li", {}, text)));
 }
 
 export async function openGapFlight() {
@@ -43,11 +45,12 @@ export async function openGapFlight() {
   try {
     const vehicles = await get("/api/coverage/vehicles");
     rows = vehicles.map((row) => {
-      const on = make("input", { type: "checkbox", checked: !row.busy, disabled: Boolean(row.busy), onchange: () => setPlan(null) });
+      const on = make("input", { type: "checkbox", checked: !row.busy, disabled: Boolean(row.busy) && !row.in_air, onchange: () => setPlan(null) });
       const minutes = make("input", { type: "number", min: 1, max: 600, step: "any", value: row.minutes ?? "", inputmode: "decimal", "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
-      const words = row.busy || t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : `${Math.round(100 * row.battery)} %` });
-      list.append(make("li", {}, make("label", { class: "check" }, on, make("b", {}, nameOf(row.id))), make("small", {}, words), row.busy ? null : minutes));
-      return { id: row.id, on, minutes };
+      const left = t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : `${Math.round(100 * row.battery)} %` });
+      const words = row.in_air ? `${t("gapflight.inair")} ${left}` : row.busy || left;
+      list.append(make("li", {}, make("label", { class: "check" }, on, make("b", {}, nameOf(row.id))), make("small", {}, words), on.disabled ? null : minutes));
+      return { id: row.id, on, minutes, inAir: Boolean(row.in_air) };
     });
     setText(status, vehicles.length ? "" : t("gapflight.nobody"));
   } catch (error) {
@@ -63,8 +66,10 @@ async function makePlan() {
   planButton.disabled = true;
   setText(status, t("plan.making"));
   try {
-    const made = await post("/api/coverage/flight", { vehicles: Object.fromEntries(chosen.map((row) => [row.id, Number(row.minutes.value)])) }, 120_000);
-    setPlan(made);
+    const inAir = chosen.filter((row) => row.inAir).map((row) => row.id);
+    const wanted = { vehicles: Object.fromEntries(chosen.map((row) => [row.id, Number(row.minutes.value)])) };
+    const made = await post("/api/coverage/flight", inAir.length ? { ...wanted, in_air: inAir } : wanted, 120_000);
+    setPlan({ ...made, inAir });
     setText(status, "");
     const features = (await get(`/api/plans/${made.id}/map`)).features ?? [];
     show("plan", features.filter((feature) => feature.geometry?.type === "LineString").map((feature) => ({ ...feature, properties: { ...feature.properties, colour: colourOf(made.names[feature.properties.vehicle]) } })));
@@ -75,11 +80,18 @@ async function makePlan() {
   }
 }
 
+// The command that ended last: a vehicle in the air that could not be paused is sent no mission.
+async function upload(chosen, mission) {
+  const vehicle = chosen.names[mission];
+  const paused = chosen.inAir.includes(vehicle) ? await command(vehicle, "pause") : null;
+  return paused && paused.outcome !== "done" ? paused : command(vehicle, "upload", { plan: chosen.id, mission });
+}
+
 async function confirm() {
   const chosen = plan;
   go.disabled = true;
   setText(status, t("gapflight.uploading"));
-  const ended = await Promise.all(chosen.vehicles.map((row) => command(chosen.names[row.id], "upload", { plan: chosen.id, mission: row.id })));
+  const ended = await Promise.all(chosen.vehicles.map((row) => upload(chosen, row.id)));
   const wrong = ended.filter((entry) => entry.outcome !== "done");
   if (wrong.length) {
     setText(status, t("gapflight.refused", { list: wrong.map((entry) => `${entry.name}: ${entry.reason}`).join("; ") }));

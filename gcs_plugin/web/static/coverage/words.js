@@ -12,5 +12,6 @@ export const coverageWords = {
   "gapflight.title": "Fly the gaps", "gapflight.about": "The plan uses the lens as it was solved and the battery that is left. Nothing is uploaded before you confirm, and nothing starts before the check.",
   "gapflight.plan": "Plan", "gapflight.confirm": "Upload, then check and start…", "gapflight.minutes": "Minutes that {name} can fly", "gapflight.left": "battery {battery}; minutes by what its flight has cost",
   "gapflight.ask": "battery {battery}; how many minutes it can fly is not known: enter them", "gapflight.unknown": "Enter how many minutes {name} can fly.", "gapflight.nobody": "No vehicle is on the links.",
+  "gapflight.inair": "In the air: tick it to pause it and give it these legs in place of its mission.", "gapflight.pauses": "{name} is in the air: it is paused before it gets the new mission, and flies on when you start it.",
   "gapflight.failed": "Not planned: {why}", "gapflight.uploading": "Uploading…", "gapflight.refused": "Not uploaded: {list}", "gapflight.part": "{name}: {length}, {time}, {photos} pictures, {sorties} flights",
 };
