@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 LATE_S: Final = 0.25
 """How long a moment is past before its picture is taken: two messages at 10 Hz."""
 _BEHIND_S: Final = 10.0
+"""A camera that is later than this gives up what it has missed."""
+_THINNED_S: Final = 2.0
+"""For each so many seconds that it is late it leaves out one more between two pictures: on a machine that is too slow
+the pictures lie farther apart, without holes."""
 _IDLE_S: Final = 0.02
 _POST_TIMEOUT_S: Final = 30.0
 
@@ -179,8 +183,11 @@ class Shutter:
             lost = int(late // self.every_s)
             self.skipped += lost
             self._next_s += lost * self.every_s
+            late -= lost * self.every_s
         moment = self._next_s
-        self._next_s += self.every_s
+        thinned = int(late // _THINNED_S)
+        self.skipped += thinned
+        self._next_s += (1 + thinned) * self.every_s
         return moment
 
 

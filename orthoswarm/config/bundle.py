@@ -87,6 +87,8 @@ class BundleConfig:
     """Flown steps are medians over so many photos before and after (chosen; not measured)."""
     course_turn_deg: float = 12.0
     """... of those whose heading differs by less, degrees (chosen; not measured)."""
+    step_time_factor: float = 1.7
+    """... and that took at most so many times longer or shorter: a missing picture doubles the step (chosen)."""
     velocity_reach_photos: int = 2
     """Velocities are differences over so many photos before and after (chosen; not measured)."""
     velocity_leap: float = 3.0

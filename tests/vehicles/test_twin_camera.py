@@ -234,6 +234,18 @@ def test_a_camera_that_is_far_behind_skips_and_says_so():
     assert shutter.due(50.0, True, 50.0) == pytest.approx(50.0 - LATE_S)  # its clock was set back
 
 
+def test_a_camera_that_is_too_slow_takes_pictures_farther_apart_without_holes():
+    shutter, now, moments = Shutter(0.5, 20.0), 100.0, []
+    while now < 220.0:
+        moment = shutter.due(now, True, 50.0)
+        moments += [] if moment is None else [moment]
+        now += 0.02 if moment is None else 1.2  # rendering takes longer than the time between two pictures
+    gaps = np.diff(moments)
+    assert max(gaps) < 2.5
+    assert shutter.skipped + len(moments) == pytest.approx((moments[-1] - moments[0]) / 0.5, abs=5)
+    assert now - moments[-1] < 8.0
+
+
 def test_pictures_can_follow_the_autopilots_triggers():
     shutter = Shutter(0.5, 20.0, on_trigger=True)
     shutter.exposed(99.0)

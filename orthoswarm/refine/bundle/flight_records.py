@@ -45,15 +45,21 @@ class FlightRecords:
         return rotation_from_angles(self.yaw, self.pitch, self.roll)
 
     def steps(self) -> Array:
-        """Movement from the previous frame to each frame, median over neighbours on the same course: (N, 3)."""
+        """Movement from the previous frame to each frame, float64 (N, 3), metres.
+
+        The median over neighbours on the same course that took about as long; the recorded step where too few did, as
+        where pictures between two frames are missing.
+        """
         config = active().bundle
         reach, turn_rad = config.course_reach_photos, np.radians(config.course_turn_deg)
         n = len(self.position)
         raw = np.diff(self.position, axis=0, prepend=self.position[:1])
+        took = np.maximum(np.diff(self.time_s, prepend=self.time_s[:1]), 1e-3)
         out = raw.copy()
         for i in range(1, n):
             near = np.arange(max(1, i - reach), min(n, i + reach + 1))
             same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < turn_rad
+            same &= np.abs(np.log(took[near] / took[i])) < np.log(config.step_time_factor)
             chosen = near[same]
             if len(chosen) >= 3:
                 out[i] = np.median(raw[chosen], axis=0)

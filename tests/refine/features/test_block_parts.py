@@ -129,6 +129,14 @@ def test_steps_ignore_a_single_outlier():
     assert np.hypot(*steps[3:10, :2].T) == pytest.approx(11.12, abs=0.1)
 
 
+def test_the_step_over_missing_pictures_is_the_whole_way():
+    """Pictures that a busy camera skipped: the way past them is not the usual step of its neighbours."""
+    frames = [frame(i) for i in (*range(8), *range(13, 21))]
+    steps = np.hypot(*read_records(frames, LocalGrid(32632), np.zeros(2)).steps()[1:, :2].T)
+    assert steps[7] == pytest.approx(6 * 11.12, rel=0.01)
+    assert np.delete(steps, 7) == pytest.approx(11.12, abs=0.1)
+
+
 def weak_at(position, recorded, leg, weak):
     """What placing weak pictures makes of solved positions, where nothing looked at the weak ones."""
     n = len(position)
