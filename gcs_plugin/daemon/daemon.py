@@ -14,6 +14,7 @@ from typing import Any, Final
 import cv2  # before any thread: two that import it at once find it half made
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.coverage.event_requests import EventRequests
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
@@ -163,6 +164,7 @@ class Daemon:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
             self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
+            EventRequests(self.links.fleet)
             if settings.dem is not None:
                 self.terrain = TerrainData(settings.dem, self.links.fleet)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)

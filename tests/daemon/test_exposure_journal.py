@@ -6,9 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from gcs_plugin.daemon.coverage.event_requests import EventRequests
 from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.links.mavlink import dialect
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.memory_link import World
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.geo import LocalGrid
 
 GRID = LocalGrid(32632)
@@ -46,3 +50,54 @@ def test_events_are_kept_once_each_and_survive_a_restart(tmp_path: Path) -> None
         ("v1", 1, 1.78e9 + 1), ("v1", 2, 1.78e9 + 2), ("v1", 3, 1.78e9 + 3), ("v2", 7, 1.78e9 + 0.5),
     ]  # fmt: skip
     assert np.allclose(events[0].position[:2], PLACE, atol=0.1) and events[3].position is None  # type: ignore[index]
+
+
+class _Camera(SimVehicle):
+    """A vehicle whose camera gives its events again when it is asked; `told` holds all of them by number."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.told: dict[int, Any] = {}
+
+    def take(self, count: int) -> None:
+        self.waiting = [*range(len(self.told) + 1, len(self.told) + count + 1)]
+
+    def advance(self, now: float) -> list[Any]:
+        said = super().advance(now)
+        if getattr(self, "waiting", None):
+            number = self.waiting.pop(0)
+            self.told[number] = _captured(number, time_s=1.78e9 + number)
+            said.append(self.told[number])
+        return said
+
+    def handle(self, message: Any, sender: Any, now: float) -> list[Any]:
+        if message.get_type() == "COMMAND_LONG" and message.command == dialect.MAV_CMD_REQUEST_MESSAGE:
+            assert message.param1 == dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED
+            return [self.told[int(message.param2)]]
+        return super().handle(message, sender, now)
+
+
+def test_events_that_a_bad_link_has_lost_are_asked_for_and_come(tmp_path: Path) -> None:
+    vehicle = _Camera(1, Autopilot.PX4)
+    world = World([vehicle], down=Faults(loss=0.3, seed=4), up=Faults(loss=0.2, seed=5))
+    journal = Journal(tmp_path / "journal.db")
+    kept = ExposureJournal(journal, lambda system: f"v{system}")
+    try:
+        world.meet()
+        world.fleet.subscribe(kept.message, "CAMERA_IMAGE_CAPTURED")
+        came: list[int] = []
+        world.fleet.subscribe(lambda v, m, t: came.append(m.image_index), "CAMERA_IMAGE_CAPTURED")
+        vehicle.take(40)
+        world.wait(30.0)
+        without = len(set(came))
+        EventRequests(world.fleet)
+        vehicle.take(40)
+        world.wait(60.0)
+        kept.write()
+    finally:
+        world.fleet.close()
+    later = {n for n in came if n > 40}
+    events = [e for e in kept.events(GRID) if e.number > 40]
+    journal.close()
+    assert without < 40 and min(later) <= 45 and later >= set(range(min(later), max(later) + 1))
+    assert [e.time_s for e in events] == [1.78e9 + e.number for e in events]

@@ -31,6 +31,7 @@ class ExposureJournal:
         self._journal, self._name_of = journal, name_of
         self._fresh: deque[Row] = deque()
         self._kinds: dict[int, str] = {}
+        self._boot_s: dict[int, float] = {}
         self._last: dict[int, tuple[int, float]] = {}
 
     def message(self, vehicle: "Vehicle", message: Any, utc_s: float) -> None:
@@ -43,12 +44,20 @@ class ExposureJournal:
         elif message.capture_result == 0:
             return  # the camera failed to take it
         else:
-            number, time_s, lat, lon = message.image_index, message.time_utc * 1e-6, message.lat, message.lon
+            number, lat, lon = message.image_index, message.lat, message.lon
+            time_s = self._dated(system, message, utc_s)
         if self._last.get(system) == (number, time_s):
             return  # said twice
         self._last[system] = number, time_s
         place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
         self._fresh.append((packed(self._name_of(system)), int(number), _utc(time_s, utc_s), *place))
+
+    def _dated(self, system: int, message: Any, utc_s: float) -> float:
+        """When a picture was taken; without a date in it, by the time since boot, since an event may come late."""
+        boot_s = message.time_boot_ms * 1e-3
+        late_s = self._boot_s[system] = min(utc_s - boot_s, self._boot_s.get(system, utc_s))
+        dated_s = float(message.time_utc) * 1e-6
+        return dated_s if dated_s > _AFTER_2001_S else boot_s + late_s
 
     def write(self) -> bool:
         """Write what has come since the last call; whether there was anything."""
