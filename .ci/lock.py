@@ -29,7 +29,7 @@ def closure(requirements: list[str]) -> dict[str, str]:
         except PackageNotFoundError:
             raise SystemExit(f"{wanted} is not installed here; install the project with its extras first") from None
         known = name in found
-        found[name] = re.sub(r"\+.*", "", package.version)  # a local build's tag is no part of the pin
+        found[name] = re.sub(r"\+.*", "", package.version)  # a local build's tag is not a part of the pin
         if name in WITHOUT_NEEDS or (known and not wanted.extras):
             continue
         for text in package.requires or []:

@@ -12,7 +12,7 @@ from orthoswarm.config import override
 
 single_threaded()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
 
-# Machines differ and are shared: a slow example is no failure. A gate tries the same examples each time.
+# Machines differ and are shared: a slow example is not a failure. A gate tries the same examples each time.
 settings.register_profile("unhurried", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("unhurried")
 

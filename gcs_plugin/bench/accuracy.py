@@ -19,7 +19,7 @@ def run_accuracy(
     """Measure every method on every set; what is in `out` already is not measured again.
 
     Raises:
-        InputError: if a folder is no set with truth.
+        InputError: if a folder is not a data set with truth.
     """
     for folder in sets:
         check_set(folder, truth=True)

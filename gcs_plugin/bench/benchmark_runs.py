@@ -19,7 +19,9 @@ def check_set(folder: Path, *, truth: bool = False) -> None:
         InputError: if its photos, its map or (where asked for) its truth is missing.
     """
     if not (folder / "photos").is_dir() or not (folder / "basemap.tif").exists():
-        raise InputError(f"{folder} is no set with photos and basemap.tif; make one with `orthoswarm twin make`")
+        raise InputError(
+            f"{folder} is not a data set with photos and basemap.tif; make one with `orthoswarm twin make`"
+        )
     if truth and not (folder / "truth" / "reference.tif").exists():
         raise InputError(f"{folder} has no truth/reference.tif; make the set with `orthoswarm twin make`")
 
@@ -149,7 +151,7 @@ def numbers(value: str, flag: str) -> list[int]:
     except ValueError:
         found = []
     if not found or min(found) < 1:
-        raise InputError(f"{flag} {value} is no list of numbers; give for example 1,2,4")
+        raise InputError(f"{flag} {value} is not a list of numbers; give for example 1,2,4")
     return found
 
 

@@ -194,7 +194,7 @@ def run_peers(sets: Sequence[Path], settings: Settings) -> dict[str, Any]:
     """Run every program on every set; what is in the folder of results already is not run again.
 
     Raises:
-        InputError: if a folder is no set with truth, or a program is not known.
+        InputError: if a folder is not a data set with truth, or a program is not known.
     """
     unknown = set(settings.programs) - set(PROGRAMS)
     if unknown or not settings.programs:

@@ -1,4 +1,4 @@
-"""Progress bars with the time left, on stderr; silent where stderr is no terminal, but for a line per stage."""
+"""Progress bars with the time left, on stderr; silent where stderr is not a terminal, but for a line per stage."""
 
 import sys
 import time

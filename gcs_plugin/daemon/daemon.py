@@ -263,7 +263,7 @@ class Daemon:
             The frame's number, and False if it was there already (the first one stays).
 
         Raises:
-            InputError: the file is no picture.
+            InputError: the file is not a picture.
             OrthoSwarmError: the disk is full or gone; nothing was kept.
         """
         came = time.time()

@@ -92,7 +92,7 @@ class Settings:
         """A receiver of Cursor-on-Target events.
 
         Raises:
-            InputError: it is no address.
+            InputError: it is not an address.
         """
         return TakAddress.parse(text, self.tak_certificate, self.tak_authority)
 
@@ -103,7 +103,7 @@ class Settings:
             InputError: a value that makes no sense.
         """
         if not 0 <= self.port <= 65535:
-            raise InputError(f"port {self.port} is no port; give 1 to 65535, or 0 for any free one")
+            raise InputError(f"port {self.port} is not a port; give 1 to 65535, or 0 for any free one")
         if self.basemap is not None and not self.basemap.exists():
             raise InputError(f"the basemap {self.basemap} does not exist; check the path")
         if self.dem is not None and not self.dem.is_file():
@@ -111,7 +111,7 @@ class Settings:
         if self.fov_min_deg is not None and not 5.0 <= self.fov_min_deg <= 150.0:
             raise InputError(f"a field of view of {self.fov_min_deg:g} degrees is not possible; for example 70")
         if self.gsd_m is not None and not 0.005 <= self.gsd_m <= 5.0:
-            raise InputError(f"{self.gsd_m:g} m is no ground pixel; give metres, for example 0.1")
+            raise InputError(f"{self.gsd_m:g} m is not a ground pixel; give metres, for example 0.1")
         if self.workers < 1:
             raise InputError(f"{self.workers} workers are too few; give 1 or more")
         for text in self.tak:

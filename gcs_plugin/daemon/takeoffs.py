@@ -212,7 +212,7 @@ def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:
     """
     sortie, names = body.get("sortie", 1), body.get("vehicles", {})
     if isinstance(sortie, bool) or not isinstance(sortie, int) or sortie < 1:
-        raise InputError("sortie is no number from 1; send one, or nothing for the first")
+        raise InputError("sortie is not a number from 1; send one, or nothing for the first")
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
         raise InputError('vehicles does not name vehicles; send for example {"v1": "alpha"}, or nothing')
     return sortie, names

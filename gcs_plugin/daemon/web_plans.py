@@ -55,7 +55,7 @@ class Plans:
             raise InputError("area is missing; send a GeoJSON polygon")
         zones = body.get("no_fly")
         if not isinstance(zones, dict | None):
-            raise InputError("no_fly is no GeoJSON; send the polygons of the no-fly zones, or nothing")
+            raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
         has_zones = zones is not None and bool(zones.get("coordinates") or zones.get("features"))
         return self._make("area.geojson", area, zones if has_zones else None, values)
 
@@ -115,7 +115,7 @@ class Plans:
         """The mission that an upload asks for: `plan` with `mission` (the vehicle's own if not said), or `text`.
 
         Raises:
-            InputError: there is none, or the text is no mission file.
+            InputError: there is none, or the text is not a mission file.
         """
         from gcs_plugin.mission.mission_builder import build_mission, read_mission
         from gcs_plugin.mission.mission_files import parse_mission
@@ -126,7 +126,7 @@ class Plans:
         folder = self._path(body.get("plan"))
         name = body.get("mission", vehicle)
         if not isinstance(name, str) or not _NAME.match(name):
-            raise InputError("mission is no name of a mission; send for example v1")
+            raise InputError("mission is not the name of a mission; send for example v1")
         for path in (folder / f"{name}.waypoints", folder / f"{name}-sortie1.waypoints"):
             if path.is_file():
                 return read_mission(path, autopilot)
@@ -202,7 +202,7 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
         values["terrain_items"] = body["terrain_items"] is True
     starts = body.get("starts", [])
     if not isinstance(starts, list) or not all(_is_position(start) for start in starts):
-        raise InputError("starts is no list of [latitude, longitude]; send one")
+        raise InputError("starts is not a list of [latitude, longitude]; send one")
     return values | {"starts": [(float(lat), float(lon)) for lat, lon in starts]}
 
 

@@ -124,7 +124,9 @@ def open_outlet(url: str, system: int) -> Outlet:
     except ValueError:
         host = port = None
     if parts.scheme not in ("tcp", "udp", "http") or not host or not port:
-        raise InputError(f"'{url}' is no place for pictures; give tcp://HOST:PORT, udp://HOST:PORT or http://HOST:PORT")
+        raise InputError(
+            f"'{url}' is not a place for pictures; give tcp://HOST:PORT, udp://HOST:PORT or http://HOST:PORT"
+        )
     if parts.scheme == "http":
         return Poster(url, f"v{system}")
     if port + system - 1 > 65535:

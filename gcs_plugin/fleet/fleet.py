@@ -173,8 +173,8 @@ class Fleet:
         """Put a mission into a vehicle and read it back.
 
         Raises:
-            OrthoSwarmError: the vehicle is not there, is no multirotor, is flying its mission, or is busy with another
-                upload or start.
+            OrthoSwarmError: the vehicle is not there, is not a multirotor, is flying its mission, or is busy with
+                another upload or start.
         """
         vehicle = self._flies_missions(system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:

@@ -11,7 +11,7 @@ _FAST_M_S: Final = 300.0
 
 
 def possible(message: Message) -> bool:
-    """False for a message with values outside their range, or that are no numbers."""
+    """False for a message with values outside their range, or that are not numbers."""
     check = _CHECKS.get(message.get_msgId())
     return check is None or check(message)
 

@@ -468,10 +468,10 @@ def parse_address(text: str) -> LinkAddress:
         return LinkAddress("serial", line["device"], int(line["baud"] or _BAUD))
     match = _URL.fullmatch(text.strip())
     if not match or int(match["port"]) > 65535:
-        raise InputError(f"'{text}' is no link; write for example {EXAMPLES}")
+        raise InputError(f"'{text}' is not a link; write for example {EXAMPLES}")
     kind = _KINDS.get((match["kind"] or "udpin").lower())
     if kind is None:
-        raise InputError(f"'{text}' is no link: '{match['kind']}' is not known; write for example {EXAMPLES}")
+        raise InputError(f"'{text}' is not a link: '{match['kind']}' is not known; write for example {EXAMPLES}")
     nowhere = "0.0.0.0" if kind.endswith("in") else "127.0.0.1"
     return LinkAddress(kind, match["plain"] or match["host"] or nowhere, int(match["port"]))
 

@@ -32,7 +32,7 @@ class Client:
         try:
             return json.loads(self.fetch(path, body))
         except ValueError:
-            raise RuntimeError(f"what answers at {self.url} is no daemon; say connect") from None
+            raise RuntimeError(f"what answers at {self.url} is not a daemon; say connect") from None
 
     def fetch(self, path: str, body: dict[str, Any] | None = None) -> bytes:
         """The answer of a route as it is.

@@ -70,7 +70,7 @@ def why_no_missions(vehicle_type: int) -> str:
     entry = dialect.enums["MAV_TYPE"].get(vehicle_type)
     name = str(entry.name).removeprefix("MAV_TYPE_").lower().replace("_", " ") if entry else f"type {vehicle_type}"
     return (
-        f"is no multirotor ({name}); missions here turn on the spot and hover, so none is uploaded or started; "
+        f"is not a multirotor ({name}); missions here turn on the spot and hover, so none is uploaded or started; "
         "pause, rtl and land are sent to it"
     )
 

@@ -70,7 +70,7 @@ def read_mission(path: Path, autopilot: Autopilot) -> Mission:
     """The mission in a `.plan` or `.waypoints` file, for one autopilot whichever it was written for.
 
     Raises:
-        InputError: the file cannot be read or is no mission.
+        InputError: the file cannot be read or is not a mission.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -130,6 +130,6 @@ def _check(mission: Mission) -> None:
     for seq, item in enumerate(mission.items):
         if item.has_place and not (abs(item.lat_deg) <= 90.0 and abs(item.lon_deg) <= 180.0):
             where = f"{item.lat_deg:g}, {item.lon_deg:g}"
-            raise InputError(f"{name}: item {seq} ({item.name}) lies at {where}, which is no place; correct it")
+            raise InputError(f"{name}: item {seq} ({item.name}) lies at {where}, which is not a place; correct it")
         if not math.isfinite(item.z) or abs(item.z) >= 1e6:
             raise InputError(f"{name}: item {seq} ({item.name}) has the height {item.z:g} m; correct it")

@@ -212,7 +212,7 @@ def parse_mission(text: str, name: str = "the file") -> Mission:
     try:
         document = json.loads(head)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
+        raise InputError(f"{name} is not valid JSON ({error}); export it again") from None
     if not isinstance(document, dict) or document.get("fileType") != "Plan":
         raise InputError(f"{name} is JSON but no QGroundControl plan (fileType is not 'Plan'); export a .plan file")
     try:
@@ -302,7 +302,7 @@ def _check_item(item: MissionItem, name: str) -> None:
 
 def _check_position(lat: float, lon: float, name: str, used: bool) -> None:
     if used and not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
-        raise InputError(f"{name} has the position {lat:g}, {lon:g}, which is no latitude and longitude; correct it")
+        raise InputError(f"{name} has the position {lat:g}, {lon:g}, which is not a latitude and longitude; correct it")
 
 
 def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:

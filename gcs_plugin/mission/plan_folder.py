@@ -32,7 +32,7 @@ def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]
                 )
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         raise InputError(
-            f"{report} is no report of a plan; plan again with: orthoswarm plan ... --out {folder}"
+            f"{report} is not the report of a plan; plan again with: orthoswarm plan ... --out {folder}"
         ) from None
     if document is None:
         for path in sorted(folder.glob("*")):

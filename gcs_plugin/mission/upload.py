@@ -234,7 +234,7 @@ class MissionUpload(Exchange):
     def _nack(self, refusal: Refusal, now: float) -> list[Message]:
         if refusal.code == DENIED:
             self._denied = refusal
-            self._begun -= self.stage is Stage.COUNT  # waiting for another ground station is no attempt
+            self._begun -= self.stage is Stage.COUNT  # waiting for another ground station is not an attempt
             return self._pause(now, _DENIED_AGAIN_S)
         if self._refused is not None and (self._refused.code, self._refused.item) == (refusal.code, refusal.item):
             self.refusal = refusal

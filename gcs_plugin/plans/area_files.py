@@ -111,7 +111,7 @@ def _text(path: Path, name: str) -> str:
     """The text of a file, of a KMZ's first KML.
 
     Raises:
-        InputError: it is no text.
+        InputError: it is not text.
     """
     try:
         data = path.read_bytes()
@@ -120,12 +120,14 @@ def _text(path: Path, name: str) -> str:
                 data = archive.read(_inside(path, name, ".kml")[0])
         return data.decode("utf-8-sig")
     except (UnicodeDecodeError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
-        raise InputError(f"{name} is no text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan") from None
+        raise InputError(
+            f"{name} is not a text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan"
+        ) from None
 
 
 def _is_mission(text: str, name: str) -> bool:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
+        raise InputError(f"{name} is not valid JSON ({error}); export it again") from None
     return isinstance(document, dict) and document.get("fileType") == "Plan"

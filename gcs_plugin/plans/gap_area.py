@@ -53,10 +53,10 @@ def read_gaps(path: Path) -> list[ReadGap]:
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); give the gaps.geojson of a coverage") from None
     except ValueError as error:
-        raise InputError(f"{path} is no valid JSON ({error}); give the gaps.geojson of a coverage") from None
+        raise InputError(f"{path} is not valid JSON ({error}); give the gaps.geojson of a coverage") from None
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list):
-        raise InputError(f"{path} is no GeoJSON feature collection; give the gaps.geojson of a coverage")
+        raise InputError(f"{path} is not a GeoJSON feature collection; give the gaps.geojson of a coverage")
     if not features:
         raise InputError(f"{path} holds no gap: all of the area was seen, so there is nothing to fly")
     known = {str(cause): cause for cause in Cause}

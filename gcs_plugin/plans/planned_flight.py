@@ -30,7 +30,7 @@ def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
         ends = np.array([[line[0][:2], line[-1][:2]] for line in lines], float).reshape(-1, 2, 2)
     except OSError as error:
         raise InputError(
-            f"{folder} is no plan's folder ({error.strerror}); give the --out of `orthoswarm plan`"
+            f"{folder} is not the folder of a plan ({error.strerror}); give the --out of `orthoswarm plan`"
         ) from None
     except (ValueError, KeyError, TypeError, IndexError):
         raise InputError(f"{folder} holds a broken plan.json or all.geojson; plan again") from None

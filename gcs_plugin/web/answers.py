@@ -73,9 +73,9 @@ async def json_body(request: Request) -> dict[str, Any]:
     try:
         document = parse_json(data) if data.strip() else {}
     except ValueError:
-        raise HTTPException(422, "the request is no JSON; send a JSON object") from None
+        raise HTTPException(422, "the request is not JSON; send a JSON object") from None
     if not isinstance(document, dict):
-        raise HTTPException(422, "the request is no JSON object; send one")
+        raise HTTPException(422, "the request is not a JSON object; send one")
     return document
 
 
@@ -101,11 +101,11 @@ def parse_json(data: bytes | str) -> Any:
     """A JSON value; NaN and infinities, which JSON does not have, are refused.
 
     Raises:
-        ValueError: it is no JSON, or nested too deeply.
+        ValueError: it is not JSON, or nested too deeply.
     """
 
     def refuse(name: str) -> NoReturn:
-        raise ValueError(f"{name} is no JSON")
+        raise ValueError(f"{name} is not JSON")
 
     try:
         return json.loads(data, parse_constant=refuse)

@@ -121,7 +121,7 @@ class Routes:
         body = await json_body(request)
         vehicle = body.get("vehicle")
         if vehicle is not None and not isinstance(vehicle, str):
-            raise HTTPException(422, "vehicle is no text; send the id of a vehicle, or nothing for all")
+            raise HTTPException(422, "vehicle is not text; send the id of a vehicle, or nothing for all")
         jobs = await self.work(self.daemon.refine, vehicle)
         return JsonAnswer([job.document() for job in jobs], status_code=202)
 
@@ -133,7 +133,7 @@ class Routes:
         body = await json_body(request)
         formats = body.get("formats", ["cog", "gpkg"])
         if not isinstance(formats, list) or not all(isinstance(name, str) for name in formats):
-            raise HTTPException(422, 'formats is no list of texts; send for example ["mbtiles", "kmz"]')
+            raise HTTPException(422, 'formats is not a list of texts; send for example ["mbtiles", "kmz"]')
         job = await self.work(self.daemon.export, formats)
         return JsonAnswer(job.document(), status_code=202)
 

@@ -98,7 +98,7 @@ class CommandRoutes:
         if known[0] != what:
             raise HTTPException(409, f"the id {number} was used for another command; give each command its own")
         if known[1].done() and (known[1].cancelled() or known[1].exception() is not None):
-            return None  # it was no command: a wrong plan, for example
+            return None  # it was not a command: a wrong plan, for example
         return known[1]
 
     def _given(self, body: Mapping[str, Any]) -> Given:
@@ -106,11 +106,11 @@ class CommandRoutes:
         if number is None:
             number = new_id()
         if not isinstance(number, str) or not 0 < len(number) <= _MOST_ID:
-            raise InputError(f"id is no text of 1 to {_MOST_ID} characters; send one, or none for a new one")
+            raise InputError(f"id is not a text of 1 to {_MOST_ID} characters; send one, or none for a new one")
         if at is None:
             return Given(number, time.time() - self._standstill.length_s())
         if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < 1e11 or not math.isfinite(at):
-            raise InputError("given_s is no time; send epoch seconds by the daemon's clock, as its heartbeats tell")
+            raise InputError("given_s is not a time; send epoch seconds by the daemon's clock, as its heartbeats tell")
         return Given(number, float(at))
 
     def _carry_out(

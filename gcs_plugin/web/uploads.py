@@ -146,9 +146,9 @@ class UploadRoute:
         try:
             form = await request.form(max_files=4, max_fields=8, max_part_size=_MOST_POSE_BYTES)
         except (MultiPartException, ValueError) as error:
-            raise InputError(f"the request is no multipart form ({error}); send image and pose as one") from None
+            raise InputError(f"the request is not a multipart form ({error}); send image and pose as one") from None
         except HTTPException as error:
-            raise HTTPException(error.status_code, f"the request is no multipart form ({error.detail})") from None
+            raise HTTPException(error.status_code, f"the request is not a multipart form ({error.detail})") from None
         try:
             image, text = form.get("image"), form.get("pose")
             if not isinstance(image, UploadFile):
@@ -201,5 +201,5 @@ def _pose(text: str, filename: str | None) -> PostedPose:
     try:
         document = json.loads(text)  # a NaN is refused with its name
     except (ValueError, RecursionError):
-        raise InputError("the pose is no JSON; send a JSON object") from None
+        raise InputError("the pose is not JSON; send a JSON object") from None
     return parse_pose(document, filename)

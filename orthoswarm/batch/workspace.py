@@ -48,7 +48,7 @@ class Workspace:
         out: the output folder; made if absent.
 
     Raises:
-        InputError: if another run is writing there, or it is no folder.
+        InputError: if another run is writing there, or it is not a folder.
         OrthoSwarmError: if it cannot be written.
     """
 

@@ -170,7 +170,7 @@ def _connect(address: str) -> Any:
     except ImportError:
         raise InputError("a cluster needs dask.distributed; pip install orthoswarm[cluster]") from None
     if not re.search(r":\d+/?$", address):  # Dask would complain in its own words, and hang on leaving
-        raise InputError(f"{address} is no address of a Dask scheduler; give one like tcp://192.168.1.10:8786")
+        raise InputError(f"{address} is not an address of a Dask scheduler; give one like tcp://192.168.1.10:8786")
     # States of vehicles are megabytes large; they have to travel, and a warning for each helps nobody.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
     try:

@@ -100,7 +100,7 @@ def read_overrides(path: Path) -> Overrides:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} is no TOML file ({error}); write a table for each stage, for example [features]"
+            f"{path} is not a TOML file ({error}); write a table for each stage, for example [features]"
         ) from None
     before = overridden()
     try:

@@ -37,7 +37,7 @@ class FeaturesConfig:
     flow_gate_px: float = 5.0
     """Flow that is farther from the median of its picture is dropped, pixels (chosen; not measured)."""
     flow_least: int = 3
-    """Fewer corners that agree are no consensus (chosen; not measured)."""
+    """Fewer corners that agree are not a consensus (chosen; not measured)."""
     shift_below_share: float = 0.3
     """Where a smaller share of the corners is followed, its shift is measured on the whole picture (chosen)."""
     shift_below_corners: int = 6

@@ -87,7 +87,7 @@ class InitialConfig:
     tag_tilt_share: float = 0.5
     """Share of a segment's photos that must record a tilt (chosen; not measured)."""
     tag_tilt_limit_deg: float = 45.0
-    """A recorded tilt beyond this is no start: such a photo could not be matched anyway, degrees (chosen)."""
+    """A recorded tilt beyond this is not a start: such a photo could not be matched anyway, degrees (chosen)."""
     tilt_floor_deg: float = 0.7
     """Least sigma of a tilt for the nadir's prior, degrees (chosen; not measured)."""
     tilt_sigma_factor: float = 2.0
@@ -158,7 +158,7 @@ class InitialConfig:
     lag_spread_s: float = 0.3
     """Scatter of the delay of recorded positions along the way, seconds (chosen on four real flights)."""
     stated_sigma_floor_m: float = 0.1
-    """Least sigma of a position whose source states one: an antenna is no camera, metres (chosen; not measured)."""
+    """Least sigma of a position whose source states one: an antenna is not a camera, metres (chosen; not measured)."""
     network_still_m_s: float = 0.1
     """A slower vehicle has no direction along the way (chosen; not measured)."""
     link_sigma: float = 0.15

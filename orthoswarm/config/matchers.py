@@ -22,8 +22,8 @@ class MatchersConfig:
     cfog_valid_share: float = 0.4
     """Least share of valid pixels in a tile (chosen; not measured)."""
     cfog_energy_share: float = 0.1
-    """Windows with less energy than this share of the largest count as having it: a correlation over nothing is no peak
-    (chosen; not measured)."""
+    """Least energy of a window as a share of the largest: without texture a correlation peak means nothing (chosen;
+    not measured)."""
     cfog_least_peak: float = 0.12
     """Least correlation of a match (chosen; not measured)."""
     cfog_most_ratio: float = 0.92

@@ -47,7 +47,7 @@ class MosaicConfig:
     weak_cost: float = 1e6
     """Cost of a picture that is used only where no other sees (damaged, weakly determined): above all other costs."""
     candidate_tan2: float = 0.5
-    """Pictures more oblique than the best by this squared tangent are no candidates for a cell (chosen for its
+    """Pictures more oblique than the best by this squared tangent are not candidates for a cell (chosen for its
     time)."""
 
     obliqueness_cost: float = 15000.0

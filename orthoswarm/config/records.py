@@ -46,7 +46,7 @@ class RecordsConfig:
     leg_turn_deg: float = 35.0
     """Least bend of the path at the corner between two legs, degrees (chosen; not measured)."""
     leg_fewest: int = 3
-    """Fewer frames are no leg (chosen)."""
+    """Fewer frames are not a leg (chosen)."""
     leg_jump_steps: float = 6.0
     """A step of more than so many median steps and the next field ends a leg (chosen) ..."""
     leg_jump_m: float = 30.0

@@ -36,7 +36,7 @@ class RegistrationConfig:
     """Side of the square by which the valid part is eroded: gradients at its edge are artefacts (chosen)."""
     energy_share: float = 0.05
     """Shifts under which the map has less energy than this share of the largest count as having it: a correlation over
-    nothing is no peak (chosen; not measured)."""
+    nothing is not a peak (chosen; not measured)."""
     peak_apart_px: int = 4
     """Correlations within this distance, pixels, belong to the same peak (chosen)."""
     coarse_reach_m: tuple[float, float] = (60.0, 150.0)

@@ -84,7 +84,7 @@ def _documents(folder: Path) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
     except ValueError as error:
         raise InputError(f"{folder} holds a broken report.json or frames.jsonl ({error}); make the map again") from None
     if not isinstance(report, dict):
-        raise InputError(f"{folder / 'report.json'} is no report of a map; make the map again")
+        raise InputError(f"{folder / 'report.json'} is not the report of a map; make the map again")
     return report, rows
 
 

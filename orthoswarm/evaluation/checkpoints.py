@@ -268,7 +268,7 @@ def _reason(error: Exception) -> str:
 def _number(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"'{text}' is no number")
+        raise ValueError(f"'{text}' is not a number")
     return value
 
 
@@ -284,7 +284,7 @@ def _transformer(system: str, name: str) -> Any:
         return pyproj.Transformer.from_crs(system, _GRID, always_xy=True)
     except pyproj.exceptions.CRSError:
         raise InputError(
-            f"{name}: '{system[:60]}' is no coordinate system; write EPSG:32617 or a PROJ string"
+            f"{name}: '{system[:60]}' is not a coordinate system; write EPSG:32617 or a PROJ string"
         ) from None
 
 

@@ -94,7 +94,7 @@ def gradient_field(gray: Floats, valid: Mask) -> tuple[NDArray[np.complex64], Fl
     smooth = cv2.GaussianBlur(np.where(valid, gray, 0).astype(np.float32), (0, 0), 1.0)
     gx = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-    # the edge of the valid part is no edge of the ground: blur and derivative reach four pixels
+    # the edge of the valid part is not an edge of the ground: blur and derivative reach four pixels
     inside = cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0) > 0
     length = np.sqrt(gx * gx + gy * gy)
     scale = float(np.median(length[inside])) if inside.any() else 0.0

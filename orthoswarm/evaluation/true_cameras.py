@@ -36,7 +36,7 @@ def read_truth(path: Path) -> dict[str, tuple[str, int, Camera]]:
             camera = Camera(position, rotation_from_angles(yaw - convergence, pitch, roll), lens)
             out[row["image"]] = (row["vehicle"], grid.epsg, camera)
     except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is no table of true cameras ({error}); give a twin's truth/frames.csv") from None
+        raise InputError(f"{path} is not a table of true cameras ({error}); give a twin's truth/frames.csv") from None
     return out
 
 

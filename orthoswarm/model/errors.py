@@ -16,8 +16,8 @@
     ├── Unreadable                     bytes are not of the format they claim       telemetry.samples.unreadable
     └── Preempted                      a job gave way to one of higher priority     gcs_plugin.daemon.jobs.job_queue
 
-The last three are no failure of the whole: their callers take the next matcher, reject the file and say why, or start
-the job again.
+The last three do not end a run: their callers use the next matcher, reject the file with the reason, or start the job
+again.
 """
 
 

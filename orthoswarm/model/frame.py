@@ -85,7 +85,7 @@ class Ingest:
 
     Attributes:
         frames: sorted by vehicle, then time (then name where times are unknown).
-        rejected: every file with a picture's suffix, or picture of a video, that is no frame.
+        rejected: every file with a picture's suffix, or picture of a video, that is not a frame.
         warnings: findings that a user should read, in plain words.
     """
 

@@ -204,7 +204,7 @@ def _on_area(
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             dataset = rasterio.open(path)
     except RasterioError:
-        raise InputError(f"{name} is no readable height model; give a GeoTIFF with heights by --dem") from None
+        raise InputError(f"{name} is not a readable height model; give a GeoTIFF with heights by --dem") from None
     with dataset:
         if dataset.crs is None:
             raise InputError(f"{name} has no CRS; assign one (gdal_edit.py -a_srs EPSG:...) and try again")

@@ -43,7 +43,7 @@ def read_gray(path: Path, factor: int = 1) -> Bytes:
             takes two thirds of the time, and a large picture is never in memory.
 
     Raises:
-        PictureError: if the file is no picture or is damaged beyond decoding.
+        PictureError: if the file is not a picture or is damaged beyond decoding.
     """
     data = _bytes(path)
     if _is_jpeg(data):
@@ -61,7 +61,7 @@ def read_rgb(path: Path) -> Bytes:
     """A picture's colours, uint8 (rows, columns, 3), red first; grey pictures are repeated in all three.
 
     Raises:
-        PictureError: if the file is no picture or is damaged beyond decoding.
+        PictureError: if the file is not a picture or is damaged beyond decoding.
     """
     data = _bytes(path)
     if _is_jpeg(data):
@@ -73,7 +73,7 @@ def read_rgba(path: Path) -> Bytes:
     """A picture's colours with alpha 255, uint8 (rows, columns, 4); a JPEG costs no more than by read_rgb.
 
     Raises:
-        PictureError: if the file is no picture or is damaged beyond decoding.
+        PictureError: if the file is not a picture or is damaged beyond decoding.
     """
     data = _bytes(path)
     if _is_jpeg(data):
@@ -110,7 +110,7 @@ def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int
         data: the whole file. formats: those that are allowed, all that Pillow knows by default.
 
     Raises:
-        PictureError: it is no picture, or larger than MOST_PIXELS.
+        PictureError: it is not a picture, or larger than MOST_PIXELS.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -121,7 +121,7 @@ def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise PictureError("it has more pixels than any camera; leave it out or send a smaller one") from None
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, OverflowError, struct.error):
-        raise PictureError("it is no readable picture; leave it out or copy it again") from None
+        raise PictureError("it is not a readable picture; leave it out or copy it again") from None
     if width * height > MOST_PIXELS or min(width, height) < 1:
         text = f"it has {width} x {height} pixels, more than {MOST_PIXELS // 1_000_000} megapixels"
         raise PictureError(f"{text}; leave it out or send a smaller one")
@@ -167,5 +167,5 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
-        raise PictureError(f"{path.name} is no readable picture; leave it out or copy it again")
+        raise PictureError(f"{path.name} is not a readable picture; leave it out or copy it again")
     return np.asarray(image)

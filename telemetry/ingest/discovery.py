@@ -73,7 +73,7 @@ def _relative(folder: str, root: str) -> str:
 
 
 def _text(name: str) -> str:
-    """A path as text: bytes of its name that are no UTF-8 come as escapes, for no file format could hold them."""
+    """A path as text: bytes of its name that are not UTF-8 come as escapes, for no file format could hold them."""
     return name.replace(os.sep, "/").encode("utf-8", "backslashreplace").decode()
 
 

@@ -101,7 +101,9 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
                 result.findings.append(Finding("table-unreadable", f"{found.name(path)} is not used: {table}"))
             elif table is None:
                 if pose_csv.names_pictures(path) and read_control_points(path) is None:
-                    text = f"{found.name(path)} names pictures, but is no table of poses that is known; it is not used"
+                    text = (
+                        f"{found.name(path)} names pictures, but is not a table of poses that is known; it is not used"
+                    )
                     result.findings.append(Finding("table-unknown", text, note=True))
             else:
                 where = found.scope(path)

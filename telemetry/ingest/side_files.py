@@ -1,4 +1,4 @@
-"""Files beside pictures that are no pictures: ground control points and georeferenced rasters; named, not mapped."""
+"""Files beside pictures that are not pictures: ground control points and georeferenced rasters; named, not mapped."""
 
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -97,7 +97,7 @@ def _take(
             found=scanned,
             vehicle=vehicle,
         )
-    except OSError:  # the folder for the pictures cannot be written: that is no fault of this video
+    except OSError:  # the folder for the pictures cannot be written: that is not this video's fault
         raise
     except Exception as error:
         result.rejected.append(Rejection(name, str(reason_of(error)), vehicle))

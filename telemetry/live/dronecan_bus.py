@@ -79,7 +79,7 @@ class CanSource:
         }
 
     def run(self, url: str, stop: threading.Event) -> None:
-        """Read a bus until told to stop; packets that are no frames (strangers on a multicast group) are skipped.
+        """Read a bus until told to stop; packets that are not frames (strangers on a multicast group) are skipped.
 
         Raises:
             InputError: it cannot be opened. OSError, can.CanError: it broke off.

@@ -73,10 +73,10 @@ class PhotoTags:
 
 
 def read_photo(path: Path) -> PhotoTags | None:
-    """Read the tags of one photo; None for a georeferenced raster, which is no photo.
+    """Read the tags of one photo; None for a georeferenced raster, which is not a photo.
 
     Raises:
-        NotAPicture: the file is no readable picture; its text is the reason.
+        NotAPicture: the file is not a readable picture; its text is the reason.
     """
     container = read_container(path)
     if container.georeferenced:

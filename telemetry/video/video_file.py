@@ -87,7 +87,7 @@ def open_video(path: Path | str, **options: Any) -> Any:
         if "://" in str(path):
             raise NotAVideo(f"the stream {path} cannot be opened ({_reason(error)}); check its address") from None
         raise NotAVideo(
-            f"the file is no video that can be read ({_reason(error)}); check it with a player or leave it out"
+            f"the file is not a video that can be read ({_reason(error)}); check it with a player or leave it out"
         ) from None
     if not container.streams.video:
         container.close()
@@ -120,7 +120,7 @@ def scan(path: Path) -> VideoScan:
     """Read all metadata of a file, without decoding pictures.
 
     Raises:
-        NotAVideo: it is no video.
+        NotAVideo: it is not a video.
     """
     if path.stat().st_size == 0:
         raise NotAVideo("the file is empty; copy it again")

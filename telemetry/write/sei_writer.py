@@ -38,7 +38,7 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
         Number of pictures that got one.
 
     Raises:
-        InputError: the source is no H.264 or H.265 video, or the target's container cannot hold it.
+        InputError: the source is not an H.264 or H.265 video, or the target's container cannot hold it.
     """
     import av
 

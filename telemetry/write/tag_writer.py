@@ -24,7 +24,7 @@ def with_pose(jpeg: bytes, frame: Frame) -> bytes:
     """A JPEG with a frame's pose; EXIF and XMP that were there are replaced, the picture stays as it is.
 
     Raises:
-        ValueError: the bytes are no JPEG.
+        ValueError: the bytes are not a JPEG.
     """
     if jpeg[:2] != b"\xff\xd8":
         raise ValueError("no JPEG")

@@ -67,7 +67,7 @@ def test_damaged_files_are_named_and_the_rest_is_mapped(scene, basemap, tmp_path
     files[5].write_bytes(whole[: len(whole) // 2])  # truncated within the picture
     files[9].write_bytes(whole[:700])  # truncated within the tags
     (photos / "zero.jpg").write_bytes(b"")
-    (photos / "text.jpg").write_text("this is no picture")
+    (photos / "text.jpg").write_text("this is not a picture")
     (photos / "other.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 50)
     (photos / "movie.dng").write_bytes(b"\0\0\0\x18ftypmp42" + b"\0" * 80)
     (photos / "notes.txt").write_text("seen a fox")
@@ -343,7 +343,7 @@ def test_a_height_model_that_is_none_is_refused_before_the_work(scene, tmp_path,
     scene.fly(tmp_path / "photos", legs(count=1, photos=4))
     (tmp_path / "dem.tif").write_text("heights")
     code, _, _, said = mosaic(tmp_path / "photos", dem=tmp_path / "dem.tif")
-    assert code == 2 and "no readable height model" in said
+    assert code == 2 and "not a readable height model" in said
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_a_wrong_address_is_one_sentence(configure):
     with pytest.raises(InputError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         Cluster("tcp://127.0.0.1:9")
     for address in ("nonsense:::", "scheduler", "tcp://10.0.0.1"):
-        with pytest.raises(InputError, match="is no address of a Dask scheduler"):
+        with pytest.raises(InputError, match="is not an address of a Dask scheduler"):
             Cluster(address)
 
 

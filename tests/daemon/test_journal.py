@@ -95,7 +95,7 @@ def test_what_was_written_is_there_after_reopening(tmp_path):
 
 
 def test_a_file_that_is_no_journal_is_refused_in_words(tmp_path):
-    (tmp_path / "journal.db").write_bytes(b"this is no database at all, but long enough to be one" * 20)
+    (tmp_path / "journal.db").write_bytes(b"this is not a database at all, but long enough to be one" * 20)
     with pytest.raises(OrthoSwarmError, match="cannot be opened"):
         Journal(tmp_path / "journal.db")
 

@@ -168,7 +168,7 @@ def test_work_that_gave_way_is_done_again(journal):
     jobs.start()
     finished(jobs, 1)
     jobs.close()
-    assert tries == [1, 1]  # giving way is no failed attempt
+    assert tries == [1, 1]  # giving way is not a failed attempt
 
 
 # -- the whole way ----------------------------------------------------------------------------------------------------

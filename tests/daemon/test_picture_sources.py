@@ -333,7 +333,7 @@ def test_videos_say_whether_they_are_whole(tmp_path):
     for size in (10, 100, len(data) // 2, len(data) - 1):
         (tmp_path / "half.mp4").write_bytes(data[:size])
         assert not is_video_complete(tmp_path / "half.mp4"), size
-    (tmp_path / "text.mp4").write_bytes(b"this is no video at all")
+    (tmp_path / "text.mp4").write_bytes(b"this is not a video at all")
     assert is_video_complete(tmp_path / "text.mp4")  # whoever reads it says what is wrong
 
 

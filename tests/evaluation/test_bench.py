@@ -98,7 +98,7 @@ def test_scaling_goes_on_with_runs_that_are_there_and_says_whether_cost_is_flat(
     assert main([*command, "--figures", str(figures)]) == 0
     said = capsys.readouterr()
     assert "1 vehicles with fewer than 600 photos are left out" in said.err
-    # 40 ms a picture at 1,200 pictures, 38.3 at 2,400: 4 % apart; a single vehicle is no block to compare with
+    # 40 ms a picture at 1,200 pictures, 38.3 at 2,400: 4 % apart; a single vehicle is not a block to compare with
     assert "From 1,200 to 2,400 pictures" in said.out and "within 4% of the first" in said.out
     assert "goes to 56% of it: flat within 20%" in said.out
     assert "| 4 | 100 | 400 | 8.5 | 17.0 | 42.5 | 650 |" in said.out

@@ -69,7 +69,7 @@ def test_other_programs_read_the_same_places(tmp_path):
 def test_a_changed_list_of_places_is_refused(tmp_path):
     assert read_places(tmp_path) == []
     (tmp_path / FILE).write_text(json.dumps({"features": [{"geometry": None}]}))
-    with pytest.raises(InputError, match="no list of places"):
+    with pytest.raises(InputError, match="not a list of places"):
         read_places(tmp_path)
 
 

@@ -61,7 +61,7 @@ def test_one_press_and_one_confirmation_send_once_to_all(browser):
         ok_for_all(station)
         page.wait_for_selector(".tile >> nth=1")
         page.dblclick(".command[data-verb=rtl]")
-        assert station.commands("rtl") == []  # a double press is no confirmation
+        assert station.commands("rtl") == []  # a double press is not a confirmation
         confirm(page)
         page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
         assert [path for _, path, _ in station.heard] == ["/api/missions/all/rtl"]

@@ -157,7 +157,7 @@ def test_a_run_in_lies_in_line_with_each_leg_before_its_first_picture(area, tmp_
 BAD_AREAS = {
     "crossing.geojson": '{"type":"Polygon","coordinates":[[[9,47],[9.01,47.01],[9.01,47],[9,47.01],[9,47]]]}',
     "flat.geojson": '{"type":"Polygon","coordinates":[[[9,47],[9.01,47],[9.02,47],[9,47]]]}',
-    "garbage.geojson": "this is no area",
+    "garbage.geojson": "this is not an area",
     "truncated.geojson": '{"type":"Polygon","coordinates":[[[9,47],[9.01',
     "kml.geojson": "<kml></kml>",
     "geojson.kml": '{"type":"Polygon","coordinates":[[[9,47],[9.01,47],[9.01,47.01],[9,47]]]}',

@@ -35,7 +35,7 @@ def test_a_reduced_picture_lies_where_the_full_one_does(tmp_path: Path, suffix: 
         ((640, 480), 960, 1),
         ((1920, 1080), 960, 2),
         ((4000, 3000), 960, 4),
-        ((5280, 3956), 960, 4),  # 3956 is no multiple of 8
+        ((5280, 3956), 960, 4),  # 3956 is not a multiple of 8
         ((8064, 6048), 960, 8),
         ((5471, 3647), 960, 1),  # odd sides: a reduced picture would not end where the full one does
     ],

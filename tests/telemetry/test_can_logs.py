@@ -82,7 +82,7 @@ def test_other_files_of_these_suffixes_are_worth_a_note_only(tmp_path, name, tex
     (tmp_path / name).write_text(text)
     found = survey([tmp_path])
     assert [(f.code, f.note) for f in found.findings if name in f.message] == [("not-a-log", True)]
-    with pytest.raises(NotALog, match="no log of a CAN bus"):
+    with pytest.raises(NotALog, match="not the log of a CAN bus"):
         read_log(tmp_path / name)
 
 

@@ -73,7 +73,7 @@ WRONG = {
     "neither a uuid": 'struct = "<d"',
     "no format": f'uuid = "{UUID}"\nstruct = "<y"\nfields = ["lat_deg"]',
     "each of the 2": f'uuid = "{UUID}"\nstruct = "<dd"\nfields = ["lat_deg"]',
-    "is no field": f'uuid = "{UUID}"\nstruct = "<d"\nfields = ["lattitude"]',
+    "is not a field": f'uuid = "{UUID}"\nstruct = "<d"\nfields = ["lattitude"]',
 }
 
 

@@ -456,7 +456,7 @@ def test_a_wait_that_the_mission_asks_for_is_no_pause(make_world):
 def test_a_vehicle_that_does_not_hover_gets_no_mission_and_is_brought_home_all_the_same(make_world, kind, word):
     world = make_world(SimVehicle(1, AP, kind=int(kind)))
     world.meet()
-    with pytest.raises(OrthoSwarmError, match=rf"vehicle 1 is no multirotor \({word}\)"):
+    with pytest.raises(OrthoSwarmError, match=rf"vehicle 1 is not a multirotor \({word}\)"):
         world.fleet.upload(1, mission(AP, END))
     result = end_of(world, give(world, "start", 1))
     assert result.outcome is Verdict.REFUSED and word in result.reason

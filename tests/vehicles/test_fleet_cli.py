@@ -142,11 +142,11 @@ def test_nobody_on_the_link_is_said_with_exit_code_one(capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["list", "--link", "nonsense"], "is no link"),
-        (["list", "--vehicle", "x"], "is no vehicle"),
+        (["list", "--link", "nonsense"], "is not a link"),
+        (["list", "--vehicle", "x"], "is not a vehicle"),
         (["list", "--gcs-system", "300"], "1 to 255"),
-        (["list", "--wait", "-1"], "is no time"),
-        (["watch", "--seconds", "nan"], "is no time"),
+        (["list", "--wait", "-1"], "is not a time"),
+        (["watch", "--seconds", "nan"], "is not a time"),
         (["upload", "absent.plan"], "does not exist"),
         (["start", "--plan", "absent"], "holds no missions"),
         (["list", "--signing-key", "absent"], "cannot be read"),

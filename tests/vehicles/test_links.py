@@ -201,7 +201,7 @@ def test_the_checksum_is_mavlinks(data):
 @given(st.data())
 @settings(max_examples=60, deadline=None)
 def test_packets_are_found_in_any_pieces_between_any_noise(data):
-    """What is between packets is no marker here: noise that looks like a packet may cost one, never invent one."""
+    """What is between packets is not a marker here: noise that looks like a packet may cost one, never invent one."""
     raws = messages(6) + messages(3, version1=True)
     stream, noise = b"", st.binary(max_size=8).map(lambda b: b.replace(b"\xfd", b"").replace(b"\xfe", b""))
     for raw in raws:

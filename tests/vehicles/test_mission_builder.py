@@ -123,7 +123,7 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_sent(tmp_path):
     item = mission_files.MissionItem
     with pytest.raises(InputError, match="no items"):
         build_mission(PX4, [], name="empty.plan")
-    with pytest.raises(InputError, match="no place"):
+    with pytest.raises(InputError, match="not a place"):
         build_mission(PX4, [item(WAYPOINT, 3, lat_deg=95.0, lon_deg=8.0, alt_m=20.0)])
     with pytest.raises(InputError, match="height"):
         build_mission(AP, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=2e6)])

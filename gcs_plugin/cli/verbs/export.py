@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     if not 1 <= args.quality <= 100:
         raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")
     if not args.map.is_dir():
-        raise InputError(f"{args.map} is no folder; name the output folder of `orthoswarm mosaic`")
+        raise InputError(f"{args.map} is not a folder; name the output folder of `orthoswarm mosaic`")
     dest = args.dest or args.map / "export"
     made: dict[str, str] = {}
     notes: list[str] = []

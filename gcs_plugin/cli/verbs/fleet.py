@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
         ("--ready", getattr(args, "ready", 0.0)),
     ):
         if not value >= 0.0:
-            raise InputError(f"{name} {value:g} is no time; give seconds, 0 or more")
+            raise InputError(f"{name} {value:g} is not a time; give seconds, 0 or more")
     systems = parse_systems(args.vehicle)
     prepared = _Prepared(args, systems)
     backend = open_backend(
@@ -236,7 +236,7 @@ def parse_systems(texts: Sequence[str]) -> list[int]:
         for part in text.split(","):
             match = re.fullmatch(r"v?(\d{1,3})", part.strip())
             if not match or not 1 <= int(match[1]) <= 255:
-                raise InputError(f"'{part}' is no vehicle; give system ids as in --vehicle 3 or --vehicle 1,2,5")
+                raise InputError(f"'{part}' is not a vehicle; give system ids as in --vehicle 3 or --vehicle 1,2,5")
             systems.append(int(match[1]))
     return sorted(set(systems))
 

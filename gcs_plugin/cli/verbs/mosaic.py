@@ -130,9 +130,9 @@ def _check(args: argparse.Namespace) -> None:
     from orthoswarm.model.errors import InputError
 
     if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
-        raise InputError(f"--gsd {args.gsd:g} is no ground pixel; give metres, for example 0.1")
+        raise InputError(f"--gsd {args.gsd:g} is not a ground pixel; give metres, for example 0.1")
     if args.fov_min is not None and not 5.0 <= args.fov_min <= 150.0:
-        raise InputError(f"--fov-min {args.fov_min:g} is no field of view; give degrees, for example 70")
+        raise InputError(f"--fov-min {args.fov_min:g} is not a field of view; give degrees, for example 70")
     for flag, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
         if value is not None and not value > 0.0:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")

@@ -168,14 +168,16 @@ def _aspect(text: str) -> float:
         width, _, height = text.replace("/", ":").partition(":")
         return float(width) / float(height or 1.0)
     except (ValueError, ZeroDivisionError):
-        raise InputError(f"the aspect ratio '{text}' is no W:H; give it as 4:3") from None
+        raise InputError(f"the aspect ratio '{text}' is not of the form W:H; give it as 4:3") from None
 
 
 def _position(text: str) -> tuple[float, float]:
     try:
         lat, lon = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"the start '{text}' is no LAT,LON; give it in degrees as 48.1371,11.5754") from None
+        raise InputError(
+            f"the start '{text}' is not of the form LAT,LON; give it in degrees as 48.1371,11.5754"
+        ) from None
     return lat, lon
 
 

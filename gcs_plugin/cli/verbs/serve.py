@@ -124,7 +124,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     for text in args.source:
         name, _, where = text.partition("=")
         if not name or not where:
-            raise InputError(f"--source {text} is no ID=WHERE; for example v1=udp://0.0.0.0:5600")
+            raise InputError(f"--source {text} is not of the form ID=WHERE; for example v1=udp://0.0.0.0:5600")
         where_to = {"can": where.removeprefix(CAN)} if where.startswith(CAN) else {"pictures": where}
         vehicles[name] = replace(vehicles.get(name, VehicleSettings(name)), **where_to)
     return replace(settings, vehicles=tuple(vehicles.values())).check()

@@ -85,9 +85,9 @@ def _home(text: str) -> tuple[float, float, float]:
         parts = [float(part) for part in text.split(",")]
         lat, lon, alt = (*parts, 0.0)[:3]
     except ValueError:
-        raise InputError(f"'{text}' is no place; give LAT,LON or LAT,LON,ALT in degrees and metres") from None
+        raise InputError(f"'{text}' is not a place; give LAT,LON or LAT,LON,ALT in degrees and metres") from None
     if not (-85.0 <= lat <= 85.0 and -180.0 <= lon <= 180.0):
-        raise InputError(f"'{text}' is no place; give LAT,LON or LAT,LON,ALT in degrees and metres")
+        raise InputError(f"'{text}' is not a place; give LAT,LON or LAT,LON,ALT in degrees and metres")
     return lat, lon, alt
 
 
@@ -100,6 +100,6 @@ def _events(texts: list[str], what: str) -> list[tuple[float, int, str, float]]:
             events.append((float(at), int(who.removeprefix("v")), what, float(seconds or 10.0)))
         except ValueError:
             raise InputError(
-                f"'{text}' is no time for a vehicle; write for example 2@60, or 2@60+15 for a silence"
+                f"'{text}' is not a time for a vehicle; write for example 2@60, or 2@60+15 for a silence"
             ) from None
     return events

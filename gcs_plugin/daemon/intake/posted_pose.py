@@ -66,14 +66,16 @@ def parse_pose(document: Any, image: str | None = None) -> PostedPose:
         InputError: what is missing or wrong, in a sentence.
     """
     if not isinstance(document, Mapping):
-        raise InputError("the pose is no JSON object; send vehicle, image, time, lat_deg, lon_deg, height_m, yaw_deg")
+        raise InputError(
+            "the pose is not a JSON object; send vehicle, image, time, lat_deg, lon_deg, height_m, yaw_deg"
+        )
     vehicle, name = _text(document, "vehicle"), _text(document, "image", image)
     values = {"lat_deg": _number(document, "lat_deg", 90.0), "lon_deg": _number(document, "lon_deg", 360.0)}
     for key, largest in _OPTIONAL.items():
         if document.get(key) is not None:
             values[key] = _number(document, key, largest)
     if "fov_deg" in values and values["fov_deg"] < 1.0:
-        raise InputError("fov_deg of the pose is no field of view; leave it out or send degrees")
+        raise InputError("fov_deg of the pose is not a field of view; leave it out or send degrees")
     return PostedPose(vehicle, name, parse_time(document.get("time")), values)
 
 

@@ -11,7 +11,7 @@ from orthoswarm.export.product_files import iso_time
 CAUSES: Final = {
     "disk": "the workspace's disk is full or gone",
     "pose": "the pose is wrong or missing",
-    "picture": "the file is no picture, or too large",
+    "picture": "the file is not a picture, or too large",
     "time": "the upload stood still",
     "place": "the picture's position cannot be on the map",
     "map": "the picture cannot be drawn",

@@ -46,9 +46,9 @@ class ConsoleState:
         """
         for key in ("area", "settings", "vehicles"):
             if not isinstance(body.get(key), dict | None):
-                raise InputError(f"{key} is no JSON object; send one, or null")
+                raise InputError(f"{key} is not a JSON object; send one, or null")
         if not isinstance(body.get("plan"), str | None):
-            raise InputError("plan is no id of a plan; send one, or null")
+            raise InputError("plan is not the id of a plan; send one, or null")
         with self._lock:
             before, known = self.plan()["version"], body.get("version")
             if known is not None and known != before:
@@ -74,7 +74,7 @@ class ConsoleState:
             "note": body.get("note") or "", "time": iso_time(time.time()),
         }  # fmt: skip
         if not isinstance(row["note"], str) or len(row["note"]) > _MOST_NOTE:
-            raise InputError(f"note is no text of at most {_MOST_NOTE} characters; send a shorter one")
+            raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
         with self._lock:
             found = self._journal.fact("finds") or {"next": 1, "rows": []}
             if len(found["rows"]) >= _MOST_FINDS:

@@ -87,7 +87,7 @@ class Journal:
         """Open or make the journal.
 
         Raises:
-            OrthoSwarmError: the file cannot be opened or is no journal.
+            OrthoSwarmError: the file cannot be opened or is not a journal.
         """
         self.path, self.commits = path, 0
         self._local = threading.local()

@@ -25,7 +25,7 @@ def picture_size(data: bytes) -> tuple[int, int, str]:
     """Columns, rows and file suffix of a picture, by its header.
 
     Raises:
-        InputError: it is no picture, or a huge one.
+        InputError: it is not a picture, or a huge one.
     """
     try:
         width, height, kind = picture_file.picture_size(data, _FORMATS)

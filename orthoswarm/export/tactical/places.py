@@ -81,7 +81,7 @@ def read_places(folder: Path) -> list[Place]:
     try:
         return [_place(row) for row in json.loads(path.read_text(encoding="utf-8"))["features"]]
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{path} is no list of places; remove it, and export again") from None
+        raise InputError(f"{path} is not a list of places; remove it, and export again") from None
 
 
 def _place(row: Mapping[str, Any]) -> Place:

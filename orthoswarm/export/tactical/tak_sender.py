@@ -42,7 +42,9 @@ class TakAddress:
         except ValueError:
             host = port = None
         if host is None or port is None or parts.scheme not in ("udp", "tcp", "tls"):
-            raise InputError(f"{text} is no TAK address; give for example udp://239.2.3.1:6969 or tls://tak.local:8089")
+            raise InputError(
+                f"{text} is not a TAK address; give for example udp://239.2.3.1:6969 or tls://tak.local:8089"
+            )
         return cls(parts.scheme, host, port, certificate, authority)
 
 

@@ -67,7 +67,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArra
         region: the cells.
         shots: N pictures that may see it.
         tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
-        previews: (N,) of previews.RECORD; a picture without one is no candidate.
+        previews: (N,) of previews.RECORD; a picture without one is not a candidate.
     """
     config = active().mosaic
     position, rotation = shots.about(region.west, region.north)

@@ -17,7 +17,7 @@ Ints = NDArray[np.int32]
 Floats = NDArray[np.float32]
 
 NONE, FOREIGN = -1, -2
-"""Labels of cells that no picture sees, and of a neighbour's cells whose picture is no candidate here."""
+"""Labels of cells that no picture sees, and of a neighbour's cells whose picture is not a candidate here."""
 _MOST_LABELS = 8
 """Room for the labels in and around a block; a block of 8 cells seldom has more than four."""
 
@@ -77,7 +77,7 @@ def _edge(candidate, level, scale, over, costs, r, c, a, r2, c2, b):  # type: ig
 
 @kernel
 def _moved(label, held, candidate, r, c, k):  # type: ignore[no-untyped-def]
-    """A cell's label once its block is moved to k: the old one where k is no candidate."""
+    """A cell's label once its block is moved to k: the old one where k is not a candidate."""
     if k < 0 or held[r, c] or _slot(candidate, r, c, k) < 0:
         return label[r, c]
     return k

@@ -49,12 +49,12 @@ def ring(points: Any, name: str, least: int = 3) -> Ring:
         least: points that must remain: 3 for a ring (which then is not closed), 2 for a line.
 
     Raises:
-        InputError: too few points, or values that are no degrees.
+        InputError: too few points, or values that are not degrees.
     """
     try:
         array = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
-        raise InputError(f"{name} has coordinates that are no numbers; export it again") from None
+        raise InputError(f"{name} has coordinates that are not numbers; export it again") from None
     if not np.isfinite(array).all():
         raise InputError(f"{name} has coordinates that are not finite; export it again")
     if (np.abs(array) > [90.0, 180.0]).any():
@@ -74,12 +74,12 @@ def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
     """Polygons and lines of a GeoJSON text (RFC 7946): geometries, features and collections, nested ones too.
 
     Raises:
-        InputError: no JSON, no GeoJSON, or coordinates that are no longitude and latitude.
+        InputError: no JSON, no GeoJSON, or coordinates that are not longitude and latitude.
     """
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is no valid JSON ({error}); export it again") from None
+        raise InputError(f"{name} is not valid JSON ({error}); export it again") from None
     if not isinstance(document, dict) or "type" not in document:
         raise InputError(f"{name} is JSON but no GeoJSON (it has no 'type'); export a polygon as GeoJSON")
     crs = str(((document.get("crs") or {}).get("properties") or {}).get("name", "CRS84"))
@@ -124,12 +124,12 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
     """Polygons and lines of a KML text (OGC KML 2.x; any namespace).
 
     Raises:
-        InputError: no XML, no KML, or coordinates that are no longitude and latitude.
+        InputError: no XML, no KML, or coordinates that are not longitude and latitude.
     """
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{name} is no valid XML ({error}); export it again") from None
+        raise InputError(f"{name} is not valid XML ({error}); export it again") from None
     if _tag(root) not in ("kml", "Document", "Folder", "Placemark"):
         raise InputError(f"{name} is XML but no KML (its root is '{_tag(root)}'); export a polygon as KML")
     polygons, lines = [], []

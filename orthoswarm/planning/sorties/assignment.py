@@ -68,7 +68,7 @@ class Options:
         """Refuse values that mean nothing.
 
         Raises:
-            InputError: a value that is not larger than 0 or out of reach, or a start that is no position.
+            InputError: a value that is not larger than 0 or out of reach, or a start that is not a position.
         """
         speed = self.motion.speed_m_s
         if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
@@ -99,7 +99,7 @@ class Options:
                 raise InputError(f"the {name} is not finite; give a number of metres")
         for lat, lon in self.starts:
             if not (abs(lat) <= 90.0 and abs(lon) <= 180.0):
-                raise InputError(f"the start {lat:g},{lon:g} is no position; give latitude,longitude in degrees")
+                raise InputError(f"the start {lat:g},{lon:g} is not a position; give latitude,longitude in degrees")
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def read_can_log(path: Path) -> FlightLog:
         OSError: it cannot be read. NotALog: it holds no CAN frame, or no DroneCAN message that is read here.
     """
     if not is_can_log(path):
-        raise NotALog(f"the file is no log of a CAN bus ({', '.join(sorted(SUFFIXES))}); it is left out")
+        raise NotALog(f"the file is not the log of a CAN bus ({', '.join(sorted(SUFFIXES))}); it is left out")
     reading, buses = _Reading(), dict[str, DronecanPoses]()
     for message in _messages(path, reading):
         reading.frames += 1

@@ -58,7 +58,7 @@ def read_dataflash(path: Path) -> FlightLog:
     with mapped(path) as data:
         rows = _rows(data)
     if not rows:
-        raise NotALog("the file holds no DataFlash record; it is no ArduPilot log")
+        raise NotALog("the file holds no DataFlash record; it is not an ArduPilot log")
     log = FlightLog(path, "DataFlash", path.stem)
     clock = _utc_minus_boot(rows.get("GPS", []))
     if "POS" in rows:

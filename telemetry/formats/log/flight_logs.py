@@ -41,7 +41,7 @@ def read_log(path: Path) -> list[FlightLog]:
     }
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise NotALog("the file is no flight log (.tlog, .BIN, .ulg, .pos, .MRK, .log, .asc, .blf, .trc)")
+        raise NotALog("the file is not a flight log (.tlog, .BIN, .ulg, .pos, .MRK, .log, .asc, .blf, .trc)")
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")
@@ -119,7 +119,7 @@ def read_tlog(path: Path) -> list[FlightLog]:
     with mapped(path) as data:
         packets = _read_packets(data, decoder, mavlink.MAVError, wanted, vehicles)
     if not packets:
-        raise NotALog("the file holds no MAVLink packet; it is no tlog")
+        raise NotALog("the file holds no MAVLink packet; it is not a tlog")
     return [vehicle.log(path, system) for system, vehicle in sorted(vehicles.items())]
 
 

@@ -38,7 +38,7 @@ def read_ulog(path: Path) -> FlightLog:
     """
     with mapped(path) as data:
         if data[:7] != _MAGIC:
-            raise NotALog("the file is no ULog; check its name")
+            raise NotALog("the file is not a ULog; check its name")
         rows = _rows(data)
     log = FlightLog(path, "ULog", path.stem)
     fixes = rows.get("sensor_gps") or rows.get("vehicle_gps_position", [])

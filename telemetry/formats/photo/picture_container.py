@@ -61,7 +61,7 @@ def read_container(path: Path) -> Container:
     try:
         state = os.fstat(fd)
         if not stat.S_ISREG(state.st_mode):  # reading a named pipe would wait for ever
-            raise NotAPicture("this is no file but a pipe or a device; copy the picture itself here")
+            raise NotAPicture("this is not a file but a pipe or a device; copy the picture itself here")
         size = state.st_size
         head = os.read(fd, _HEAD)
         if size == 0 or not head:
@@ -91,7 +91,7 @@ def _by_content(fd: int, head: bytes, size: int) -> Container:
         return Container("bmp", abs(width), abs(height), exif.Exif())
     if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
         raise NotAPicture("HEIC and AVIF pictures cannot be read here; convert them to JPEG, which keeps their tags")
-    raise NotAPicture("the content is no picture that can be read (JPEG, PNG, TIFF, WebP, BMP); leave the file out")
+    raise NotAPicture("the content is not a picture that can be read (JPEG, PNG, TIFF, WebP, BMP); leave the file out")
 
 
 def _read_at(fd: int, offset: int, length: int) -> bytes:
@@ -215,7 +215,7 @@ def _big_tiff(fd: int, little: bool) -> Container:
     entries = _read_at(fd, first + 8, 20 * min(count, _MAX_SEGMENTS))
     tags = {struct.unpack_from(order + "H", entries, at)[0] for at in range(0, len(entries) - 19, 20)}
     if exif.GEO_KEYS not in tags:
-        raise NotAPicture("a BigTIFF is no picture of a camera; save it as TIFF or JPEG")
+        raise NotAPicture("a BigTIFF is not a picture of a camera; save it as TIFF or JPEG")
     return Container("tiff", 0, 0, exif.Exif(), georeferenced=True)
 
 

@@ -38,13 +38,13 @@ def read_sei_layout(path: Path) -> Decoder:
     except OSError as error:
         raise InputError(f"{path.name} cannot be read ({error.strerror}); check the path of --sei-layout") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} is no TOML file ({error}); see docs/telemetry.md for an example") from None
+        raise InputError(f"{path.name} is not a TOML file ({error}); see docs/telemetry.md for an example") from None
     kind, uuid = _message(entries, path)
     try:
         form = struct.Struct(str(entries.get("struct", "")))
         count = len(form.unpack(bytes(form.size)))
     except struct.error as error:
-        raise InputError(f"{path.name}: struct is no format of Python's struct ({error}); correct it") from None
+        raise InputError(f"{path.name}: struct is not a format of Python's struct ({error}); correct it") from None
     names = entries.get("fields")
     if not isinstance(names, list) or len(names) != count or count == 0:
         raise InputError(f"{path.name}: fields has to name each of the {count} values of struct; '' leaves one out")
@@ -85,8 +85,8 @@ def _field(written: str, path: Path) -> tuple[str, float, float] | None:
         return None
     match = _FIELD.fullmatch(written.replace(" ", ""))
     if match is None or match[1] not in _NUMBERS:
-        raise InputError(f"{path.name}: '{written}' is no field; known are {', '.join(sorted(_NUMBERS))}")
+        raise InputError(f"{path.name}: '{written}' is not a field; known are {', '.join(sorted(_NUMBERS))}")
     try:
         return match[1], float(match[2] or 1.0), float(match[3] or 0.0)
     except ValueError:
-        raise InputError(f"{path.name}: '{written}' has a factor or offset that is no number") from None
+        raise InputError(f"{path.name}: '{written}' has a factor or offset that is not a number") from None

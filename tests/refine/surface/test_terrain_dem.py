@@ -119,7 +119,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_dem(tmp_path / "none.tif", EPSG, BOUNDS)
     (tmp_path / "text.tif").write_text("no picture")
-    with pytest.raises(InputError, match="no readable height model"):
+    with pytest.raises(InputError, match="not a readable height model"):
         read_dem(tmp_path / "text.tif", EPSG, BOUNDS)
     with pytest.raises(InputError, match="no CRS"):
         read_dem(write(tmp_path / "bare.tif", z, None, transform), EPSG, BOUNDS)

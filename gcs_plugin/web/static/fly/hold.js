@@ -4,7 +4,7 @@ import { button, make, setHidden, setText } from "/static/core/dom.js";
 import { t } from "/static/core/strings.js";
 
 const HOLD_MS = 1000;
-const SETTLE_MS = 350; // a double press of the first button is no confirmation
+const SETTLE_MS = 350; // a double press of the first button is not a confirmation
 
 export function holdConfirm() {
   const question = make("p", { id: "confirm-question" });
