@@ -1,4 +1,4 @@
-"""Every way to learn where a camera was: readers that yield orthoswarm Frames."""
+"""Readers of camera poses (tags, logs, video metadata, live links), which yield orthoswarm Frames."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ __all__ = ["LoadOptions", "load"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the readers on first use, so that the package itself costs nothing."""
+    """Import the readers on first use, so that importing the package is fast."""
     if name in __all__:
         from telemetry.ingest import ingest
 

@@ -1,1 +1,1 @@
-"""One file a format: bytes in, samples or tags out."""
+"""One module for each file format: bytes in, samples or tags out."""

@@ -1,1 +1,1 @@
-"""From inputs to frames: finds photos, videos and logs, pairs them, and tells what is suspicious."""
+"""From inputs to frames: finds photos, videos and logs, pairs them, and reports what is suspicious."""

@@ -1,4 +1,4 @@
-"""A log of a vehicle's CAN bus beside its autopilot's log: what the bus knows better is used in its place."""
+"""A CAN log combined with the autopilot's log of the same vehicle: the more accurate values of the two are used."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
 
 
 def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
-    """Median distance of the tracks of two logs in metres; None where they have too little time in common."""
+    """Median distance of the tracks of two logs in metres; None if they share too little time."""
     own = [sample for sample in log.samples if sample.has_position]
     if not own:
         return None
@@ -31,10 +31,11 @@ def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
 
 
 def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
-    """An autopilot's log with what its vehicle's bus states a lower sigma for, and what that is, in words.
+    """The autopilot's log with values of the CAN bus that state a lower sigma, and a description of these.
 
-    Positions are compared by their stated sigmas; a position whose sigma nobody states counts as 1.5 m. A gimbal on
-    the bus is used where the autopilot reports none. None where the logs are not of one vehicle, or nothing is better.
+    Positions are compared by their stated sigmas; without a stated sigma 1.5 m is assumed. A gimbal on
+    the bus is used where the autopilot reports none. None if the logs are not of one vehicle, or nothing is more
+    accurate.
     """
     distance = apart_m(log, bus)
     if distance is None or distance > _SAME_VEHICLE_M:
@@ -56,7 +57,10 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
 
 
 def _placed(sample: Sample, track: Timeline, sigma_m: float) -> Sample:
-    """A sample at the position of the bus, where that is known then and better; else the sample itself."""
+    """The sample with the position of the bus if that is known at its time and more accurate.
+
+    Else the sample itself.
+    """
     if not sample.has_position or sample.time_s is None:
         return sample
     known = track.at(sample.time_s)

@@ -1,6 +1,6 @@
-"""The offset between a camera's clock and a vehicle's, from what both have seen of the flight.
+"""The offset between a camera's clock and a vehicle's, from what both recorded of the flight.
 
-All functions return camera time minus vehicle time in seconds, or None where nothing fits.
+All functions return camera time minus vehicle time in seconds, or None if nothing fits.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, sea
         times: (N,) by the camera.
         lat_lon: (N, 2) degrees by the camera.
         timeline: the vehicle's.
-        search_s: furthest offset besides whole quarter hours.
+        search_s: largest offset besides whole quarter hours.
     """
     if timeline.span is None or len(times) < 3:
         return None
@@ -57,7 +57,7 @@ def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, sea
 
 
 def _distance(times: Array, lat_lon: Array, timeline: Timeline) -> float | None:
-    """Median distance in metres between positions and a track; None where the track covers too few of them."""
+    """Median distance in metres between positions and a track; None if the track covers too few of them."""
     lat, lon = timeline.values("lat_deg", times), timeline.values("lon_deg", times)
     known = ~np.isnan(lat)
     if known.sum() < max(3, 0.6 * len(times)):
@@ -72,17 +72,17 @@ def _distance(times: Array, lat_lon: Array, timeline: Timeline) -> float | None:
 def offset_by_turning(
     picture_times: Array, picture_rates: Array, timeline: Timeline, *, search_s: float = 120.0, step_s: float = 0.1
 ) -> tuple[float, float] | None:
-    """The offset under which the pictures turn when the vehicle turns.
+    """The offset for which the pictures rotate when the vehicle turns.
 
     Args:
         picture_times: (N,) video seconds or camera time.
-        picture_rates: (N,) yaw rate seen by the pictures, degrees a second.
+        picture_rates: (N,) yaw rate measured in the pictures, degrees a second.
         timeline: the vehicle's; its flight yaw (or camera yaw) is read.
-        search_s: how far the clocks may be apart, beyond what aligns their beginnings.
+        search_s: largest difference of the clocks after their beginnings are aligned.
         step_s: resolution.
 
     Returns:
-        Offset and the correlation there (0 to 1), None where the flight has too few turns to tell.
+        Offset and the correlation there (0 to 1), None if the flight has too few turns.
     """
     if timeline.span is None or len(picture_times) < 10 or np.std(picture_rates) < 0.5:
         return None
@@ -121,9 +121,9 @@ def offset_by_turning(
 
 
 def turning_of_pictures(grays: Sequence[NDArray[np.uint8]], times: Array) -> tuple[Array, Array]:
-    """How fast consecutive pictures turn about their centre: times between them and degrees a second.
+    """Rotation rate of consecutive pictures about their centre: times between them and degrees a second.
 
-    A picture that turns clockwise over the ground (yaw grows) shows the ground turning the other way.
+    A picture that rotates clockwise over the ground (yaw grows) shows the ground rotating the other way.
     """
     import cv2
 
@@ -139,7 +139,7 @@ def turning_of_pictures(grays: Sequence[NDArray[np.uint8]], times: Array) -> tup
         model, inliers = cv2.estimateAffinePartial2D(points[good], moved[good], ransacReprojThreshold=2.0)
         if model is None or inliers.sum() < 10:
             continue
-        # Rows run down: a positive angle of the model is clockwise as seen, which is the camera turning left.
+        # Rows point down: a positive angle of the model looks clockwise, which is the camera turning left.
         angle = np.degrees(np.arctan2(model[1, 0], model[0, 0]))
         middle.append(0.5 * (times[i] + times[i + 1]))
         rates.append(-angle / (times[i + 1] - times[i]))

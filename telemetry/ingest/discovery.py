@@ -1,4 +1,4 @@
-"""What lies in the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
+"""Lists the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
 
 import os
 import re
@@ -24,10 +24,10 @@ _SUBTITLES = frozenset({".srt"})
 
 @dataclass(slots=True)
 class Folder:
-    """One folder with something in it.
+    """One folder that contains usable files.
 
     Attributes:
-        path: of the folder. vehicle: id of the vehicle whose photos lie here.
+        path: of the folder. vehicle: id of the vehicle whose photos it contains.
         pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
     """
 
@@ -42,13 +42,13 @@ class Folder:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """All folders of the inputs, and the folder that picture names are relative to.
+    """All folders of the inputs, and the root of picture names.
 
     Attributes:
-        root: names are relative to it. folders: those with something in them.
-        left_out: files with a picture's suffix that are not looked into, and why.
+        root: names are relative to it. folders: those with usable files.
+        left_out: files with a picture's suffix that are not read -> reason.
         videos: the vehicle of each video, unless its metadata names another.
-        everywhere: tables and logs that were named, themselves or by a folder, apart from all pictures and videos.
+        everywhere: tables and logs given by themselves or in folders without pictures and videos.
     """
 
     root: Path
@@ -58,7 +58,7 @@ class Discovery:
     everywhere: frozenset[Path] = frozenset()
 
     def scope(self, path: Path) -> Path:
-        """The folder whose pictures and videos, with those below it, a table or log tells about."""
+        """The folder whose pictures and videos (subfolders included) a table or log applies to."""
         return self.root if path in self.everywhere else path.parent
 
     def name(self, path: Path) -> str:
@@ -73,12 +73,12 @@ def _relative(folder: str, root: str) -> str:
 
 
 def _text(name: str) -> str:
-    """A path as text: bytes of its name that are not UTF-8 come as escapes, for no file format could hold them."""
+    """A path as text: bytes of its name that are not UTF-8 are escaped, as no file format could hold them."""
     return name.replace(os.sep, "/").encode("utf-8", "backslashreplace").decode()
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key in which DJI_2 comes before DJI_10; upper and lower case count alike."""
+    """Sort key in which DJI_2 comes before DJI_10; case is ignored."""
     return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in _DIGITS.split(name.lower()) if part)
 
 
@@ -86,10 +86,10 @@ _DIGITS = re.compile(r"([0-9]{1,18})")
 
 
 def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
-    """List what the inputs hold. Hidden files and folders, and everything below `exclude`, are not looked into.
+    """List the inputs' files, without hidden files and folders and everything below `exclude`.
 
-    A video or photo that is named itself brings what lies beside it and tells its pose: the SRT of the same name,
-    geo.txt and CSV. Logs have to be named, for any flight's may lie there.
+    A video or photo given by itself includes the files next to it that describe its pose: the SRT of the same name,
+    geo.txt and CSV. Logs must be given, as those of other flights may be there.
 
     Raises:
         InputError: no input, or one that does not exist.
@@ -147,7 +147,7 @@ def _walk(top: Path, outside: set[str]) -> list[Path]:
 
 
 def _beside(named: list[Path]) -> list[Path]:
-    """Files beside videos and photos that tell where these were taken."""
+    """Files next to videos and photos that describe their poses."""
     videos = {(path.parent, path.stem.lower()) for path in named if path.suffix.lower() in VIDEO_SUFFIXES}
     photos = {path.parent for path in named if path.suffix.lower() in PICTURE_SUFFIXES}
     found: list[Path] = []
@@ -165,7 +165,7 @@ def _beside(named: list[Path]) -> list[Path]:
 
 
 def _far_from_pictures(tops: Sequence[Path], folders: list[Folder]) -> frozenset[Path]:
-    """Tables and logs in named folders (or named themselves in folders) that hold no picture and no video."""
+    """Tables and logs in given folders (or given by themselves in folders) without pictures and videos."""
     seen = {up for folder in folders if folder.pictures or folder.videos for up in (folder.path, *folder.path.parents)}
     apart = {top for top in tops if top not in seen}
     there = (folder for folder in folders if not apart.isdisjoint((folder.path, *folder.path.parents)))
@@ -203,7 +203,7 @@ def _name_vehicles(folders: list[Folder], root: Path) -> None:
 
 
 def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
-    """A video is a vehicle by its name; by its path where cameras of several drones gave the same name."""
+    """Each video is a vehicle named like it; by its path if cameras of several drones used the same name."""
     videos = [path for folder in folders for path in folder.videos]
     often = Counter([path.stem for path in videos] + [folder.vehicle for folder in folders if folder.pictures])
     paths = {path: _text(os.path.relpath(path, root)) for path in videos}

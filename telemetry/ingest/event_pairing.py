@@ -1,4 +1,4 @@
-"""Photos paired with camera events, although their clocks differ and some of either are missing.
+"""Pairs photos with camera events, although their clocks differ and some of both are missing.
 
 By time: both are matched as sequences (`sequence_match`). Without times: by the numbers in file names and events, else
 by order alone. Missing first, dropped and extra pictures are found that way and reported.
@@ -24,10 +24,10 @@ class Pairing:
 
     Attributes:
         pairs: (photo, event) indices, both increasing.
-        doubtful: photos whose pairing the times do not decide, with the events that each may belong to.
-        offset_s: photo clock minus event clock, None where times were not used.
+        doubtful: photos whose pairing the times leave open -> possible events.
+        offset_s: photo clock minus event clock, None if times were not used.
         residual_s: median distance of paired times after offset and drift.
-        ambiguous: True where less than half of the pairs are decided. how: "time", "number" or "order".
+        ambiguous: True if less than half of the pairs are decided. how: "time", "number" or "order".
     """
 
     pairs: list[tuple[int, int]] = field(default_factory=list)
@@ -50,7 +50,7 @@ def pair(
         photo_times: by the camera's clock, None where unknown.
         event_times: UTC, None where unknown.
         photo_numbers: of file names.
-        event_numbers: as the autopilot counts.
+        event_numbers: the autopilot's image counts.
     """
     if not len(photo_times) or not len(event_times):
         return Pairing()
@@ -73,7 +73,7 @@ def pair(
 
 
 def by_time(photos: Array, events: Array) -> Pairing:
-    """Pair two rows of times whose clocks differ by an unknown offset and drift."""
+    """Pair two sequences of times whose clocks differ by an unknown offset and drift."""
     order_p, order_e = np.argsort(photos, kind="stable"), np.argsort(events, kind="stable")
     found = match_sequences(photos[order_p], events[order_e])
     if found is None:
@@ -96,7 +96,7 @@ def by_time(photos: Array, events: Array) -> Pairing:
 
 
 def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pairing | None:
-    """Pair by the numbers of files and events under the shift that most agree with; None where there are none."""
+    """Pair by the numbers of files and events, with the shift on which most agree; None without numbers."""
     own = {n: i for i, n in enumerate(photos) if n is not None}
     theirs = {n: j for j, n in enumerate(events) if n is not None}
     if len(own) < 2 or len(theirs) < 2 or len(own) < 0.9 * len(photos) or len(theirs) < 0.9 * len(events):
@@ -106,7 +106,7 @@ def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pa
         for m in theirs:
             votes[n - m] = votes.get(n - m, 0) + 1
     most = max(votes.values())
-    # Of equal shifts the one that brings the first pictures together.
+    # Of equally good shifts, the one that pairs the first pictures.
     shift = min((s for s, v in votes.items() if v == most), key=lambda s: abs(min(own) - s - min(theirs)))
     pairs = sorted((own[m + shift], j) for m, j in theirs.items() if m + shift in own)
     return Pairing(pairs, how="number", ambiguous=sum(v == most for v in votes.values()) > 1)

@@ -1,6 +1,7 @@
 """From inputs to frames: finds the sources, merges them field by field, decides between contradicting tags.
 
-The richer source wins a field, none throws away what another has: a geo.txt without angles leaves the photos'
+For each field the better source is used, and missing fields come from others: a geo.txt without angles leaves the
+photos'
 angles, and an absolute altitude never becomes a height.
 """
 
@@ -74,7 +75,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         if progress is not None:
             progress("reading photos", done, total)
 
-    # One sequence over all folders: with a call for each, processes would wait at every folder's end.
+    # One call for all folders: with one for each, processes would idle at the end of every folder.
     pictures = [picture for folder in found.folders for picture in folder.pictures]
     with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
         for folder in found.folders:
@@ -115,7 +116,7 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
 
 
 def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery) -> list[Finding]:
-    """Lines of a pose table that say nothing, or are about pictures that are not there."""
+    """Findings on lines of a pose table that have no pose, or name missing pictures."""
     findings = []
     if table.useless:
         text = f"{plural(table.useless, 'line')} of {path.name} hold no position that can be one; they are not used"
@@ -137,7 +138,7 @@ def _photo_folder(
     logs: Sequence[LogSource],
     result: Survey,
 ) -> None:
-    """Make one folder's photos, of which these are the tags, one source."""
+    """Make one source from a folder's photos with these tags."""
     at_root = folder.path == found.root
     source = SourceInfo(folder.path.name if at_root else found.name(folder.path), "photos")
     groups: dict[str, list[PhotoTags]] = {}
@@ -166,7 +167,7 @@ def _photo_folder(
 
 
 def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
-    """Of a multispectral camera's pictures the colour ones, else those of one band; the others are rejected."""
+    """Keep a multispectral camera's colour pictures, else those of one band; the others are rejected."""
     bands = {photo.band for photo in photos}
     if len(bands) < 2:
         return list(photos)
@@ -180,7 +181,7 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
 
 
 def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
-    """Those that have a position; the others are rejected."""
+    """Keep photos with a position; the others are rejected."""
     placed = []
     for photo in photos:
         if photo.lat_deg is not None and photo.lon_deg is not None:
@@ -196,7 +197,7 @@ def _photo_key(photo: PhotoTags) -> tuple[object, ...]:
 
 
 def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, PoseTable]]) -> str | None:
-    """Put what tables say over the photo's own tags, field by field; returns a vehicle's name if one is given."""
+    """Overwrite the photo's own tags by table values, field by field; returns the vehicle's name if a table has one."""
     vehicle = None
     for where, kind, table in tables:
         if not path.is_relative_to(where):
@@ -237,7 +238,7 @@ def _check_vehicles(result: Survey) -> None:
 
 
 def require_frames(ingest: Ingest) -> None:
-    """Raise if there is nothing to map, saying why.
+    """Raise an error with the reason if there is nothing to map.
 
     Raises:
         InputError: no frame came out of the inputs.

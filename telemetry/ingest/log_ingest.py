@@ -1,4 +1,4 @@
-"""Flight logs as sources: exposures for `inspect`, poses for photos and videos that lie beside them."""
+"""Flight logs as sources: exposures for `inspect`, poses for photos and videos near them."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ _NAME_BONUS = 0.05
 
 @dataclass(slots=True)
 class LogSource:
-    """A log, the folder that it is about, whether it was used, and what in it is from a log of the vehicle's bus."""
+    """A log, the folder that it applies to, whether it was used, and what in it comes from a CAN log."""
 
     folder: Path
     log: FlightLog
@@ -44,7 +44,7 @@ class LogSource:
 
     @property
     def name(self) -> str:
-        """The file's name, and what of it is from a CAN bus."""
+        """The file's name, and which values come from a CAN bus."""
         return f"{self.log.path.name}, with {self.better}" if self.better else self.log.path.name
 
 
@@ -55,7 +55,7 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
         for path in folder.logs:
             vehicles = read_or_reason(read_log, path)
             if isinstance(vehicles, Unreadable):
-                # A .bin without DataFlash's marks, a .log that is none of a CAN bus: worth a note, no warning.
+                # A .bin that is not a DataFlash log, a .log that is not a CAN log: a note, not a warning.
                 suffix = path.suffix.lower()
                 foreign = (suffix == ".bin" and not has_dataflash_records(path)) or (
                     suffix in CAN_LOGS and not is_can_log(path)
@@ -74,7 +74,7 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
 
 
 def _with_buses(logs: Sequence[LogSource]) -> list[LogSource]:
-    """The logs, those of CAN buses put into the logs of their vehicles' autopilots where there are any."""
+    """The logs; CAN logs are merged into the logs of their vehicles' autopilots."""
     apart: list[LogSource] = []
     flown = [entry for entry in logs if entry.log.kind != _BUS]
     for bus in (entry for entry in logs if entry.log.kind == _BUS):
@@ -96,7 +96,7 @@ def _with_buses(logs: Sequence[LogSource]) -> list[LogSource]:
 
 
 def _count_once(logs: Sequence[LogSource]) -> None:
-    """Count exposures; a log whose exposures are all in another one's names it instead."""
+    """Count exposures; a log whose exposures are all in another log refers to that one instead."""
     counted: list[LogSource] = []
     for entry in sorted(logs, key=lambda e: (-len(e.log.events), e.log.kind != "DataFlash")):
         twin = next((other for other in counted if _same_exposures(entry.log, other.log)), None)
@@ -137,10 +137,10 @@ def add_logs(
 
     Args:
         photos: of one vehicle, in order of time and name.
-        folder: where they lie; logs there and above are considered.
+        folder: their folder; logs there and above are considered.
         vehicle: id, for messages.
         logs: all logs.
-        findings: what was found is appended here.
+        findings: findings are appended here.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):
@@ -163,13 +163,13 @@ def add_logs(
 
 
 def _fit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> float:
-    """How well a log fits photos: 1 where each has its event, less for what is left over, rests, and reuse."""
+    """How well a log fits photos: 1 if each has its event, less for leftovers, residuals and repeated use."""
     share = len(pairing.pairs) / max(len(photos), len(entry.log.events))
     return share - 0.5 * (pairing.how != "time") - 0.6 * entry.used - 0.01 * math.log1p(pairing.residual_s)
 
 
 def _same_number(vehicle: str, log: FlightLog) -> bool:
-    """Whether a vehicle's name and a log's end in the same number: swarms fly alike, and their logs fit each other."""
+    """Whether vehicle and log are named by the same number (logs of a swarm are similar and can be confused)."""
     number = number_of(vehicle)
     return number is not None and number in (number_of(log.path.name), number_of(log.vehicle))
 
@@ -190,7 +190,7 @@ def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent]) -> Pairing
 def _use_events(
     photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
 ) -> None:
-    """Give photos the poses of their events."""
+    """Assign photos the poses of their events."""
     entry.used = True
     log = entry.log
     far = 0
@@ -248,7 +248,7 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
 
 
 def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:
-    """Put a pose's fields where a photo has none; its time replaces the camera's clock."""
+    """Fill a photo's missing fields from a pose; its time replaces the camera's clock."""
     if photo.lat_deg is None and pose.has_position:
         photo.lat_deg, photo.lon_deg = pose.lat_deg, pose.lon_deg
         photo.position_sigma_m = pose.sigma_m

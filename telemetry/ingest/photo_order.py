@@ -1,4 +1,4 @@
-"""The order in which photos were taken, also where the camera's clock was set in between."""
+"""The order of exposure of photos, even if the camera's clock was set in between."""
 
 from collections.abc import Sequence
 
@@ -13,15 +13,15 @@ _JUMP_S = 60.0
 
 
 def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
-    """Photos in the order of their times, or of their names where the clock jumped.
+    """Sort photos by time, or by name where the clock jumped.
 
-    Where the two orders differ, the one with the shorter track is believed; times are then shifted after each jump so
-    that they follow on, which keeps intervals within each part.
+    Where the two orders differ, the one with the shorter track is used; times are then shifted after each jump so
+    that they continue, which preserves intervals within each part.
 
     Args:
         photos: of one vehicle.
         vehicle: id, for messages.
-        findings: what was found is appended here.
+        findings: findings are appended here.
     """
     by_name = sorted(photos, key=lambda p: natural_key(p.path.name))
     by_time = sorted(by_name, key=lambda p: float("inf") if p.time_s is None else p.time_s)

@@ -1,12 +1,14 @@
 """Two recordings of one sequence of exposures, matched by their times.
 
-A camera and an autopilot record the same exposures, each by its own clock and each losing some. Both are matched as
+A camera and an autopilot record the same exposures, each with its own clock and each missing some. Both are matched as
 sequences (a pair hidden Markov model with the states match, photo without event, event without photo; Durbin et al.,
 "Biological Sequence Analysis", chapter 4) under the clock offsets and drifts that their correlation proposes. The
-forward-backward algorithm, summed over all clocks, gives the probability of every pairing: what the times do not decide
-comes out as undecided, not as the nearest event.
+forward-backward algorithm, summed over all clocks, gives the probability of every pairing: a pairing that the times
+leave
+open comes out as undecided, not as the nearest event.
 
-Exposures are taken as a Poisson process of the usual interval, so a match of residual u weighs f(u) times the interval,
+Exposures are modelled as a Poisson process with the usual interval, so a match of residual u weighs f(u) times the
+interval,
 where f is a uniform density as wide as the camera's clock resolution (one second for EXIF without sub-seconds)
 convolved with a Gaussian of the trigger's jitter. Exposures that are missing at an end weigh less than those missing in
 between: logs begin before the first photo.
@@ -45,8 +47,8 @@ class SequenceMatch:
     """Probabilities of pairings.
 
     Attributes:
-        events: (K,) index of each single event; repetitions are left out.
-        first: (N,) position in `events` that column 0 of a photo's row stands for.
+        events: (K,) index of each event, without repetitions.
+        first: (N,) index into `events` of column 0 of a photo's row.
         probability: (N, B) of each photo and event.
         offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
         resolution_s: of the photo's clock. jitter_s: of the trigger, one sigma.
@@ -104,7 +106,7 @@ def _raise_to(tree: list[tuple[float, int]], at: int, entry: tuple[float, int]) 
 
 
 def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
-    """Match two increasing rows of times; None where nothing can be said.
+    """Match two increasing sequences of times; None if they cannot be matched.
 
     Args:
         photos: (N,) by the camera's clock, whole seconds or finer, equal ones in order of exposure.
@@ -146,9 +148,10 @@ def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
 def _without_coincidences(
     problem: "_Problem", first: Indices, probability: Array, offset: float, drift: float
 ) -> Array:
-    """Probabilities given that exposures do not come closer to each other than the camera can take them.
+    """Probabilities under the condition that exposures are never closer than the camera's least interval.
 
-    The Poisson process allows a photo without event and an event without photo at one moment. Where every exposure that
+    The Poisson process allows a photo without event and an event without photo at the same time. Where every exposure
+    that
     the photo's time allows lies closer to its likeliest event than the least interval, the two are the same exposure,
     and only events compete.
     """
@@ -170,7 +173,7 @@ def _single_events(events: Array) -> Indices:
 
 
 def _resolution(times: Array) -> float:
-    """Of a clock, in seconds: the coarsest step that all times are multiples of; 0 for finer than 0.05 s."""
+    """Resolution of a clock in seconds: the coarsest step of which all times are multiples; 0 if finer than 0.05 s."""
     for step in (1.0, 0.5, 0.1, 0.05):
         if np.abs(times / step - np.round(times / step)).max() < 1e-3:
             return step
@@ -179,12 +182,12 @@ def _resolution(times: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Problem:
-    """Times of photos and events, each from an origin of its own, and the model's parameters.
+    """Times of photos and events, each relative to its own origin, and the model's parameters.
 
     Attributes:
         p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
-        resolution_s: width of a photo's interval. interval_s: time between exposures that matches are weighed with.
-        jitter_s: one sigma. missing: odds of one exposure missing from one of the recordings.
+        resolution_s: width of a photo's interval. interval_s: time between exposures, by which matches are weighted.
+        jitter_s: one sigma. missing: odds that an exposure is missing from one of the recordings.
     """
 
     p: Array
@@ -195,7 +198,7 @@ class _Problem:
     missing: float = 0.1
 
     def weights(self, i: int, first: int, width: int, offset: Array, drift: Array) -> Array:
-        """(H, width) weight of photo i being the event `first` and those after it."""
+        """(H, width) weights of photo i matching the event `first` and those after it."""
         at = np.arange(first, first + width)
         inside = (at >= 0) & (at < len(self.e))
         e = self.e[np.clip(at, 0, len(self.e) - 1)]
@@ -208,10 +211,10 @@ class _Problem:
         return np.asarray(np.where(inside, self.interval_s * density, 0.0))
 
     def regular(self) -> "_Problem":
-        """The same for exposures at intervals as even as these.
+        """The same problem for exposures at intervals as even as these.
 
-        At even intervals a clock that is wrong by whole intervals brings photos onto events, too, so that a coincidence
-        is worth as much as the intervals vary, and not a whole interval.
+        At even intervals a clock that is off by whole intervals aligns photos with events, too, so that a coincidence
+        counts only by the variation of the intervals, not by a full interval.
         """
         steps = np.diff(self.e)
         spread = mad_sigma(steps - np.median(steps))
@@ -221,7 +224,7 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True)
 class _Grid:
-    """Clocks about one of them: offsets (H,) in seconds and drifts (H,); half widths bound the band of events."""
+    """Clocks around a given one: offsets (H,) in seconds and drifts (H,); half widths bound the band of events."""
 
     offset: Array
     drift: Array
@@ -283,7 +286,7 @@ def _reach_s(problem: _Problem) -> float:
 
 
 def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
-    """(size,) a unit for each time, spread over its clock's resolution and between the two bins next to it."""
+    """(size,) one unit for each time, spread over the clock's resolution and the two nearest bins."""
     spread = np.arange(-0.5 * width_s, 0.5 * width_s + 1e-9, bin_s) if width_s > bin_s else np.zeros(1)
     places = ((times[:, None] + spread[None, :]) / bin_s).ravel()
     low = np.floor(places).astype(np.int64)
@@ -295,7 +298,7 @@ def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
 
 
 def _plausible(problem: _Problem) -> tuple[_Problem, list[tuple[float, float]]]:
-    """The model's parameters by the best clock, and the clocks that are not out of the question."""
+    """The model's parameters for the best clock, and the clocks that are still possible."""
     tried: list[tuple[float, float, float]] = []
     bin_s = 0.25 if problem.resolution_s >= 0.5 else 0.1
     for offset, drift in _correlation_peaks(problem):
@@ -307,7 +310,7 @@ def _plausible(problem: _Problem) -> tuple[_Problem, list[tuple[float, float]]]:
     if not tried or not np.isfinite(tried[0][0]):
         return problem, []
     problem = _fitted(problem, tried[0][1], tried[0][2]).regular()
-    # The first parameters were guesses: leave out only what they make impossible.
+    # The first parameters are guesses: exclude only what they make impossible.
     return problem, [(o, d) for value, o, d in tried if value > tried[0][0] - 3.0 * _NEGLIGIBLE]
 
 
@@ -328,7 +331,7 @@ def _fitted(problem: _Problem, offset: float, drift: float) -> _Problem:
 
 
 def _normalisation(problem: _Problem) -> float:
-    """Of the model's weights, so that evidence under different shares of missing exposures can be compared."""
+    """Normalisation of the model's weights, to compare evidence for different shares of missing exposures."""
     return (len(problem.p) + len(problem.e)) * float(np.log1p(problem.missing))
 
 
@@ -392,7 +395,7 @@ def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bo
 def _probabilities(
     problem: _Problem, candidates: list[tuple[float, float]]
 ) -> tuple[Indices, Array, float, float, float]:
-    """First event and probabilities of each photo's band; the most likely offset and drift, and their doubt."""
+    """First event and probabilities of each photo's band; the most likely offset and drift, and their uncertainty."""
     scored = []
     for offset, drift in candidates:
         grid = _grid(problem, offset, drift, 2.0 * _FIRST_JITTER_S + 0.3 * _reach_s(problem), 0.16)

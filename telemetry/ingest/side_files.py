@@ -1,4 +1,4 @@
-"""Files beside pictures that are not pictures: ground control points and georeferenced rasters; named, not mapped."""
+"""Ground control points and georeferenced rasters found next to pictures; they are reported, not mapped."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from telemetry.samples.findings import Finding
 
 @dataclass(frozen=True, slots=True)
 class ControlPoints:
-    """What an ODM control point file holds.
+    """Summary of an ODM control point file.
 
     Attributes:
         rows: number of observations. points: number of points. heights: their z values.
@@ -24,7 +24,7 @@ class ControlPoints:
 
 
 def read_control_points(path: Path) -> ControlPoints | None:
-    """Read an ODM `gcp_list.txt` (projection, then x y z column row image); None where it is no such file."""
+    """Read an ODM `gcp_list.txt` (projection, then x y z column row image); None if it is another file."""
     try:
         if path.stat().st_size > 8 << 20:
             return None
@@ -50,7 +50,7 @@ def read_control_points(path: Path) -> ControlPoints | None:
 
 
 def control_point_findings(path: Path, points: ControlPoints, widths: Collection[int]) -> list[Finding]:
-    """What to know about control points beside pictures of some widths."""
+    """Findings on control points, given the widths of the pictures near them."""
     text = f"{path.name} holds {points.points} ground control points in {points.rows} pictures; they are not used"
     found = [Finding("control-points", text, note=True)]
     width = max(widths, default=0)
@@ -69,7 +69,7 @@ def control_point_findings(path: Path, points: ControlPoints, widths: Collection
 
 
 def raster_finding(path: Path) -> Finding | None:
-    """What a georeferenced raster is; None where it cannot be read."""
+    """Finding that describes a georeferenced raster; None if it cannot be read."""
     import rasterio
     from rasterio.errors import RasterioError
 

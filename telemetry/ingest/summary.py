@@ -1,4 +1,4 @@
-"""What `inspect` tells: sources, vehicles, legs and findings as plain data."""
+"""The summary for `inspect`: sources, vehicles, legs and findings as plain data."""
 
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
@@ -22,11 +22,11 @@ COUNTS = ("frames", "sei", "klv", "camera_events")
 
 
 def summarise(found: Survey, *, pictures: bool = True) -> dict[str, Any]:
-    """The contract of `inspect --json` (more keys than it asks for).
+    """The document of `inspect --json`.
 
     Args:
-        found: what was read.
-        pictures: whether pairs of pictures are matched to confirm the recorded yaw.
+        found: the inputs' survey.
+        pictures: True to match pairs of pictures to confirm the recorded yaw.
     """
     sources = [_source(source, pictures=pictures) for source in found.sources]
     sources += _side_files(found)
@@ -39,7 +39,7 @@ def summarise(found: Survey, *, pictures: bool = True) -> dict[str, Any]:
 
 
 def iso(time_s: float | None) -> str | None:
-    """ISO 8601 in UTC with milliseconds; None for None and for what no calendar holds."""
+    """ISO 8601 in UTC with milliseconds; None for None and for times outside the calendar."""
     if time_s is None or not 0.0 <= time_s < 7.3e9:
         return None
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -107,7 +107,7 @@ def _of_samples(vehicle: str, samples: Sequence[Sample], shown: int) -> dict[str
 
 
 def _thinned(ground: NDArray[np.float64], step_m: float = 3.0) -> NDArray[np.float64]:
-    """Positions at least some metres apart: the legs of a dense track are those of its thinned one."""
+    """Thin positions to a least distance; the legs of a dense track are those of its thinned one."""
     kept: list[int] = []
     for i, point in enumerate(ground):
         if not kept or np.hypot(*(point - ground[kept[-1]])) >= step_m:
@@ -134,7 +134,7 @@ def _ranges(**columns: Iterable[float | None]) -> dict[str, Any]:
 
 
 def _fields(origins: Sequence[dict[str, str]]) -> dict[str, str]:
-    """Field -> where it comes from, the most frequent source."""
+    """Field -> its most frequent source."""
     counts: dict[str, dict[str, int]] = {}
     for origin in origins:
         for name, source in origin.items():

@@ -1,4 +1,4 @@
-"""What is found in a set of inputs, source by source, and how inputs are read."""
+"""The survey of a set of inputs, source by source, and the options for reading them."""
 
 import math
 import os
@@ -19,17 +19,17 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class LoadOptions:
-    """How inputs are read.
+    """Options for reading inputs.
 
     Attributes:
-        every_m: distance between pictures taken from a video, metres; None for the default of `picture_choice`.
-        every_s: seconds between pictures taken from a video.
-        cache: folder for pictures taken from videos; None makes one under the system's temporary folder.
+        every_m: distance between pictures extracted from a video, metres; None for the default of `picture_choice`.
+        every_s: seconds between pictures extracted from a video.
+        cache: folder for pictures extracted from videos; None makes one under the system's temporary folder.
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.
-        run: maps a function over items in processes, for many photos; None reads them in threads.
+        run: maps a function over items in processes, for many photos; None: read in threads.
         sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei_layout`.
-        decode: False to look at the metadata of videos only, without taking pictures (for `inspect`).
+        decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
     """
 
     every_m: float | None = None
@@ -48,9 +48,9 @@ class SourceInfo:
 
     Attributes:
         path: relative to the inputs' root. kind: "photos", "video", "geo.txt" and so on.
-        counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious.
+        counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious about it.
         frames: the frames. tracks: for sources without frames, the poses of each vehicle in order.
-        shown: number of pictures of each vehicle where that is not the number of its frames.
+        shown: number of pictures of each vehicle if it differs from the number of its frames.
     """
 
     path: str
@@ -64,7 +64,7 @@ class SourceInfo:
 
 @dataclass(slots=True)
 class Survey:
-    """Everything that was found out about a set of inputs."""
+    """All sources of a set of inputs."""
 
     root: Path
     discovery: Discovery | None = None

@@ -31,7 +31,7 @@ def read_videos(
     progress: Progress | None,
     result: Survey,
 ) -> None:
-    """Read the videos of a folder, each with the SRT of its name; SRT files without a video are named only."""
+    """Read the videos of a folder, each with the SRT of its name; SRT files without a video are only reported."""
     beside = {path.stem.lower(): path for path in folder.subtitles}
     for path in folder.videos:
         name = found.name(path)
@@ -65,7 +65,7 @@ def read_videos(
 
 
 def cache_folder(root: Path) -> Path:
-    """Where pictures of videos go if the caller names no folder."""
+    """Folder for pictures of videos if the caller names none."""
     key = hashlib.sha1(str(root).encode(), usedforsecurity=False).hexdigest()[:12]
     return Path(tempfile.gettempdir()) / f"orthoswarm-video-{key}"
 
@@ -81,7 +81,7 @@ def _take(
     source: SourceInfo,
     result: Survey,
 ) -> None:
-    """Take pictures and make frames of them."""
+    """Extract pictures and make frames of them."""
     if not poses.has_positions:
         result.rejected.append(Rejection(name, NO_POSITION, vehicle, lacks_position=True))
         return
@@ -109,7 +109,7 @@ def _take(
 
 
 def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
-    """Only the metadata: the poses of all pictures, by vehicle."""
+    """Read only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
     for index in order:
@@ -121,7 +121,7 @@ def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) ->
 
 
 def _subtitles(path: Path, name: str, findings: list[Finding]) -> srt.Subtitles | None:
-    """What an SRT file says; None where it cannot be read, which becomes a finding."""
+    """Read an SRT file; None with a finding if it cannot be read."""
     cues = read_or_reason(srt.read_srt, path)
     if isinstance(cues, Unreadable):
         findings.append(Finding("unreadable", f"{name} is not used: {cues}"))

@@ -1,4 +1,4 @@
-"""A flight log beside a video that carries no poses of its own: where in the log the video lies."""
+"""Aligns a flight log with a video that has no poses of its own."""
 
 from collections.abc import Sequence
 
@@ -19,9 +19,9 @@ _LONGEST_S = 600.0
 
 
 def add_log(poses: Poses, found: VideoScan, logs: Sequence["LogSource"]) -> list[Finding]:
-    """Give a video's pictures the poses of the log that fits it best.
+    """Assign a video's pictures the poses of the log that fits it best.
 
-    The clocks are brought together by the video's own positions, else by how its pictures turn, else by the
+    The clocks are aligned by the video's own positions, else by the rotation of its pictures, else by the
     container's creation time.
     """
     name = found.path.name
@@ -41,7 +41,7 @@ def add_log(poses: Poses, found: VideoScan, logs: Sequence["LogSource"]) -> list
 
 
 def _offset(poses: Poses, found: VideoScan, entry: "LogSource") -> tuple[float | None, str]:
-    """Video time minus UTC, and how it was found."""
+    """Video time minus UTC, and the method that found it."""
     if poses.has_positions:
         times, places = poses.track()
         clock = found.created_s or 0.0
@@ -65,7 +65,7 @@ def _longest(entry: "LogSource") -> float:
 
 
 def picture_rates(found: VideoScan) -> tuple[Array, Array]:
-    """Video times and yaw rates in degrees a second as the pictures of a file show them (its first ten minutes)."""
+    """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
     import cv2
 
     from telemetry.video.extraction import decoded

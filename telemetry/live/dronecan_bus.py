@@ -1,6 +1,6 @@
 """DroneCAN, live: a bus over python-can, or a vehicle's own bus through MAVLink's CAN_FRAME, into a vehicle's poses.
 
-Why a ground station wants it: a receiver with RTK on the bus is better than the autopilot's fused position, and a
+Purpose: an RTK receiver on the bus is more accurate than the autopilot's fused position, and a
 payload on the bench has no autopilot at all.
 
     poses = LivePoses("uav1")
@@ -26,15 +26,15 @@ _WAIT_S: Final = 0.2
 _MOST_FAILURES: Final = 100
 _EXTENDED: Final = 0x80000000
 _FRAME_BYTES: Final = {"CAN_FRAME": 8, "CANFD_FRAME": 64}
-# Of an extended identifier: the message's type, and the bit that tells messages from services.
+# In an extended identifier: the message's type, and the bit that distinguishes messages from services.
 _FILTERS: Final = [{"can_id": kind << 8, "can_mask": 0x00FFFF80, "extended": True} for kind in MESSAGES]
 
 
 def open_bus(url: str) -> Any:
     """A python-can bus: "socketcan:can0", "slcan:/dev/ttyACM0", "udp_multicast:239.74.163.2", "virtual:name".
 
-    A bit rate may follow an @ ("slcan:/dev/ttyACM0@500000"; default 1,000,000). Frames of other messages than those
-    that are read are filtered out, by the kernel where the interface can do that.
+    A bit rate may follow an @ ("slcan:/dev/ttyACM0@500000"; default 1,000,000). Frames of messages other than those
+    that are read are filtered out, by the kernel if the interface supports it.
 
     Raises:
         InputError: it cannot be opened.
@@ -55,7 +55,7 @@ def open_bus(url: str) -> Any:
 
 
 class CanSource:
-    """Frames of one bus into a vehicle's poses, each node a source of its own there.
+    """Passes the frames of one bus into a vehicle's poses, each node as a source of its own.
 
     Attributes:
         poses: of the vehicle.
@@ -79,10 +79,12 @@ class CanSource:
         }
 
     def run(self, url: str, stop: threading.Event) -> None:
-        """Read a bus until told to stop; packets that are not frames (strangers on a multicast group) are skipped.
+        """Read a bus until `stop` is set.
+
+        Packets that are not CAN frames (other senders on a multicast group) are skipped.
 
         Raises:
-            InputError: it cannot be opened. OSError, can.CanError: it broke off.
+            InputError: it cannot be opened. OSError, can.CanError: the connection broke.
         """
         from can import CanOperationError
 
@@ -98,7 +100,7 @@ class CanSource:
                         raise
 
     def read(self, bus: Any, wait_s: float = 0.0) -> bool:
-        """Take one frame of a python-can bus, waiting for it at most so long; returns whether one came."""
+        """Read one frame of a python-can bus within a timeout; returns whether one came."""
         message = bus.recv(wait_s)
         if message is None:
             return False
@@ -107,7 +109,10 @@ class CanSource:
         return True
 
     def feed(self, message: Any) -> None:
-        """Take a MAVLink CAN_FRAME or CANFD_FRAME message; pymavlink's `id` carries the flag of an extended frame."""
+        """Process a MAVLink CAN_FRAME or CANFD_FRAME message.
+
+        Pymavlink's `id` carries the flag of an extended frame.
+        """
         name = message.get_type()
         if message.id & _EXTENDED:
             size = min(int(message.len), _FRAME_BYTES[name])
@@ -120,7 +125,7 @@ class CanSource:
             self.poses.add(found.sample, source=f"DroneCAN node {found.node}", sigma=found.sigma)
 
     def _body_at(self, time_s: float) -> NDArray[np.float64] | None:
-        """The airframe's attitude by what else the vehicle tells, for a gimbal alone on its bus."""
+        """The airframe's attitude from the vehicle's other messages, for a gimbal alone on its bus."""
         sample = self.poses.at(time_s)
         if sample.flight_yaw_deg is None:
             return None

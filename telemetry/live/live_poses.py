@@ -1,8 +1,8 @@
-"""A vehicle's recent poses from its MAVLink link and its CAN bus, to be read at the moment of a picture.
+"""A vehicle's recent poses from its MAVLink link and its CAN bus, read at the time of a picture.
 
-Each source (MAVLink, each node of the bus) has series of its own; at any moment the one with the lowest stated sigma is
-used. Cheap enough for a hundred vehicles: a message costs a few microseconds, memory is bounded by the time that is
-kept.
+Each source (MAVLink, each node of the bus) has its own series; at any time the one with the lowest stated sigma is
+used. Fast enough for a hundred vehicles: a message costs a few microseconds, memory is bounded by the time span
+stored.
 """
 
 import threading
@@ -31,7 +31,7 @@ _TURNS = frozenset({"lon_deg", *_FLIGHT, *_CAMERA})
 
 
 class _Series:
-    """Values of some fields over time with the sigma by which sources are compared, in order of time; bounded."""
+    """Values of some fields in order of time, with the sigma used to compare sources; bounded in length."""
 
     __slots__ = ("_keep_s", "names", "times", "values")
 
@@ -42,11 +42,11 @@ class _Series:
         self._keep_s = keep_s
 
     def add(self, time_s: float, values: tuple[float | None, ...]) -> None:
-        """Take the fields' values, and the sigma last."""
+        """Add the fields' values followed by the sigma."""
         if not self.times or time_s > self.times[-1]:
             self.times.append(time_s)
             self.values.append(values)
-        elif time_s < self.times[0] - self._keep_s:  # the clock was set back: begin anew
+        elif time_s < self.times[0] - self._keep_s:  # the clock was set back: start again
             self.times[:], self.values[:] = [time_s], [values]
         else:
             at = bisect_left(self.times, time_s)
@@ -58,7 +58,10 @@ class _Series:
             del self.times[:old], self.values[:old]
 
     def at(self, time_s: float, gap_s: float) -> tuple[float | None, ...] | None:
-        """The values at a moment, interpolated; the newest is held for a moment, no more. None where unknown."""
+        """The interpolated values at a time; the newest is extrapolated as constant for a short time only.
+
+        None if unknown.
+        """
         at = bisect_right(self.times, time_s)
         if at == 0:
             return None
@@ -83,15 +86,15 @@ def _between(name: str, a: float | None, b: float | None, share: float) -> float
 
 
 class _Sources:
-    """One kind of value, a series for each source of it."""
+    """One kind of value, with a series for each source."""
 
     def __init__(self, names: tuple[str, ...], keep_s: float) -> None:
         self._names, self._keep_s = names, keep_s
-        self._series = {MAVLINK: _Series(names, keep_s)}  # first: it is used where others are no better
+        self._series = {MAVLINK: _Series(names, keep_s)}  # first, so that it is used where others are no better
         self.told = False
 
     def add(self, source: str, sample: Sample, sigma: float) -> None:
-        """Take a sample's values."""
+        """Add a sample's values."""
         series = self._series.get(source)
         if series is None:
             series = self._series[source] = _Series(self._names, self._keep_s)
@@ -102,7 +105,7 @@ class _Sources:
         return sum(len(series.times) for series in self._series.values())
 
     def read(self, time_s: float, gap_s: float, sample: Sample) -> str | None:
-        """Put the values of the best source at a moment into a sample; returns the source, None if there is none."""
+        """Store the values of the best source at a time in a sample; returns the source, None if there is none."""
         best: tuple[float, str, tuple[float | None, ...]] | None = None
         for source, series in self._series.items():
             values = series.at(time_s, gap_s)
@@ -118,10 +121,10 @@ class _Sources:
 
 @dataclass(frozen=True, slots=True)
 class LinkPose:
-    """A pose at a moment, and where it comes from.
+    """A pose at a time, and its sources.
 
     Attributes:
-        sample: the pose. origin: of its `position`, `height`, `angles` and `flight_yaw`, as far as it has them.
+        sample: the pose. origin: source of its `position`, `height`, `angles` and `flight_yaw`, as far as known.
     """
 
     sample: Sample
@@ -129,11 +132,11 @@ class LinkPose:
 
 
 class LivePoses:
-    """The recent poses of one vehicle; messages may come in other threads than those that read.
+    """The recent poses of one vehicle; messages and readers may use different threads.
 
     Attributes:
         vehicle: id.
-        latest: the newest value of every field, whatever its source. last_event: the newest camera event.
+        latest: the newest value of every field, from any source. last_event: the newest camera event.
     """
 
     def __init__(
@@ -154,15 +157,15 @@ class LivePoses:
         self._ground = _Sources(("height_m",), keep_s)
 
     def __len__(self) -> int:
-        """Number of positions that are kept."""
+        """Number of stored positions."""
         return len(self._position)
 
     def feed(self, message: Any, arrival_s: float | None = None) -> CameraEvent | None:
-        """Take a MAVLink message of this vehicle; returns the camera event if it is one, with its pose complete.
+        """Process a MAVLink message of this vehicle; if it is a camera event, returns it with its complete pose.
 
         Args:
             message: decoded by pymavlink.
-            arrival_s: UTC epoch seconds when it came, for vehicles that do not know UTC; None for now.
+            arrival_s: time of arrival, UTC epoch seconds, for vehicles that do not know UTC; None for now.
         """
         reboots = self._mavlink.reboots
         found = self._mavlink.feed(message)
@@ -178,12 +181,12 @@ class LivePoses:
         return None
 
     def add(self, sample: Sample, *, source: str = MAVLINK, sigma: float | None = None) -> None:
-        """Take a sample.
+        """Add a sample.
 
         Args:
             sample: its time is UTC.
-            source: who says so.
-            sigma: one sigma that the source states, metres for a position, degrees for angles; None for none.
+            source: its sender.
+            sigma: one sigma stated by the source, metres for a position, degrees for angles; None if not stated.
         """
         if sample.time_s is None:
             return
@@ -201,14 +204,14 @@ class LivePoses:
             self.latest.vehicle = self.vehicle
 
     def at(self, time_s: float) -> Sample:
-        """The pose at a moment (UTC), interpolated; fields are None where they are not known then.
+        """The interpolated pose at a time (UTC); unknown fields are None.
 
-        A camera whose own attitude is not reported is taken as fixed under the airframe.
+        A camera without a reported attitude is assumed fixed under the airframe.
         """
         return self.read(time_s).sample
 
     def read(self, time_s: float) -> LinkPose:
-        """The same with the sources that it comes from."""
+        """The pose with its sources."""
         sample, above = Sample(time_s=time_s, vehicle=self.vehicle), Sample()
         with self._lock:
             origin = {
@@ -227,7 +230,7 @@ class LivePoses:
 
     @property
     def has_gimbal(self) -> bool:
-        """Whether any message told the camera's own attitude."""
+        """Whether any message contained the camera's own attitude."""
         return self._mavlink.has_gimbal or self._camera.told
 
     def _utc(self, boot_s: float, arrival_s: float | None) -> float:
@@ -241,7 +244,7 @@ class LivePoses:
         return boot_s + self._arrival_offset
 
     def _event(self, event: CameraEvent, arrival_s: float | None) -> CameraEvent:
-        """Complete an exposure: what the autopilot says about it, but for what the bus knows better."""
+        """Complete an exposure: the autopilot's values, replaced by more accurate ones of the bus."""
         if event.time_s is None:
             boot_s = event.boot_s
             now_s = self._clock() if arrival_s is None else arrival_s
@@ -261,22 +264,22 @@ class LivePoses:
 
 
 class Poses:
-    """The recent poses of all vehicles, by their ids."""
+    """The recent poses of all vehicles, by id."""
 
     def __init__(self) -> None:
         self._of: dict[str, LivePoses] = {}
 
     def of(self, vehicle: str) -> LivePoses:
-        """Those of a vehicle, to be added to."""
+        """The poses of a vehicle, for adding to them."""
         return self._of.setdefault(vehicle, LivePoses(vehicle))
 
     def at(self, vehicle: str, time_s: float) -> LinkPose | None:
-        """The pose of a vehicle's camera at a moment (UTC); None where its position is not known then."""
+        """The pose of a vehicle's camera at a time (UTC); None if its position is unknown."""
         known = self._of.get(vehicle)
         found = None if known is None else known.read(time_s)
         return found if found is not None and found.sample.has_position else None
 
     def origins(self) -> dict[str, dict[str, str]]:
-        """Where the newest pose of each vehicle comes from, by the vehicle's id; see `LinkPose.origin`."""
+        """Source of the newest pose of each vehicle, by the vehicle's id; see `LinkPose.origin`."""
         times = {vehicle: poses.latest.time_s for vehicle, poses in list(self._of.items())}
         return {v: self._of[v].read(time_s - _ALL_HEARD_S).origin for v, time_s in times.items() if time_s}

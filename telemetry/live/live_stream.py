@@ -1,7 +1,7 @@
 """Live video with metadata: RTSP, RTMP, MPEG-TS over UDP or TCP; pictures with their poses as they arrive.
 
-SEI is bound to its own picture as in files. KLV that comes beside the pictures is interpolated where the next packet
-is already here, else the last one is held for half a second at most. A lost link is opened again until told to stop.
+SEI belongs to its own picture as in files. KLV in its own stream is interpolated if the next packet
+has arrived, else the last one is used for half a second at most. A lost link is reopened until `stop` is set.
 """
 
 import threading
@@ -34,9 +34,9 @@ class LivePicture:
     Attributes:
         number: counts the pictures since the stream was first opened.
         rgb: uint8 (rows, columns, 3).
-        sample: its pose, None where the stream carries none. origin: where the pose is from.
+        sample: its pose, None if the stream has none. origin: source of the pose.
         time_s: UTC epoch seconds of the exposure by the stream, else of its arrival.
-        damaged: True where parts are predicted from something that was lost.
+        damaged: True if parts are predicted from lost data.
     """
 
     number: int
@@ -60,7 +60,7 @@ def open_stream(
     clock: Callable[[], float] = time.time,
     on_state: Callable[[str], None] | None = None,
 ) -> Iterator[LivePicture]:
-    """Pictures of a live stream, thinned as those of a file (`telemetry.video.picture_choice`).
+    """Pictures of a live stream, thinned like those of a file (`telemetry.video.picture_choice`).
 
     Args:
         url: rtsp://, rtmp://, udp://, tcp://, or a file.
@@ -68,11 +68,11 @@ def open_stream(
         every_s: spacing in seconds.
         all_pictures: True to get every picture.
         stop: ends the iteration when set (within `timeout_s`).
-        reconnect: whether a lost link is opened again; False ends with the stream.
+        reconnect: True to reopen a lost link; False to end with the stream.
         timeout_s: of opening and of waiting for data.
         options: for FFmpeg, over the defaults.
         clock: gives the time of arrival.
-        on_state: told "open" and "lost: reason".
+        on_state: called with "open" and "lost: reason".
 
     Raises:
         NotAVideo: the first opening fails and `reconnect` is False.
@@ -108,9 +108,9 @@ class _Lost(Exception):
 
 
 def _options(url: str, timeout_s: float, given: Mapping[str, str] | None) -> dict[str, str]:
-    # Not "nobuffer": it throws away what was read while probing, and with it the first key picture.
+    # Not "nobuffer": it discards what was read while probing, including the first key picture.
     options = {"flags": "low_delay", "analyzeduration": "1000000", "probesize": "1000000"}
-    if "://" in url:  # PyAV's own timeout is off while streams are looked for
+    if "://" in url:  # PyAV's own timeout is off while streams are probed
         options["rw_timeout"] = str(round(timeout_s * 1e6))
     if url.startswith("rtsp"):
         options["rtsp_transport"] = "tcp"
@@ -202,7 +202,7 @@ def _offer(
 
 
 def _beside(samples: deque[Sample], seconds: float) -> Sample | None:
-    """KLV at a moment of the stream: between two packets, or the last one held."""
+    """KLV at a time of the stream: interpolated between two packets, or the last one."""
     last = max(samples, key=lambda s: s.time_s or 0.0)
     if last.time_s is None or seconds > last.time_s + _HELD_S:
         return None

@@ -1,7 +1,7 @@
 """Which of the recorded angles are the picture's: gimbal or airframe, absolute or relative, plausible or not.
 
-Decided for all photos of one vehicle and camera model together, because a single photo cannot tell. Picture
-content is not looked at here.
+Decided for all photos of one vehicle and camera model together, as a single photo is ambiguous. Picture
+content is not used here.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ _NADIR_WITHIN_DEG = 45.0
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """Yaw, pitch and roll of each photo in degrees (None where unknown), where the yaw is from, and findings."""
+    """Yaw, pitch and roll of each photo in degrees (None where unknown), the yaw's source, and findings."""
 
     angles: list[Angles]
     yaw_origin: str
@@ -82,7 +82,7 @@ def _drop_unfilled(camera: Array, flight: Array, findings: list[Finding], vehicl
 
 
 def _repair_upside_down(camera: Array, findings: list[Finding], vehicle: str) -> None:
-    """Roll near 180 at nadir says the same as a yaw turned by 180 (gimbals cannot hang upside down)."""
+    """Replace a roll near 180 at nadir by the equivalent yaw turned by 180 (gimbals do not hang upside down)."""
     with np.errstate(invalid="ignore"):
         flipped = (np.abs(wrap_deg(camera[:, 2] - 180.0)) < 30.0) & (camera[:, 1] < -90.0 + _NADIR_WITHIN_DEG)
     if flipped.any():
@@ -114,7 +114,7 @@ def _choose_yaw(
     both = np.isfinite(gimbal) & np.isfinite(flight)
     origin = "camera yaw"
     if both.any():
-        # The upper quartile, because legs towards north agree either way.
+        # The upper quartile, as legs towards north agree with both models.
         apart = float(np.quantile(np.abs(wrap_deg(gimbal[both] - flight[both])), 0.75))
         stays = float(np.median(np.abs(wrap_deg(gimbal[both])))) < 20.0
         known = any(p.model in RELATIVE_GIMBAL_MODELS for p in photos)
@@ -138,7 +138,7 @@ def _choose_yaw(
                     vehicle,
                 )
             )
-        elif stays and known:  # flying north: both agree either way, but the model is known
+        elif stays and known:  # flying north: both agree anyway, but the camera model is known
             return flight + np.where(np.isfinite(gimbal), gimbal, 0.0), "flight yaw + gimbal yaw"
     return np.where(np.isfinite(gimbal), gimbal, flight), origin
 
@@ -153,7 +153,7 @@ def _circular_spread_deg(angle: Array) -> float:
 
 
 def _agrees(yaw: Array, course: Array) -> float:
-    """Share of photos whose yaw lies along the course (either way) within 25 degrees."""
+    """Share of photos whose yaw is along the course (in either direction) within 25 degrees."""
     known = np.isfinite(yaw) & np.isfinite(course)
     if not known.any():
         return 0.0
@@ -162,7 +162,7 @@ def _agrees(yaw: Array, course: Array) -> float:
 
 
 def check_legs(yaw_deg: Array, legs: Sequence[Straight], vehicle: str) -> list[Finding]:
-    """Contradictions between yaw and course that tags alone show.
+    """Contradictions between yaw and course that are visible in the tags.
 
     A camera either turns with the airframe from leg to leg or keeps its heading; a flight that does both has legs
     whose yaw may be turned by 180 degrees. So has a leg whose yaw turns half-way.

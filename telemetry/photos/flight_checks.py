@@ -1,6 +1,6 @@
-"""What a flight's tags say about how well it can be mapped: gaps, coarse times, lens distortion, geometry.
+"""Checks of a flight's tags for mapping: gaps, coarse times, lens distortion, geometry.
 
-Nothing is changed here; most of it is worth knowing rather than wrong.
+Nothing is changed here; most findings are notes, not errors.
 """
 
 import math
@@ -24,7 +24,7 @@ _FOV_GUESS_RAD = math.radians(70.0)
 
 
 def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
-    """Observations on one vehicle's photos (in order, with the frames that were made of them)."""
+    """Findings on one vehicle's photos (in order, with the frames made of them)."""
     if len(frames) < 2:
         return []
     ground = track_of(frames)
@@ -117,7 +117,7 @@ def number_of(image: str) -> int | None:
 
 
 def _astray(frames: Sequence[Frame], ground: Array) -> Finding | None:
-    """Pictures that lie far from both neighbours, which lie near each other: their position is wrong."""
+    """Pictures far from both neighbours, which are near each other: their position is wrong."""
     if len(ground) < 3:
         return None
     step = np.hypot(*np.diff(ground, axis=0).T)
@@ -158,7 +158,7 @@ def _missing_numbers(frames: Sequence[Frame]) -> Finding | None:
 
 
 def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -> Finding | None:
-    """How far apart pictures are along the legs, against what they see."""
+    """Spacing of pictures along the legs compared with their footprint."""
     heights = [f.fix.height_m for f in frames if f.fix.height_m is not None]
     if not heights or not legs:
         return None
@@ -184,7 +184,7 @@ def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -
 
 
 def _one_height(frames: Sequence[Frame]) -> Finding | None:
-    """Flat, level and straight down: the focal length cannot be told from the height."""
+    """Flat ground, one height and nadir views: focal length and height cannot be separated."""
     heights = np.array([f.fix.height_m for f in frames if f.fix.height_m is not None])
     tilt = [abs(math.degrees(f.fix.pitch_rad) + 90.0) for f in frames if f.fix.pitch_rad is not None]
     if len(heights) < 3 or len(tilt) < 3 or np.ptp(heights) > 0.02 * np.median(heights) or max(tilt) > 2.0:
@@ -202,7 +202,7 @@ def courses_of(frames: Sequence[Frame]) -> Array:
 
 
 def _low(frames: Sequence[Frame]) -> Finding | None:
-    """A few pictures from far below the others: takeoff, landing, a look at something."""
+    """A few pictures from far below the others: takeoff, landing, inspection."""
     heights = np.array([np.nan if f.fix.height_m is None else f.fix.height_m for f in frames])
     if np.isnan(heights).mean() > 0.5:
         return None

@@ -1,4 +1,4 @@
-"""Attitudes in XMP, as each maker writes them, brought to pitch -90 looking straight down.
+"""Attitudes in the XMP of each manufacturer, converted to pitch -90 at nadir.
 
 | properties | written by | pitch |
 |---|---|---|
@@ -80,7 +80,7 @@ def _angle(found: xmp.Properties, name: str) -> float | None:
 def _from_pix4d(angles: Angles, make: str) -> Angles:
     """Pix4D's Camera name space counts pitch from nadir; Autel and Wingtra write it from the horizon.
 
-    A camera that looks more than 25 degrees backwards is not built, so such a value counts from the horizon, whoever
+    No camera looks more than 25 degrees backwards, so such a value counts from the horizon, whoever
     wrote it; this program's own are always from nadir. senseFly's roll has the other sign.
     """
     yaw, pitch, roll = angles

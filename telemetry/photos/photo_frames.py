@@ -1,4 +1,4 @@
-"""Frames of one vehicle's photos: their tags weighed against each other, what cannot be true left out."""
+"""Frames of one vehicle's photos: their tags are compared with each other, impossible values removed."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,13 +21,13 @@ _LEAST_HEIGHT_M = 1.0
 def frames_of(
     photos: Sequence[PhotoTags], vehicle: str, name: Callable[[Path], str], findings: list[Finding]
 ) -> list[Frame]:
-    """Frames of one vehicle's photos (in order of time), after its tags were weighed against each other.
+    """Frames of one vehicle's photos (in order of time), after comparing their tags.
 
     Args:
         photos: with positions.
         vehicle: id.
-        name: from a file to its name in the products.
-        findings: what was found is appended here.
+        name: maps a file to its name in the products.
+        findings: findings are appended here.
     """
     ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
     course = courses_deg(ground)
@@ -77,7 +77,7 @@ def _frame(
 
 
 def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str) -> list[float | None]:
-    """Heights that can be true; a height of nothing or below is not, and an altitude is none at all."""
+    """Plausible heights: not zero or negative, and not altitudes."""
     heights = [p.height_m if p.height_m is not None and math.isfinite(p.height_m) else None for p in photos]
     low = [h for h in heights if h is not None and h < _LEAST_HEIGHT_M]
     if low:

@@ -1,6 +1,6 @@
-"""Photos: what one picture's own tags say about where its camera was, how it looked and when.
+"""The tags of one photo: position, attitude, time and lens of its camera.
 
-Only evidence is gathered here, each value as its tag has it; `telemetry.photos.attitude` decides which of several
+Tags are only collected here, with their values unchanged; `telemetry.photos.attitude` decides which of several
 yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
 """
 
@@ -29,7 +29,7 @@ _CHUNK = 64
 
 @dataclass(slots=True)
 class PhotoTags:
-    """The evidence of one photo.
+    """The tags of one photo.
 
     Attributes:
         path: the file. width: columns as stored; height: rows.
@@ -44,8 +44,8 @@ class PhotoTags:
         band: name of the spectral band, "" for a colour picture.
         fov_hint_rad: horizontal field of view from focal length tags.
         dewarp_k1: radial distortion that the tags state for a picture which still has it.
-        yaw_is_stated: True where the source defines its yaw as the picture's, so that nothing is left to choose.
-        origin: field -> where it came from.
+        yaw_is_stated: True if the source defines its yaw as the picture's, so that there is no choice.
+        origin: field -> its source.
         damaged: True for a picture of a video that lost parts.
     """
 
@@ -89,11 +89,11 @@ def read_photo(path: Path) -> PhotoTags | None:
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
 ) -> Generator[PhotoTags | Unreadable | None, None, None]:
-    """Read many photos in parallel, in order; a file that cannot be read gives the reason.
+    """Read many photos in parallel, in order; for a file that cannot be read, the reason.
 
     Args:
         paths: files.
-        workers: threads, while there is no `run`: reading from a slow disk waits more than it computes.
+        workers: threads, used without `run`, as reading from a slow disk is mostly waiting.
         run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
         progress: called with the number of photos done since the last call.
     """
@@ -110,7 +110,7 @@ def _read_chunk(paths: Sequence[Path]) -> list[PhotoTags | Unreadable | None]:
 
 
 def tags_of(path: Path, container: Container) -> PhotoTags:
-    """The evidence in a container that was read."""
+    """The tags in a picture container."""
     tags = container.exif
     found = xmp.properties(container.xmp) if container.xmp else {}
     photo = PhotoTags(path, container.width, container.height)
@@ -251,7 +251,7 @@ def _fov_hints(
         xmp.number(found, "drone-dji:CalibratedOpticalCenterX"),
     )
     if calibrated and centre and calibrated > 0 and centre > 0:
-        # Stated for the full picture, whose half width the centre tells: holds for a scaled copy, too.
+        # Stated for the full picture, whose half width is the principal point: valid for a scaled copy, too.
         yield 2.0 * math.atan(centre / calibrated), "XMP CalibratedFocalLength"
     skydio = xmp.number(found, "drone-skydio:CalibratedFocalLength/X")
     middle = xmp.number(found, "drone-skydio:CalibratedOpticalCenter/X")

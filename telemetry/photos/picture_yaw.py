@@ -1,8 +1,8 @@
-"""The yaw that pictures themselves show: one match of neighbours on each straight leg.
+"""The yaw measured in pictures: one match of neighbours on each straight leg.
 
-The camera moves along the leg's course; the direction in which the ground runs through the picture tells where the
-picture's up direction pointed. Good to a few degrees, which is enough to find a yaw that is turned by 180 degrees or
-that belongs to the airframe instead of the camera.
+The camera moves along the leg's course; the direction in which the ground moves through the picture gives the
+azimuth of the picture's up direction. Accurate to a few degrees, which is enough to find a yaw that is flipped or
+belongs to the airframe instead of the camera.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ _LEAST_STEP_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class SeenHeading:
-    """What the pictures of a leg showed.
+    """The yaw measured on a leg.
 
     Attributes:
         leg: the straight run. pair: indices of the pictures that were matched. inliers: matches that agree.
@@ -43,7 +43,7 @@ class SeenHeading:
 
 
 def seen_headings(frames: Sequence[Frame], *, most_legs: int = 12) -> list[SeenHeading]:
-    """Yaw of each of a vehicle's straight legs by its pictures; legs that cannot be matched are left out."""
+    """Yaw of each straight leg of a vehicle, measured in its pictures; legs that cannot be matched are left out."""
     ground = track_of(frames)
     legs = straight_legs(ground)
     if len(legs) > most_legs:
@@ -61,7 +61,7 @@ def seen_headings(frames: Sequence[Frame], *, most_legs: int = 12) -> list[SeenH
 
 
 def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
-    """Yaw of the second picture in degrees and how many matches agree; None where the two cannot be matched."""
+    """Yaw of the second picture in degrees and how many matches agree; None if the two cannot be matched."""
     if np.hypot(*moved) < _LEAST_STEP_M:
         return None
     one, two = _features(a.path), _features(b.path)
@@ -83,7 +83,8 @@ def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
     shift = model[:, :2] @ centre + model[:, 2] - centre
     if np.hypot(*shift) < 4.0:
         return None
-    # In the second picture the first one's centre lies where the camera came from; up is against the rows.
+    # In the second picture the first one's centre lies in the direction the camera came from; up is opposite to the
+    # rows.
     to_the_right_of_up = np.degrees(np.arctan2(-shift[0], shift[1]))
     course = np.degrees(np.arctan2(moved[0], moved[1]))
     return wrap_deg(float(course - to_the_right_of_up)), count

@@ -1,1 +1,1 @@
-"""One reading of telemetry and what is done with many: timeline, course over ground, rotations, findings."""
+"""Single telemetry samples and series of them: timeline, course over ground, rotations, findings."""

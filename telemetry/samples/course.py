@@ -24,7 +24,7 @@ def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Ar
 
 
 def courses_deg(east_north: Array, *, least_step_m: float = 1.0, bend_deg: float = 40.0) -> Array:
-    """Course over ground (N,) in degrees clockwise from north at each position; NaN in turns and where it stands."""
+    """Course over ground (N,) in degrees clockwise from north at each position; NaN in turns and while stationary."""
     count = len(east_north)
     result = np.full(count, np.nan)
     if count < 2:

@@ -1,4 +1,4 @@
-"""What is suspicious about an input, with a code for programs and a sentence for people."""
+"""Findings about an input, with a code for programs and a sentence for people."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ class Finding:
 
     Attributes:
         code: stable, lower case with hyphens. message: one plain sentence, with what was done about it.
-        vehicle: whom it concerns, "" for all. note: True where it is worth knowing but nothing is wrong.
+        vehicle: the vehicle concerned, "" for all. note: True for information that is not an error.
     """
 
     code: str

@@ -1,4 +1,4 @@
-"""Attitudes of other conventions brought to ours (orthoswarm.model.camera: pitch -90 deg looks straight down)."""
+"""Attitudes of other conventions converted to ours (orthoswarm.model.camera: pitch -90 deg looks straight down)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def camera_frame_angles_deg(camera_ned: Array) -> tuple[float, float, float]:
 
 
 def mounted_down_deg(body_ned: Array) -> tuple[float, float, float]:
-    """Our yaw, pitch, roll in degrees of a camera fixed under an airframe, its picture's up towards the nose."""
+    """Our yaw, pitch, roll in degrees of a camera fixed under an airframe, with the picture's up towards the nose."""
     down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # optical axis = body z, picture up = body x
     return camera_angles_deg(body_ned @ down)
 

@@ -1,4 +1,4 @@
-"""One reading of telemetry: what a SEI message, a KLV packet, a subtitle or a log line says about a moment."""
+"""One telemetry sample: the content of a SEI message, KLV packet, subtitle or log record at one time."""
 
 import math
 from dataclasses import dataclass, fields
@@ -8,7 +8,7 @@ _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_d
 
 @dataclass(slots=True)
 class Sample:
-    """Position and attitude of a camera at a moment, degrees and metres; None where unknown.
+    """Position and attitude of a camera at one time, degrees and metres; None where unknown.
 
     Attributes:
         time_s: UTC epoch seconds.
@@ -44,7 +44,7 @@ class Sample:
 
     @property
     def has_position(self) -> bool:
-        """Whether it says where the camera was."""
+        """Whether it contains a position."""
         return self.lat_deg is not None and self.lon_deg is not None
 
     def merge(self, other: "Sample") -> "Sample":
@@ -63,7 +63,7 @@ _NAMES = tuple(f.name for f in fields(Sample))
 
 
 def checked(sample: Sample) -> Sample | None:
-    """A sample without what cannot be true (not finite, out of range, 0, 0); None if nothing is left."""
+    """The sample without invalid values (not finite, out of range, 0, 0); None if nothing is left."""
     for name in _NAMES:
         value = getattr(sample, name)
         if isinstance(value, float) and not math.isfinite(value):

@@ -18,7 +18,7 @@ def frame_of(
     camera: str = "",
     origin: str = "",
 ) -> Frame | None:
-    """A frame of a picture with its pose; None where the sample has no position.
+    """The frame of a picture with its pose; None if the sample has no position.
 
     Args:
         sample: the pose; its yaw is the picture's.
@@ -27,8 +27,8 @@ def frame_of(
         vehicle: id.
         width: columns of the picture.
         height: rows of the picture.
-        camera: tells lenses of one vehicle apart.
-        origin: where the pose is from.
+        camera: distinguishes lenses of one vehicle.
+        origin: source of the pose.
     """
     if sample.lat_deg is None or sample.lon_deg is None:
         return None

@@ -1,6 +1,6 @@
 """Poses over time: interpolation without guessing beyond gaps.
 
-Every field keeps its own moments, so that a source which sends position at 5 Hz and attitude at 50 Hz needs no
+Every field has its own times, so that a source which sends position at 5 Hz and attitude at 50 Hz needs no
 joining. Positions are interpolated along the chord, angles over the shortest arc; nothing is extrapolated and no gap
 longer than `max_gap_s` is bridged.
 """
@@ -24,7 +24,7 @@ GROUND = "ground_m"
 
 
 class Timeline:
-    """Samples of one vehicle over time, for reading at any moment in between.
+    """Samples of one vehicle over time, which can be read at any time in between.
 
     Attributes:
         max_gap_s: neighbours further apart than this are not interpolated between.
@@ -34,7 +34,7 @@ class Timeline:
         self.max_gap_s = max_gap_s
         rows = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
         self._series = {name: _series(rows, name) for name in FIELDS if name != "height_m"}
-        # Heights above takeoff and above the ground are two things, even where both are recorded.
+        # Heights above takeoff and above the ground are different quantities, even where both are recorded.
         self._series["height_m"] = _series([s for s in rows if not s.height_is_ground], "height_m")
         self._series[GROUND] = _series([s for s in rows if s.height_is_ground], "height_m")
         self._times = np.array([s.time_s for s in rows], dtype=np.float64)
@@ -45,11 +45,11 @@ class Timeline:
 
     @property
     def span(self) -> tuple[float, float] | None:
-        """First and last moment, None if it is empty."""
+        """First and last time, None if it is empty."""
         return (float(self._times[0]), float(self._times[-1])) if len(self._times) else None
 
     def values(self, name: str, times: ArrayLike) -> Array:
-        """A field at some moments, float64, NaN where no neighbours within the gap hold it."""
+        """A field at some times, float64, NaN where there are no neighbours within the gap."""
         t = np.asarray(times, dtype=np.float64)
         moments, values = self._series[name]
         if len(moments) == 0:
@@ -58,7 +58,7 @@ class Timeline:
         right = np.clip(np.searchsorted(moments, t, side="left"), 0, len(moments) - 1)
         left = np.clip(np.where(moments[right] > t, right - 1, right), 0, len(moments) - 1)
         bridged = moments[right] - moments[left] <= self.max_gap_s
-        # On a sample itself there is nothing to bridge; before the first and after the last there is no value.
+        # At a sample's own time no interpolation is needed; before the first and after the last there is no value.
         held = (bridged & (t >= moments[0]) & (t <= moments[-1])) | (moments[right] == t)
         result = np.where(held, result, np.nan)
         if name in _WRAPPED:
@@ -66,11 +66,11 @@ class Timeline:
         return np.asarray(result)
 
     def at(self, time_s: float) -> Sample:
-        """The pose at a moment; fields are None where they are not known then."""
+        """The pose at a time; unknown fields are None."""
         return self.at_all([time_s])[0]
 
     def at_all(self, times: ArrayLike) -> list[Sample]:
-        """The poses at many moments at once."""
+        """The poses at many times."""
         moments = np.asarray(times, dtype=np.float64)
         columns = [(name, self.values(name, moments).tolist()) for name in FIELDS if len(self._series[name][0])]
         ground = self.values(GROUND, moments).tolist()
@@ -89,7 +89,7 @@ class Timeline:
 
 
 def _series(rows: Sequence[Sample], name: str) -> tuple[Array, Array]:
-    """Moments and values of one field, moments strictly increasing, angles unwrapped."""
+    """Times and values of one field, times strictly increasing, angles unwrapped."""
     pairs = [(s.time_s, v) for s in rows if (v := getattr(s, name)) is not None]
     if not pairs:
         return np.zeros(0), np.zeros(0)

@@ -12,7 +12,7 @@ _WRITTEN = re.compile(
 
 
 def parse_time(value: str) -> tuple[float, bool] | None:
-    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is taken as UTC."""
+    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is read as UTC."""
     match = _WRITTEN.match(value)
     if match is None:
         return None

@@ -1,4 +1,4 @@
-"""One way for a reader to fail: no file, however damaged, ends a run that has other inputs."""
+"""The failure of a reader: a damaged file must not end a run that has other inputs."""
 
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
@@ -10,19 +10,19 @@ T = TypeVar("T")
 
 
 class Unreadable(Exception):
-    """A file cannot be read; the text is one sentence that tells the user why and what to do."""
+    """A file cannot be read; the text is one sentence with the reason and what to do."""
 
 
 def read_or_reason(read: Callable[P, T], *args: P.args, **options: P.kwargs) -> T | Unreadable:
-    """What a reader returns, or the reason why it cannot read the file.
+    """The reader's result, or the reason why it cannot read the file.
 
-    A reader parses bytes that anybody may have written, some of them in C code (FFmpeg, OpenCV, GDAL), so any
-    exception of it says something about that file and nothing about the run.
+    A reader parses untrusted bytes, partly in C code (FFmpeg, OpenCV, GDAL), so any
+    exception concerns that file only, not the run.
 
     Args:
         read: the reader.
-        args: for it.
-        options: for it.
+        args: passed to it.
+        options: passed to it.
     """
     try:
         return read(*args, **options)

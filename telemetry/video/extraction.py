@@ -1,4 +1,4 @@
-"""Pictures out of a video: decoded once, picked, written as JPEG, each with the pose of its own packet."""
+"""Extracts pictures from a video: decoded once, selected, written as JPEG, each with the pose of its own packet."""
 
 import math
 import os
@@ -15,7 +15,7 @@ from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
-from telemetry.video.extraction_cache import Kept, Taken, key_of, recall, remember
+from telemetry.video.extraction_cache import CachedExtraction, CachedPicture, key_of, recall, remember
 from telemetry.video.packet_loss import Damage, transport_gaps
 from telemetry.video.picture_choice import Candidate, Picker
 from telemetry.video.picture_poses import Pose, Poses
@@ -27,14 +27,14 @@ _ZOOM_STEP = 0.03
 
 @dataclass(slots=True)
 class Picture:
-    """A picture that was taken from a video.
+    """A picture extracted from a video.
 
     Attributes:
         number: of the picture in the video, in order of presentation, from 0.
-        sample: its pose, None where nothing is known. origin: where the pose is from.
+        sample: its pose, None if unknown. origin: source of the pose.
         rgb: uint8 (rows, columns, 3). video_s: its time in the video.
-        packet: index of its packet, None where the decoder did not tell.
-        damaged: whether parts of it are predicted from something that was lost.
+        packet: index of its packet, None if the decoder did not report it.
+        damaged: whether parts of it are predicted from lost data.
     """
 
     number: int
@@ -48,7 +48,7 @@ class Picture:
 
 @dataclass(slots=True)
 class Extraction:
-    """What a video gave: photos by vehicle, findings, counts."""
+    """The result of an extraction: photos by vehicle, findings, counts."""
 
     photos: dict[str, list[PhotoTags]] = field(default_factory=dict)
     names: dict[Path, int] = field(default_factory=dict)
@@ -63,8 +63,8 @@ def decoded(
 ) -> Iterator[tuple[int, int | None, Any]]:
     """Every picture of a file in order of presentation: number, index of its packet, decoded frame.
 
-    The packet's index travels through the decoder with the picture; where a decoder does not carry it the
-    presentation time tells. Pictures that cannot be decoded are left out, and counted in counter[0]; what was lost is
+    The packet's index passes through the decoder with the picture; if a decoder does not pass it on, the
+    presentation time is used. Pictures that cannot be decoded are left out and counted in counter[0]; losses are
     noted in `damage`.
     """
     import av
@@ -124,7 +124,7 @@ def _is_transport(path: Path) -> bool:
 
 
 def _presentation_rank(found: VideoScan) -> list[int] | None:
-    """Number in order of presentation of each packet's picture; None where times are missing or repeated."""
+    """Number in order of presentation of each packet's picture; None if times are missing or repeated."""
     times = [note.video_s for note in found.pictures]
     known = [t for t in times if t is not None]
     if len(set(known)) != len(times):
@@ -142,7 +142,7 @@ def pictures(
     progress: Callable[[int, int], None] | None = None,
     result: Extraction | None = None,
 ) -> Iterator[Picture]:
-    """The pictures of a video that are worth mapping, each with its pose.
+    """The selected pictures of a video, each with its pose.
 
     Args:
         found: the file's metadata.
@@ -150,7 +150,7 @@ def pictures(
         every_m: spacing in metres.
         every_s: spacing in seconds; see `Picker` for the default.
         progress: called with pictures decoded and their number in the file.
-        result: where counts are kept.
+        result: receives the counts.
     """
     picker = Picker(every_m, every_s)
     result = result if result is not None else Extraction()
@@ -171,24 +171,24 @@ def pictures(
         if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
             video_s = own
         sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
-        for taken in picker.push(Candidate(number, frame, sample, video_s, origin, index, lost)):
-            yield _picture(taken)
-    for taken in picker.flush():
-        yield _picture(taken)
+        for chosen in picker.push(Candidate(number, frame, sample, video_s, origin, index, lost)):
+            yield _picture(chosen)
+    for chosen in picker.flush():
+        yield _picture(chosen)
     result.damaged = damaged[0]
     if progress is not None:
         progress(total, total)
 
 
-def _picture(taken: Candidate) -> Picture:
+def _picture(chosen: Candidate) -> Picture:
     return Picture(
-        number=taken.number,
-        sample=taken.sample,
-        origin=taken.origin,
-        rgb=to_rgb(taken.frame),
-        video_s=taken.video_s,
-        packet=taken.packet,
-        damaged=taken.damaged,
+        number=chosen.number,
+        sample=chosen.sample,
+        origin=chosen.origin,
+        rgb=to_rgb(chosen.frame),
+        video_s=chosen.video_s,
+        packet=chosen.packet,
+        damaged=chosen.damaged,
     )
 
 
@@ -218,23 +218,23 @@ def extract(
     found: VideoScan | None = None,
     vehicle: str | None = None,
 ) -> Extraction:
-    """Take the pictures of a video and write them as JPEG files into a folder.
+    """Extract the pictures of a video into a folder of JPEG files.
 
-    Pictures that an earlier call left there are used again while video, choice and poses are the same.
+    Pictures of an earlier call are used again if video, selection and poses are unchanged.
 
     Args:
         path: the video.
         name: its name relative to the inputs; names its folder in the cache.
         cache: folder for the pictures.
-        poses: of its pictures, with what lies beside it; None for what the file itself holds.
+        poses: of its pictures, including those from other files; None for those in the file itself.
         every_m: spacing in metres.
         every_s: spacing in seconds.
         progress: called with pictures decoded and their number.
         found: the file's metadata if it was scanned already.
-        vehicle: id of the vehicle where the metadata names none; None for the file's name.
+        vehicle: id of the vehicle if the metadata names none; None for the file's name.
 
     Raises:
-        telemetry.video.NotAVideo: it is none.
+        telemetry.video.NotAVideo: it is not a video.
         OSError: a picture cannot be written.
     """
     found = found or scan(path)
@@ -243,18 +243,18 @@ def extract(
     folder = cache / name.replace("/", "__")
     folder.mkdir(parents=True, exist_ok=True)
     key = key_of(path, poses, len(found.pictures), (every_m, every_s, JPEG_QUALITY))
-    taken = recall(folder, key)
-    if taken is None:
-        kept = []
+    cached = recall(folder, key)
+    if cached is None:
+        written = []
         for picture in pictures(found, poses, every_m=every_m, every_s=every_s, progress=progress, result=result):
             rows, columns = picture.rgb.shape[:2]
-            kept.append(Kept(picture.number, picture.packet, columns, rows, picture.damaged))
-            write_jpeg(folder / kept[-1].name, picture.rgb)
-        taken = Taken(kept, result.pictures, result.without_pose, result.damaged)
-        remember(folder, key, taken)
-    result.pictures, result.without_pose, result.damaged = taken.seen, taken.without_pose, taken.damaged
+            written.append(CachedPicture(picture.number, picture.packet, columns, rows, picture.damaged))
+            write_jpeg(folder / written[-1].name, picture.rgb)
+        cached = CachedExtraction(written, result.pictures, result.without_pose, result.damaged)
+        remember(folder, key, cached)
+    result.pictures, result.without_pose, result.damaged = cached.seen, cached.without_pose, cached.damaged
     lens = _LensKey(found)
-    for one in taken.pictures:
+    for one in cached.pictures:
         pose = None if one.packet is None else poses.of(one.packet)
         photo = _photo(folder / one.name, one, pose, lens)
         named = pose.sample.vehicle if pose is not None else None
@@ -290,7 +290,7 @@ def encode_jpeg(rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> bytes
 
 
 def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALITY) -> None:
-    """Write a picture as JPEG under its name once it is whole.
+    """Write a picture as JPEG; the file gets its name once it is complete.
 
     Raises:
         OSError: it cannot be written.
@@ -301,7 +301,7 @@ def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALIT
 
 
 class _LensKey:
-    """Names the lens of a picture; a zoom (the stated field of view changes) begins another."""
+    """Names the lens of a picture; a zoom (change of the stated field of view) starts another."""
 
     def __init__(self, found: VideoScan) -> None:
         self._base = f"video {found.width}x{found.height}"
@@ -316,9 +316,9 @@ class _LensKey:
         return f"{self._base} fov{self._fov:.1f}"
 
 
-def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTags:
-    photo = PhotoTags(path, kept.columns, kept.rows)
-    photo.damaged = kept.damaged
+def _photo(path: Path, picture: CachedPicture, pose: Pose | None, lens: _LensKey) -> PhotoTags:
+    photo = PhotoTags(path, picture.columns, picture.rows)
+    photo.damaged = picture.damaged
     photo.camera = lens.of(None if pose is None else pose.sample)
     if pose is None:
         return photo
@@ -330,7 +330,7 @@ def _photo(path: Path, kept: Kept, pose: Pose | None, lens: _LensKey) -> PhotoTa
     photo.camera_deg = (sample.yaw_deg, sample.pitch_deg, sample.roll_deg)
     photo.flight_deg = (sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg)
     photo.position_sigma_m = sample.sigma_m
-    # DJI's sources say "gimbal yaw" and mean different things by it; all others define the picture's.
+    # DJI's sources use "gimbal yaw" with different meanings; all others define the picture's.
     photo.yaw_is_stated = not {"djmd", "SRT"} & set(pose.origin.split(" + "))
     photo.fov_hint_rad = None if sample.fov_deg is None else math.radians(sample.fov_deg)
     names = {

@@ -1,4 +1,4 @@
-"""Pictures that an earlier run took from a video: listed beside them, and taken again only if something has changed."""
+"""Cache of pictures extracted from a video: a list in their folder, valid until something changes."""
 
 import hashlib
 import json
@@ -15,12 +15,12 @@ _VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """One picture in the folder.
+class CachedPicture:
+    """One picture in the cache folder.
 
     Attributes:
         number: of the picture in the video, in order of presentation.
-        packet: index of its packet, None where the decoder did not tell.
+        packet: index of its packet, None if the decoder did not report it.
         columns: width in pixels; rows: height. damaged: whether it lost parts.
     """
 
@@ -32,30 +32,30 @@ class Kept:
 
     @property
     def name(self) -> str:
-        """Its file."""
+        """Its file name."""
         return f"{self.number:06d}.jpg"
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
-    """What a whole extraction gave.
+class CachedExtraction:
+    """The list of a complete extraction.
 
     Attributes:
-        pictures: those that were taken. seen: pictures decoded. without_pose: left out for lack of a position.
-        damaged: pictures that lost parts or could not be decoded.
+        pictures: the extracted ones. seen: number decoded. without_pose: number left out for lack of a position.
+        damaged: number that lost parts or could not be decoded.
     """
 
-    pictures: Sequence[Kept]
+    pictures: Sequence[CachedPicture]
     seen: int
     without_pose: int
     damaged: int
 
 
 def key_of(video: Path, poses: Poses, count: int, choice: Sequence[Any]) -> str:
-    """What an extraction depends on: the file, how pictures are chosen, and the poses of all `count` packets.
+    """Cache key of an extraction: the file, the selection of pictures, and the poses of all `count` packets.
 
     Raises:
-        OSError: the video is gone.
+        OSError: the video does not exist any more.
     """
     stat = video.stat()
     digest = hashlib.sha256(f"{_VERSION} {stat.st_size} {stat.st_mtime_ns} {list(choice)!r}".encode())
@@ -64,31 +64,31 @@ def key_of(video: Path, poses: Poses, count: int, choice: Sequence[Any]) -> str:
     return digest.hexdigest()
 
 
-def recall(folder: Path, key: str) -> Taken | None:
-    """What an earlier extraction with this key left in a folder; None if it left nothing whole."""
+def recall(folder: Path, key: str) -> CachedExtraction | None:
+    """The list of an earlier extraction with this key; None if there is none or it is incomplete."""
     try:
         document = json.loads((folder / _LIST).read_text(encoding="utf-8"))
         if document["key"] != key:
             return None
-        pictures = [Kept(*row) for row in document["pictures"]]
-        taken = Taken(pictures, *(int(document[name]) for name in ("seen", "without_pose", "damaged")))
-        return taken if all((folder / kept.name).stat().st_size for kept in pictures) else None
+        pictures = [CachedPicture(*row) for row in document["pictures"]]
+        extraction = CachedExtraction(pictures, *(int(document[name]) for name in ("seen", "without_pose", "damaged")))
+        return extraction if all((folder / picture.name).stat().st_size for picture in pictures) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def remember(folder: Path, key: str, taken: Taken) -> None:
-    """List what was taken, once all of it lies in the folder.
+def remember(folder: Path, key: str, extraction: CachedExtraction) -> None:
+    """Write the list, once all pictures are in the folder.
 
     Raises:
         OSError: the folder cannot be written.
     """
     document = {
         "key": key,
-        "pictures": [astuple(kept) for kept in taken.pictures],
-        "seen": taken.seen,
-        "without_pose": taken.without_pose,
-        "damaged": taken.damaged,
+        "pictures": [astuple(picture) for picture in extraction.pictures],
+        "seen": extraction.seen,
+        "without_pose": extraction.without_pose,
+        "damaged": extraction.damaged,
     }
     temporary = folder / f"{_LIST}.part"
     temporary.write_text(json.dumps(document), encoding="utf-8")

@@ -1,9 +1,10 @@
-"""Which pictures of a video are damaged because something that they are predicted from was lost.
+"""Finds pictures of a video that are damaged because data from which they are predicted was lost.
 
-A picture predicted from a damaged one is damaged, too, although the decoder reports only the first: so damage runs in
-decoding order from the lost packet to the next recovery point, a key picture that arrived whole (H.264: IDR or recovery
+A picture predicted from a damaged one is damaged, too, although the decoder reports only the first: so damage extends
+in
+decoding order from the lost packet to the next recovery point, a complete key picture (H.264: IDR or recovery
 point SEI, H.265: IRAP). Losses in files show as gaps in the continuity counters of MPEG-TS (ISO/IEC 13818-1, 2.4.3.3),
-as decoding errors, and as pictures that the decoder had to conceal; for live streams see `LiveDamage`.
+as decoding errors, and as pictures concealed by the decoder; for live streams see `LiveDamage`.
 """
 
 from bisect import bisect_right
@@ -43,13 +44,13 @@ def transport_gaps(path: Path, pid: int) -> list[tuple[int, int]]:
 
 
 def _is_payload(rows: NDArray[np.uint8], pid: int) -> NDArray[np.bool_]:
-    """Packets of a stream with a payload: only they are counted."""
+    """Whether a packet has a payload: only those increment the counter."""
     number = ((rows[:, 1].astype(np.int64) & 31) << 8) | rows[:, 2]
     return np.asarray((number == pid) & ((rows[:, 3] & 16) > 0))
 
 
 class Damage:
-    """Follows damage through the packets of a video, by their index in decoding order."""
+    """Tracks damage through the packets of a video, by their index in decoding order."""
 
     def __init__(self) -> None:
         self._recoveries: list[int] = []
@@ -57,14 +58,14 @@ class Damage:
         self._last_loss: dict[int, int] = {}
 
     def packet(self, index: int, *, is_key: bool, is_lost: bool) -> None:
-        """Take note of a packet: whether it is a recovery point, whether something is missing in or before it."""
+        """Record a packet: whether it is a recovery point, whether data is missing in or before it."""
         if is_lost:
             self.lost(index)
         elif is_key:
             self._recoveries.append(index)
 
     def lost(self, index: int) -> None:
-        """Take note that a packet cannot be decoded whole."""
+        """Record that a packet cannot be decoded completely."""
         if index not in self._losses:
             self._losses.add(index)
             section = self._section(index)
@@ -76,16 +77,16 @@ class Damage:
         return first is not None and first <= index
 
     def _section(self, index: int) -> int:
-        """Number of recovery points up to a packet: damage does not run from one section into the next."""
+        """Number of recovery points up to a packet: damage does not extend from one section into the next."""
         return bisect_right(self._recoveries, index)
 
 
 class LiveDamage:
-    """Follows damage through the packets of a live stream, of which there is no file to look for gaps in.
+    """Tracks damage through the packets of a live stream, without a file in which to look for gaps.
 
     FFmpeg marks the data in which a continuity counter jumped, but its parsers put the mark on the picture that they
     complete at that moment, the one before: both count as lost (measured on H.264 and H.265 in MPEG-TS, 2 of 300
-    transport packets lost: every smeared picture is found, one sound picture a loss is taken for damaged).
+    transport packets lost: every damaged picture is found, and one undamaged picture per loss is reported as damaged).
     """
 
     def __init__(self) -> None:
@@ -94,18 +95,18 @@ class LiveDamage:
         self._was_marked = False
 
     def packet(self, *, is_key: bool, is_marked: bool) -> int:
-        """Take note of the next packet; gives its index, by which its picture is asked for."""
+        """Record the next packet; returns its index, with which its picture can be queried."""
         index = self._count
         self._damage.packet(index, is_key=is_key, is_lost=is_marked or self._was_marked)
         self._was_marked, self._count = is_marked, index + 1
         return index
 
     def failed(self) -> None:
-        """Take note that the newest packet could not be decoded."""
+        """Record that the newest packet could not be decoded."""
         self._damage.lost(max(0, self._count - 1))
 
     def is_damaged(self, index: int | None, is_concealed: bool) -> bool:
-        """Whether a packet's picture is damaged; one that the decoder had to conceal damages those after it, too."""
+        """Whether a packet's picture is damaged; one concealed by the decoder damages those after it, too."""
         if index is None:
             return is_concealed
         if is_concealed:

@@ -1,4 +1,4 @@
-"""Which pictures of a video are worth mapping: one every few metres or seconds, the sharpest of its neighbours."""
+"""Selection of pictures from a video: one every few metres or seconds, the sharpest of its neighbours."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ _MAX_CANDIDATES = 6
 
 @dataclass(slots=True)
 class Candidate:
-    """A picture that may be taken.
+    """A picture that may be selected.
 
     Attributes:
         number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
-        origin: where the pose is from. packet: index of its packet, None where the decoder did not tell.
+        origin: source of the pose. packet: index of its packet, None if the decoder did not report it.
         damaged: whether it lost parts.
     """
 
@@ -37,10 +37,11 @@ class Candidate:
 
 
 class Picker:
-    """Takes pictures from a stream of them, at most one each spacing.
+    """Selects pictures from a stream, at most one per spacing.
 
-    Among the pictures whose progress is near the spacing the sharpest sound one is taken. Where pictures are further
-    apart than the spacing (a slow camera, a thinned video) all are taken.
+    Among the pictures whose progress is near the spacing, the sharpest undamaged one is selected. Where pictures are
+    further
+    apart than the spacing (a slow camera, a thinned video), all are selected.
 
     Args:
         every_m: spacing in metres; with neither this nor every_s 4 % of the height, else half a second.
@@ -53,7 +54,7 @@ class Picker:
         self._waiting: list[Candidate] = []
 
     def push(self, candidate: Candidate) -> Iterator[Candidate]:
-        """Offer the next picture; yields those that are taken."""
+        """Offer the next picture; yields the selected ones."""
         if self._last is None:
             self._last = candidate
             yield candidate
@@ -72,7 +73,7 @@ class Picker:
         yield from self.push(candidate)
 
     def flush(self) -> Iterator[Candidate]:
-        """At the end: what still waits."""
+        """At the end: yields the remaining selection."""
         if self._waiting:
             yield self._take()
 
@@ -86,7 +87,7 @@ class Picker:
         return best
 
     def _progress(self, new: Candidate, last: Candidate) -> float:
-        """How far a picture is from the last one taken, in units of the spacing."""
+        """Distance of a picture from the last selected one, in units of the spacing."""
         seconds = abs(new.video_s - last.video_s)
         if self._every_s is not None and self._every_m is None:
             return seconds / max(self._every_s, 1e-6)
@@ -117,7 +118,7 @@ def sharpness(frame: Any) -> float:
 
 
 def luma(frame: Any) -> Any:
-    """Grey values, uint8 (rows, columns), of a decoded picture; of a planar one its own plane, not converted."""
+    """Grey values, uint8 (rows, columns), of a decoded picture; of a planar format its Y plane, not converted."""
     name = frame.format.name
     if name.startswith(("yuv4", "yuvj4", "nv12", "nv21")) and not name.endswith(("le", "be")):
         plane = frame.planes[0]

@@ -1,7 +1,7 @@
-"""Which pose belongs to which picture of a video.
+"""Assigns poses to the pictures of a video.
 
-What is carried in or with a picture's own packet (SEI, djmd) is bound to that packet, and follows it through the
-decoder (`telemetry.video.extraction`), so that B-frames and threads cannot mix it up. What has times of its own (KLV,
+Metadata in or with a picture's own packet (SEI, djmd) belongs to that packet and follows it through the
+decoder (`telemetry.video.extraction`), so that B-frames and threads cannot mix it up. Metadata with its own times (KLV,
 subtitles) is interpolated at the picture's time. The sources are merged field by field, the one with a position first.
 """
 
@@ -25,14 +25,14 @@ _HELD_AT_ENDS_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """The merged sample of a picture and where its parts come from."""
+    """The merged sample of a picture and the sources of its parts."""
 
     sample: Sample
     origin: str
 
 
 class Clock:
-    """UTC of moments of a video, from pairs of both; beyond its ends it runs on at the rate of one."""
+    """UTC of video times, from pairs of both; beyond its ends it continues at rate one."""
 
     def __init__(self, video_s: Sequence[float], utc_s: Sequence[float]) -> None:
         order = np.argsort(video_s, kind="stable")
@@ -43,7 +43,7 @@ class Clock:
         return len(self._video)
 
     def at(self, video_s: Array) -> Array:
-        """UTC epoch seconds, NaN where the moment is NaN or nothing is known."""
+        """UTC epoch seconds, NaN where the time is NaN or nothing is known."""
         t = np.asarray(video_s, dtype=np.float64)
         if len(self) == 0:
             return np.full(t.shape, np.nan)
@@ -52,7 +52,7 @@ class Clock:
 
     @property
     def rate(self) -> float:
-        """Seconds of UTC per second of video; NaN where too few moments are known."""
+        """Seconds of UTC per second of video; NaN if too few times are known."""
         if len(self) < 5 or self._video[-1] - self._video[0] < 0.2:
             return float("nan")
         return float(np.polyfit(self._video - self._video[0], self._utc - self._utc[0], 1)[0])
@@ -62,7 +62,7 @@ class Poses:
     """The pose of each picture of a video.
 
     Attributes:
-        findings: what is odd about the video's metadata.
+        findings: irregularities in the video's metadata.
     """
 
     def __init__(self, found: VideoScan, subtitles: srt.Subtitles | None = None) -> None:
@@ -70,7 +70,7 @@ class Poses:
         self._interval = 1.0 / found.rate if found.rate else 1.0 / 30.0
         self._djmd = sorted(found.djmd_samples, key=lambda row: row[0])
         self._djmd_times = np.array([row[0] for row in self._djmd])
-        # Whole seconds: the largest difference is that of a moment at which the second had just begun.
+        # Whole seconds: the largest difference belongs to a time at which the second had just begun.
         self._djmd_clock = max((s.time_s - t for t, s in self._djmd if s.time_s is not None), default=None)
         self._times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
         self._trust_sei_times = True
@@ -83,7 +83,7 @@ class Poses:
         self._note(cues)
 
     def of(self, index: int) -> Pose | None:
-        """Pose of the picture of a packet (its index in `VideoScan.pictures`); None where nothing is known."""
+        """Pose of the picture of a packet (its index in `VideoScan.pictures`); None if unknown."""
         note, t = self._scan.pictures[index], self._times[index]
         parts: list[tuple[Sample, str]] = []
         own = note.sample
@@ -103,7 +103,7 @@ class Poses:
             parts.append((Sample(time_s=self._scan.created_s + float(t)), ""))
         if not parts:
             return None
-        # What has a position leads; a bare time stamp only says when, but that better than the others.
+        # Samples with a position come first; a time stamp alone has the better time.
         parts.sort(key=lambda part: not part[0].has_position)
         merged = parts[0][0]
         if own is not None and own.time_s is not None:
@@ -131,13 +131,13 @@ class Poses:
         )
 
     def add_track(self, name: str, timeline: Timeline, offset_s: float, *, has_gimbal: bool) -> int:
-        """Add a vehicle's log as a source, behind all others; returns how many pictures it places.
+        """Add a vehicle's log as the last source; returns the number of pictures it gives a pose.
 
         Args:
             name: origin of its fields.
             timeline: the vehicle's poses over UTC.
             offset_s: video time minus UTC.
-            has_gimbal: False where the camera is taken as fixed under the airframe.
+            has_gimbal: False if the camera is assumed fixed under the airframe.
         """
         samples = timeline.at_all(self._times - offset_s)
         if not has_gimbal:
@@ -159,7 +159,7 @@ class Poses:
         return table[:, 0], table[:, 1:]
 
     def _time(self, index: int) -> float:
-        """Video time of a packet's picture; NaN where it is not known."""
+        """Video time of a packet's picture; NaN if unknown."""
         t = self._scan.pictures[index].video_s
         if t is not None:
             return t
@@ -192,7 +192,7 @@ class Poses:
         return Clock([t for t, _ in pairs], [u for _, u in pairs])
 
     def _klv_rows(self) -> list[tuple[float, Sample]]:
-        """KLV poses with their video times: their own, else by UTC against the SEI times, else by their place."""
+        """KLV poses with video times: their own, else from UTC and the SEI times, else from their place in the file."""
         rows = [
             (t, after, p.sample)
             for t, after, p in self._scan.klv_packets
@@ -208,7 +208,7 @@ class Poses:
         utc = np.array([s.time_s if s.time_s is not None else np.nan for _, _, s in rows])
         known = ~np.isnan(self._times)
         if len(sei_clock) > 1 and known.any():
-            # The pictures' own UTC, in order, turned round: from UTC to video time.
+            # The pictures' own UTC, in order, inverted: from UTC to video time.
             moments = np.sort(self._times[known])
             at = sei_clock.at(moments)
             if np.mean((utc >= at[0] - 1.0) & (utc <= at[-1] + 1.0)) > 0.5 and np.all(np.diff(at) > 0):
@@ -219,7 +219,7 @@ class Poses:
         return [(float(self._times[min(after, last)]), s) for _, after, s in rows if last >= 0]
 
     def _compare_clocks(self, sei_clock: Clock, klv_clock: Clock) -> None:
-        """SEI time stamps that contradict the KLV's are reported, and not used where they do not even run right."""
+        """Report SEI time stamps that contradict the KLV's; ignore them if their rate is wrong."""
         name = self._scan.path.name
         ratio = sei_clock.rate / klv_clock.rate if klv_clock.rate > 0 else float("nan")
         if ratio == ratio and not 0.8 < ratio < 1.25:
@@ -270,7 +270,7 @@ class Poses:
 
 
 def _held_timeline(samples: list[Sample]) -> Timeline:
-    """A timeline whose ends are held for one usual interval (at most a second): pictures stand between samples."""
+    """A timeline extended at its ends by one usual interval (at most a second), as pictures lie between samples."""
     samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
     times = np.array([s.time_s for s in samples], dtype=np.float64)
     usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S

@@ -1,4 +1,4 @@
-"""Video files: all metadata that they carry.
+"""All metadata of video files.
 
 One pass over the packets, without decoding, finds all metadata: SEI of each picture, KLV, DJI's djmd track, a
 subtitle track. `telemetry.video.picture_poses` makes one pose for each picture of it.
@@ -20,16 +20,16 @@ _MAX_PICTURES = 5_000_000
 
 
 class NotAVideo(Unreadable):
-    """A file with a video's suffix is none; the text is one sentence for the user."""
+    """A file with a video's suffix is not a video; the text is one sentence for the user."""
 
 
 @dataclass(slots=True)
 class PictureNote:
-    """What was found with one picture's packet.
+    """Metadata of one picture's packet.
 
     Attributes:
-        video_s: its time in the video. sample: its own pose. decoders: who understood it.
-        position: byte in the file where the packet begins, None where the container does not say.
+        video_s: its time in the video. sample: its own pose. decoders: names of the decoders that understood it.
+        position: offset of the packet in the file, None if the container does not give it.
     """
 
     video_s: float | None
@@ -44,13 +44,13 @@ class VideoScan:
 
     Attributes:
         path: the file. codec: of the pictures. width: columns; height: rows.
-        rate: pictures a second, None if the file does not say.
+        rate: pictures a second, None if not given.
         created_s: UTC epoch seconds of the container's creation time.
         pictures: one for each video packet, in order of the file.
         klv_packets: video time (None if unknown), number of video packets before it, packet.
         djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
         damaged: packets that could not be read.
-        unknown_sei: how many private SEI messages of a UUID and a size nobody knows.
+        unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
     """
 
     path: Path
@@ -100,11 +100,11 @@ def open_video(path: Path | str, **options: Any) -> Any:
 
 @contextmanager
 def parked(context: Any) -> Iterator[None]:
-    """Empty a decoder that carries `opaque` objects before it is freed.
+    """Empty a decoder that holds `opaque` objects before it is freed.
 
-    PyAV frees such an object with the interpreter's lock held, in whichever thread lets go of it last, and frees a
-    decoder, which waits for the decoder's threads, holding the same lock: neither would ever end. Emptied, the threads
-    hold nothing more.
+    PyAV frees such an object with the interpreter lock held, in the thread that releases it last, and frees a
+    decoder, which waits for the decoder's threads, while holding the same lock: a deadlock. After emptying, the threads
+    hold no objects.
     """
     try:
         yield

@@ -1,7 +1,7 @@
-"""Puts SEI into H.264 and H.265 without re-encoding: for simulated cameras and companion computers.
+"""Inserts SEI into H.264 and H.265 without re-encoding, for simulated cameras and companion computers.
 
 `add_sei` rewrites a file packet by packet: each picture's packet gets one more NAL unit before its first slice, all
-else stays as it was, so every player shows the same pictures. `with_sei` does it for one packet of a live encoder.
+else is unchanged, so every player shows the same pictures. `with_sei` does it for one packet of a live encoder.
 """
 
 import os
@@ -31,8 +31,8 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
 
     Args:
         source: an H.264 or H.265 video.
-        target: where the copy goes.
-        pose_of: what to write into each picture, by its number in order of presentation from 0.
+        target: path of the copy.
+        pose_of: returns the sample for each picture, by its number in order of presentation from 0.
 
     Returns:
         Number of pictures that got one.
@@ -69,7 +69,7 @@ def presentation_order(path: Path) -> list[int]:
     """For each video packet of a file its picture's number in order of presentation.
 
     Raises:
-        NotAVideo: it is none.
+        NotAVideo: it is not a video.
     """
     with open_video(path) as container:
         stream = container.streams.video[0]
@@ -81,7 +81,7 @@ def presentation_order(path: Path) -> list[int]:
 
 
 def _order_by_decoding(path: Path, count: int) -> list[int]:
-    """The same where the stream has no times (raw streams): the decoder knows the order."""
+    """The order where the stream has no times (raw streams), from the decoder."""
     from telemetry.video.extraction import decoded
     from telemetry.video.video_file import scan
 

@@ -21,7 +21,7 @@ Entry = tuple[int, int, int, bytes]
 
 
 def with_pose(jpeg: bytes, frame: Frame) -> bytes:
-    """A JPEG with a frame's pose; EXIF and XMP that were there are replaced, the picture stays as it is.
+    """A JPEG with a frame's pose; existing EXIF and XMP are replaced, the picture data is unchanged.
 
     Raises:
         ValueError: the bytes are not a JPEG.
@@ -38,7 +38,7 @@ def _segment(body: bytes) -> bytes:
 
 
 def _without_tags(jpeg: bytes) -> bytes:
-    """What follows the start mark, without APP1 segments."""
+    """The bytes after the start marker, without APP1 segments."""
     at, kept = 2, []
     while at + 4 <= len(jpeg) and jpeg[at] == 0xFF and jpeg[at + 1] not in (0xDA, 0xD9):
         end = at + 2 + struct.unpack_from(">H", jpeg, at + 2)[0]

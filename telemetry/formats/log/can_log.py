@@ -1,7 +1,7 @@
 """Logs of a CAN bus with DroneCAN on it: candump's .log, Vector's .asc and .blf, PEAK's .trc, by python-can's readers.
 
-Several nodes may tell the same thing; at each moment the one with the lowest stated sigma counts. Fixes carry UTC,
-which dates the rest of the log; without them the log's own times count where they are dates.
+Several nodes may send the same value; at each moment the one with the lowest stated sigma is used. Fixes carry UTC,
+which dates the rest of the log; without them the log's own times are used if they are dates.
 """
 
 import re
@@ -32,7 +32,7 @@ _HEADS: Final = {
 
 
 def is_can_log(path: Path) -> bool:
-    """Whether a file begins as a log of a CAN bus does; others have these suffixes, too."""
+    """Whether a file begins like a CAN log; other kinds of files share these suffixes."""
     head = _HEADS.get(path.suffix.lower())
     try:
         with path.open("rb") as handle:
@@ -43,7 +43,7 @@ def is_can_log(path: Path) -> bool:
 
 @dataclass(slots=True)
 class _Reading:
-    """What a log has given so far: poses, those of them without a date, frames, and places that are damaged."""
+    """What was read from a log so far: poses, undated poses, number of frames, and damaged places."""
 
     poses: list[tuple[str, NodePose]] = field(default_factory=list)
     undated: list[tuple[DronecanPoses, NodePose]] = field(default_factory=list)
@@ -52,10 +52,10 @@ class _Reading:
 
 
 def read_can_log(path: Path) -> FlightLog:
-    """Read the positions and attitudes that nodes have told on a bus.
+    """Read the positions and attitudes that nodes sent on a bus.
 
     Raises:
-        OSError: it cannot be read. NotALog: it holds no CAN frame, or no DroneCAN message that is read here.
+        OSError: it cannot be read. NotALog: it holds no CAN frame, or none of the DroneCAN messages that are read here.
     """
     if not is_can_log(path):
         raise NotALog(f"the file is not the log of a CAN bus ({', '.join(sorted(SUFFIXES))}); it is left out")
@@ -102,7 +102,8 @@ def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
                 return
             except OSError:
                 raise
-            except Exception:  # its readers promise nothing about damaged files; the next line or record may be whole
+            # python-can's readers may fail anywhere in a damaged file; the next line or record may be complete
+            except Exception:
                 reading.damaged += 1
     except OSError:
         raise
@@ -114,7 +115,7 @@ def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
 
 
 def _best(poses: list[tuple[str, NodePose]]) -> list[Sample]:
-    """Poses of one kind: of each node those of which no node with a lower sigma tells at that time."""
+    """Poses of one kind, without those of nodes for which a node with a lower sigma reports at that time."""
     nodes: dict[str, list[NodePose]] = {}
     for key, pose in poses:
         nodes.setdefault(key, []).append(pose)

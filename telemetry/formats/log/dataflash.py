@@ -53,7 +53,7 @@ def read_dataflash(path: Path) -> FlightLog:
     """Read a DataFlash log; damaged parts are skipped.
 
     Raises:
-        OSError: it cannot be read. NotALog: it is none.
+        OSError: it cannot be read. NotALog: it is not a DataFlash log.
     """
     with mapped(path) as data:
         rows = _rows(data)
@@ -127,13 +127,13 @@ def _learn(data: mmap.mmap, at: int, formats: dict[int, _Format | None], lengths
 
 
 def _utc_minus_boot(rows: list[Row]) -> float | None:
-    """What to add to TimeUS for UTC, by GPS weeks and milliseconds of good fixes."""
+    """Offset from TimeUS to UTC, by the GPS weeks and milliseconds of good fixes."""
     offsets = []
     for row in rows:
         week, week_ms, boot_s = row.get("GWk", row.get("Week")), row.get("GMS", row.get("TimeMS")), _boot_s(row)
         if isinstance(week, int) and week > 1000 and week_ms is not None and boot_s is not None and _has_fix(row):
             offsets.append(GPS_EPOCH_S + week * WEEK_S + week_ms * 1e-3 - LEAP_S - boot_s)
-    # A fix is logged some time after it was measured, so the largest offsets are the best ones.
+    # A fix is logged some time after its measurement, so the largest offsets are the best.
     return float(np.quantile(offsets, 0.9)) if offsets else None
 
 
@@ -146,7 +146,7 @@ def _boot_s(row: Row) -> float | None:
 
 
 def _is_later(row: Row, last: Row) -> bool:
-    """Whether a record is worth keeping after the last one that was kept."""
+    """Whether a record is late enough after the last stored one to be stored, too."""
     now, before = _boot_s(row), _boot_s(last)
     return now is None or before is None or not 0.0 <= now - before < LEAST_STEP_S
 

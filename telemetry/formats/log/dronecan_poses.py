@@ -1,8 +1,8 @@
 """DroneCAN frames to poses: the frames of one bus in, positions and attitudes of its nodes out.
 
-Used alike for live buses (`telemetry.live.dronecan_bus`) and for logs of buses (`can_log`). Read are gnss.Fix2 and
-Fix, ahrs.Solution and camera_gimbal.Status; frames of all other types are skipped by their identifier, before anything
-is decoded. Frames of reference: body x forward, y right, z down; camera z along the optical axis, x right, y down
+Used both for live buses (`telemetry.live.dronecan_bus`) and for logs of buses (`can_log`). It reads gnss.Fix2 and
+Fix, ahrs.Solution and camera_gimbal.Status; frames of all other types are skipped by their identifier, before
+decoding. Frames of reference: body x forward, y right, z down; camera z along the optical axis, x right, y down
 (DroneCAN specification, "Coordinate frames"). Transfers: DroneCAN specification, "CAN bus transport layer".
 """
 
@@ -37,7 +37,7 @@ _RTK_FIXED_M, _RTK_FLOAT_M = 0.02, 0.3
 
 @dataclass(frozen=True, slots=True)
 class NodePose:
-    """What one message says.
+    """The content of one message.
 
     Attributes:
         sample: a position, the airframe's attitude or the camera's; its time is UTC.
@@ -54,16 +54,16 @@ class DronecanPoses:
     """Turns the frames of one bus into poses.
 
     Attributes:
-        received: node -> messages that were read.
-        lost: node -> messages that did not arrive whole, by the gaps in their transfer numbers.
+        received: node -> number of messages read.
+        lost: node -> number of messages lost or incomplete, by gaps in their transfer numbers.
     """
 
     def __init__(self, body_at: Callable[[float], Array | None] = lambda time_s: None) -> None:
-        """Start with no frame.
+        """Start without frames.
 
         Args:
-            body_at: the airframe's rotation to north-east-down at a moment (UTC), for a gimbal on a bus without
-                ahrs.Solution; None where it is not known.
+            body_at: returns the airframe's rotation to north-east-down at a time (UTC), for a gimbal on a bus without
+                ahrs.Solution; None where unknown.
         """
         self.received: Counter[int] = Counter()
         self.lost: Counter[int] = Counter()
@@ -75,12 +75,12 @@ class DronecanPoses:
         self._clocks: deque[float] = deque(maxlen=_FIXES_FOR_CLOCK)
 
     def feed(self, identifier: int, data: bytes, arrival_s: float, *, fd: bool = False) -> NodePose | None:
-        """Take a frame; returns what the message says that it completes, None where there is none.
+        """Process a frame; returns the pose of the message that it completes, None if it completes none.
 
         Args:
             identifier: 29 bits, of an extended frame.
             data: 0 to 8 bytes, to 64 of CAN FD.
-            arrival_s: when it came, seconds of any steady clock; UTC follows from the fixes.
+            arrival_s: time of arrival, seconds of any steady clock; UTC follows from the fixes.
             fd: whether it is a frame of CAN FD.
         """
         kind, node = (identifier >> 8) & 0xFFFF, identifier & 0x7F
@@ -90,7 +90,7 @@ class DronecanPoses:
         last = self._last.get((kind, node))
         if tail & 0x80:
             self._transfers.pop(identifier, None)
-            if last is not None and 0.0 <= arrival_s - last[0] < _LEAST_STEP_S:  # more often than any pose changes
+            if last is not None and 0.0 <= arrival_s - last[0] < _LEAST_STEP_S:  # sent more often than poses change
                 self._last[kind, node] = last[0], tail & 31
                 return None
             self._transfers[identifier] = []
@@ -115,11 +115,11 @@ class DronecanPoses:
 
     @property
     def knows_utc(self) -> bool:
-        """Whether a fix told UTC yet."""
+        """Whether a fix has given UTC yet."""
         return bool(self._clocks)
 
     def utc(self, arrival_s: float) -> float:
-        """UTC of an arrival, by the fixes that were least delayed; the arrival itself where no fix knew UTC."""
+        """UTC of an arrival, by the least delayed fixes; the arrival itself until a fix gives UTC."""
         return arrival_s + max(self._clocks, default=0.0)
 
     def _fix2(self, m: Any, node: int, arrival_s: float) -> NodePose | None:

@@ -1,4 +1,4 @@
-"""Lists of exposures that a GNSS receiver wrote: RTKLIB's and Emlid's events (.pos), DJI's Timestamp.MRK.
+"""Exposure lists of GNSS receivers: event files of RTKLIB and Emlid (.pos), DJI's Timestamp.MRK.
 
 .pos: comment lines begin with %, the last of them names the time scale (GPST or UTC) and the columns; then date and
 time, latitude, longitude (degrees), ellipsoidal height, quality, satellites, standard deviations north, east, up.
@@ -29,7 +29,7 @@ def read_exposure_list(path: Path) -> FlightLog:
     """Read a list of exposures.
 
     Raises:
-        OSError: it cannot be read. NotALog: it is none.
+        OSError: it cannot be read. NotALog: it is not such a list.
     """
     with path.open("rb") as handle:
         text = handle.read(_MOST_BYTES).decode("utf-8-sig", "replace")

@@ -1,7 +1,7 @@
 """Flight logs: tlog, ArduPilot's DataFlash .BIN, PX4's .ulg, CAN buses, lists of exposures; poses and camera events.
 
-All give the same: samples over UTC and exposures in order. Readers take only the messages they need and survive
-truncation and damage: a bad record is skipped, the next good one found.
+All give samples over UTC and exposures in order. Readers decode only the messages they need and tolerate
+truncation and damage: a bad record is skipped up to the next good one.
 """
 
 import mmap
@@ -26,10 +26,10 @@ __all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
 
 
 def read_log(path: Path) -> list[FlightLog]:
-    """Read a log of any of the kinds, one entry for each vehicle in it.
+    """Read a log of any kind; returns one entry for each vehicle in it.
 
     Raises:
-        NotALog: it is none, or holds nothing that can be used.
+        NotALog: it is not a flight log, or holds nothing that can be used.
     """
     readers: dict[str, Callable[[Path], list[FlightLog]]] = {
         ".tlog": read_tlog,
@@ -57,7 +57,7 @@ def read_log(path: Path) -> list[FlightLog]:
 
 
 def finish(log: FlightLog) -> None:
-    """Put a log in order: events once each, by time; a trigger goes where its picture is reported, too."""
+    """Sort a log's events by time and remove repetitions; a trigger is dropped if its picture is reported, too."""
     kinds = {event.kind for event in log.events}
     for richer, poorer in (
         ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK"),
@@ -126,7 +126,7 @@ def read_tlog(path: Path) -> list[FlightLog]:
 def _read_packets(
     data: mmap.mmap, decoder: Any, failure: type[Exception], wanted: Container[int], vehicles: dict[int, "_TlogVehicle"]
 ) -> int:
-    """Feed every wanted packet to its vehicle; returns the number of packets."""
+    """Pass every wanted packet to its vehicle; returns the number of packets."""
     at, size, packets = 0, len(data), 0
     while at + _HEADER + 8 <= size:
         length, number, system = _packet_at(data, at + _HEADER)
@@ -149,7 +149,7 @@ def _read_packets(
 
 
 def _packet_at(data: mmap.mmap, at: int) -> tuple[int, int, int]:
-    """Length, message number and system of the MAVLink packet at a place; length 0 where there is none."""
+    """Length, message id and system id of the MAVLink packet at an offset; length 0 if there is none."""
     if data[at] == 0xFD and at + 10 <= len(data):
         length = 12 + data[at + 1] + (13 if data[at + 2] & 1 else 0)
         return length, int.from_bytes(data[at + 7 : at + 10], "little"), data[at + 5]
@@ -159,7 +159,7 @@ def _packet_at(data: mmap.mmap, at: int) -> tuple[int, int, int]:
 
 
 def _resync(data: mmap.mmap, at: int) -> int:
-    """The next place where a record may begin: a plausible time (years 2000 to 2100), then a packet's mark."""
+    """The next offset where a record may begin: a plausible time (years 2000 to 2100), then a packet's start byte."""
     for start in range(at, min(len(data) - _HEADER, at + 70_000)):
         if data[start + _HEADER] in (0xFD, 0xFE) and data[start] == 0 and 0x03 <= data[start + 1] <= 0x0E:
             return start
@@ -198,7 +198,7 @@ class _TlogVehicle:
             self._events.append(found)
 
     def _close(self) -> None:
-        """Turn times since boot into UTC, by the vehicle's clock, else by the arrivals."""
+        """Convert times since boot to UTC, by the vehicle's clock, else by the arrivals."""
         offset = None
         if self._clocks:
             offset = float(np.median(self._clocks))

@@ -1,4 +1,4 @@
-"""What a flight log gives, whichever program wrote it, and what its readers share."""
+"""The content of a flight log in a common form, and helpers shared by its readers."""
 
 import contextlib
 import mmap
@@ -22,7 +22,7 @@ LEAST_STEP_S = 0.04
 
 
 class NotALog(Unreadable):
-    """A file with a log's suffix is none; the text is one sentence for the user."""
+    """A file with a log's suffix is not a log; the text is one sentence for the user."""
 
 
 @dataclass(slots=True)
@@ -33,8 +33,8 @@ class FlightLog:
         path: the file. kind: "tlog", "DataFlash", "ULog", "DroneCAN" and so on. vehicle: "sysid3" or the file's name.
         samples: poses over UTC, in order. events: exposures, in order.
         has_gimbal: whether the camera's own attitude was logged.
-        findings: what is odd.
-        position_sigma_m: horizontal sigma that the autopilot's receiver stated last, None where it stated none.
+        findings: irregularities, for the user.
+        position_sigma_m: last horizontal sigma stated by the autopilot's receiver, None if it stated none.
     """
 
     path: Path
@@ -47,7 +47,7 @@ class FlightLog:
     position_sigma_m: float | None = None
 
     def timeline(self) -> Timeline:
-        """Its poses, for reading at any moment."""
+        """Its poses, which can be read at any time."""
         return Timeline(self.samples)
 
 
@@ -63,7 +63,7 @@ def mapped(path: Path) -> Iterator[mmap.mmap]:
 
 
 def each(rows: Iterable[Row], take: Callable[[Row], None]) -> None:
-    """Take every record; one whose fields are missing or of the wrong type (a damaged format) is skipped."""
+    """Process every record; records with missing fields or fields of the wrong type (a damaged format) are skipped."""
     for row in rows:
         with contextlib.suppress(KeyError, TypeError, ValueError, ArithmeticError):
             take(row)

@@ -1,7 +1,7 @@
 """MAVLink messages to poses and camera events: one vehicle's messages in, samples and exposures out.
 
-Used alike for live links (`telemetry.live`) and for tlogs (`flight_logs`). Angles of a gimbal are honoured in the
-frame that its flags name; without any gimbal message the camera is taken as fixed under the airframe, its picture's up
+Used both for live links (`telemetry.live`) and for tlogs (`flight_logs`). Angles of a gimbal are interpreted in the
+frame that its flags name; without any gimbal message the camera is assumed fixed under the airframe, its picture's up
 towards the nose. Message fields: MAVLink common and ardupilotmega.
 """
 
@@ -59,10 +59,10 @@ class MavlinkPoses:
     """Turns one vehicle's messages into samples and camera events.
 
     Attributes:
-        utc_minus_boot_s: what to add to times since boot, None until the vehicle knows UTC.
-        heading_deg: of the airframe, latest. has_gimbal: whether any gimbal reported.
-        reboots: how often the time since boot went back. home_altitude_m: altitude of home over the sea.
-        position_sigma_m: horizontal sigma that the receiver states, None where it states none.
+        utc_minus_boot_s: offset from time since boot to UTC, None until the vehicle knows UTC.
+        heading_deg: of the airframe, latest. has_gimbal: whether a gimbal reported.
+        reboots: number of times that the time since boot went back. home_altitude_m: altitude of home above sea level.
+        position_sigma_m: horizontal sigma stated by the receiver, None if it states none.
     """
 
     utc_minus_boot_s: float | None = None
@@ -74,7 +74,7 @@ class MavlinkPoses:
     _boot_s: float = field(default=0.0, repr=False)
 
     def feed(self, message: Any) -> Sample | CameraEvent | None:
-        """Take a message; returns what it says (a sample's time is seconds since boot), None where nothing."""
+        """Process a message; returns its sample (time in seconds since boot) or event, None if it has neither."""
         handler = _HANDLERS.get(message.get_type())
         if handler is None:
             return None
@@ -82,11 +82,11 @@ class MavlinkPoses:
         if isinstance(result, Sample):
             if result.time_s is None:
                 result.time_s = self._boot_s
-            return _kept(result)
+            return _checked(result)
         return result
 
     def utc(self, boot_s: float | None) -> float | None:
-        """UTC of a time since boot, None while it is not known."""
+        """UTC of a time since boot, None while unknown."""
         if boot_s is None or self.utc_minus_boot_s is None:
             return None
         return boot_s + self.utc_minus_boot_s
@@ -108,7 +108,7 @@ class MavlinkPoses:
     def _position(self, m: Any) -> Sample | None:
         boot_s = self._boot(m.time_boot_ms)
         if not is_position(m.lat * 1e-7, m.lon * 1e-7):
-            return None  # no fix yet: the height is none either
+            return None  # no fix yet: the height is invalid, too
         return Sample(
             time_s=boot_s,
             lat_deg=m.lat * 1e-7,
@@ -181,7 +181,7 @@ class MavlinkPoses:
         if m.capture_result == 0:
             return None
         sample = Sample(lat_deg=m.lat * 1e-7, lon_deg=m.lon * 1e-7, altitude_m=m.alt * 1e-3)
-        if m.relative_alt * 1e-3 > _LEAST_HEIGHT_M:  # PX4 says -1 m where it does not know the ground
+        if m.relative_alt * 1e-3 > _LEAST_HEIGHT_M:  # PX4 sends -1 m where it does not know the ground
             sample.height_m = m.relative_alt * 1e-3
         elif self.home_altitude_m is not None and sample.altitude_m is not None:
             sample.height_m = sample.altitude_m - self.home_altitude_m
@@ -198,7 +198,7 @@ class MavlinkPoses:
         return self._event(m.time_usec * 1e-6, m.seq, Sample(), "CAMERA_TRIGGER")
 
     def _event(self, seconds: float, number: int, sample: Sample, kind: str) -> CameraEvent:
-        """An event whose time is UTC, or since boot where it is too small for that."""
+        """An event whose time is UTC, or time since boot where the value is too small for UTC."""
         if seconds > _EARLIEST_UTC_S:
             boot_s = None if self.utc_minus_boot_s is None else seconds - self.utc_minus_boot_s
             time_s: float | None = seconds
@@ -208,8 +208,8 @@ class MavlinkPoses:
         return CameraEvent(time_s, boot_s, int(number), checked(sample) or Sample(), kind)
 
 
-def _kept(sample: Sample) -> Sample | None:
-    """A checked sample; None where nothing but its time is left."""
+def _checked(sample: Sample) -> Sample | None:
+    """A checked sample; None if nothing but its time is valid."""
     boot_s = sample.time_s
     sample.time_s = None
     result = checked(sample)
@@ -236,7 +236,7 @@ def gimbal_rotation(q: Sequence[float], flags: int, heading_deg: float | None) -
         heading_deg: of the airframe, for a yaw that is relative to it.
 
     Returns:
-        float64 (3, 3); None where the quaternion is none, or the heading is needed and not known.
+        float64 (3, 3); None if the quaternion is invalid, or the heading is needed and unknown.
     """
     if not all(map(math.isfinite, q)) or not any(q):
         return None
@@ -247,7 +247,7 @@ def gimbal_rotation(q: Sequence[float], flags: int, heading_deg: float | None) -
 
 
 def put_capture_attitude(sample: Sample, q: Sequence[float]) -> None:
-    """The attitude of a capture: PX4 reports the airframe's there, or the camera's, and only the camera looks down."""
+    """Store the attitude of a capture: PX4 reports the airframe's or the camera's, and only the camera points down."""
     if not all(map(math.isfinite, q)) or not any(q):
         return
     rotation = quaternion_ned(*q)
@@ -269,7 +269,7 @@ def _above_ground(metres: float) -> Sample | None:
 
 
 def fixed_camera(sample: Sample) -> Sample:
-    """A sample whose camera angles, where unknown, are those of a camera fixed under the airframe."""
+    """The sample; where camera angles are unknown, those of a camera fixed under the airframe."""
     if sample.yaw_deg is None and sample.flight_yaw_deg is not None:
         body = euler_ned(sample.flight_yaw_deg, sample.flight_pitch_deg or 0.0, sample.flight_roll_deg or 0.0)
         sample.yaw_deg, sample.pitch_deg, sample.roll_deg = mounted_down_deg(body)

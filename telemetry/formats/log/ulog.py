@@ -1,4 +1,4 @@
-"""PX4's ULog (.ulg): formats, subscriptions and data of the topics that tell where the camera was.
+"""PX4's ULog (.ulg): formats, subscriptions and data of the topics with positions, attitudes and exposures.
 
 Source: the ULog file format specification of PX4 (header, definitions, data; messages of u16 size and u8 type).
 """
@@ -34,7 +34,7 @@ def read_ulog(path: Path) -> FlightLog:
     """Read a ULog; a truncated one as far as it goes.
 
     Raises:
-        OSError: it cannot be read. NotALog: it is none.
+        OSError: it cannot be read. NotALog: it is not a ULog.
     """
     with mapped(path) as data:
         if data[:7] != _MAGIC:
@@ -121,7 +121,7 @@ def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
 
 
 def _is_later(row: Row, last: Row) -> bool:
-    """Whether a record is worth keeping after the last one kept."""
+    """Whether a record is late enough after the last stored one to be stored, too."""
     step = (row["timestamp"] - last["timestamp"]) * 1e-6
     return not 0.0 <= step < LEAST_STEP_S
 
@@ -141,7 +141,7 @@ def _fields(text: str) -> list[tuple[str, str, int]]:
 def _layout(
     name: str, formats: dict[str, list[tuple[str, str, int]]], depth: int = 0
 ) -> list[tuple[str, struct.Struct]]:
-    """Fields of a topic with their structs, nested ones as bytes; padding keeps its place."""
+    """Fields of a topic with their structs, nested ones as bytes; padding is included."""
     layout = []
     for field, base, count in formats[name]:
         code = _TYPES.get(base)

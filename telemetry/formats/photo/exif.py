@@ -1,7 +1,7 @@
 """EXIF without a library: the tags of a TIFF structure (JPEG APP1, PNG eXIf, WebP EXIF, a TIFF file itself).
 
-Written by hand because it has to stay far below a millisecond a photo and must survive damaged files: every
-offset is checked, every count is bounded, and nothing here raises on bad data. Source: EXIF 2.32, TIFF 6.0.
+Own parser because it must take far less than a millisecond per photo and tolerate damaged files: every
+offset is checked, every count is bounded, and bad data never raises. Source: EXIF 2.32, TIFF 6.0.
 """
 
 import math
@@ -31,13 +31,13 @@ PIXEL_X, FOCAL_35MM, DIGITAL_ZOOM, SERIAL = 0xA002, 0xA405, 0xA404, 0xA431
 
 _LARGE_MAIN = frozenset({XMP})
 _LARGE_EXIF = frozenset({MAKER_NOTE})
-# Strips, tiles, colour maps and the like can be megabytes and say nothing here.
+# Strips, tiles and colour maps can be megabytes and are not needed here.
 _SKIPPED = frozenset({0x111, 0x117, 0x140, 0x144, 0x145, 0x201, 0x202, 0x14A, 0x9286})
 
 
 @dataclass(slots=True)
 class Exif:
-    """The tags of the three directories that matter, by number.
+    """The tags of the three directories that are used, by number.
 
     Attributes:
         main: IFD0. exif: the EXIF IFD. gps: the GPS IFD.
@@ -49,7 +49,7 @@ class Exif:
 
 
 def parse_tiff(data: Buffer) -> Exif:
-    """Read the directories of a TIFF structure; whatever is damaged is left out, nothing is raised."""
+    """Read the directories of a TIFF structure; damaged entries are left out, nothing is raised."""
     head = bytes(data[:8])
     if len(head) < 8 or head[:4] not in (b"II*\0", b"MM\0*"):
         return Exif()
@@ -163,10 +163,10 @@ def gps_time(gps: Tags) -> float | None:
 
 
 def exposure_time(exif: Exif) -> tuple[float, str] | None:
-    """When a picture was taken: UTC epoch seconds and how the zone is known.
+    """Time of exposure: UTC epoch seconds, and the source of the time zone.
 
     The camera's clock has sub-seconds but often no zone, the GPS stamp a zone but whole seconds and a lag: where
-    both are there the stamp only tells the zone (to the quarter of an hour).
+    both exist the stamp only determines the zone (to the quarter of an hour).
     """
     written = text(exif.exif.get(DATE_ORIGINAL)) or text(exif.main.get(DATE_TIME))
     local = parse_time(written)

@@ -2,7 +2,7 @@
 
 The note is a directory of 12-byte entries in a byte order of its own; tags 3-11 are single floats
 held in the entry itself: speed x, y, z; aircraft pitch, yaw, roll; camera pitch, yaw, roll (degrees; true north,
-camera pitch -90 = straight down). Source: ExifTool's DJI tag table, agreed with photos that have both.
+camera pitch -90 = straight down). Source: ExifTool's DJI tag table, checked with photos that have both.
 """
 
 import math
@@ -26,10 +26,11 @@ class DjiNote:
 
 
 def parse_dji(note: bytes) -> DjiNote | None:
-    """Attitude of a DJI maker note, None where it is no such note or says nothing. Never raises."""
+    """Attitude in a DJI maker note, None if it is another note or has no attitude. Never raises."""
     if len(note) < 14:
         return None
-    # Software that rewrites the EXIF may turn its byte order but leaves the note: the note's own count tells.
+    # Software that rewrites the EXIF may change its byte order but not the note's: the note's own count shows which it
+    # is.
     order = "<" if note[1] == 0 else ">"
     (count,) = struct.unpack_from(order + "H", note)
     count = min(count, _MAX_ENTRIES, (len(note) - 2) // 12)

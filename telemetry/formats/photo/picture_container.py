@@ -1,6 +1,6 @@
 """Picture files by their content: kind, size and metadata blocks, without decoding a pixel.
 
-Reads the head of a JPEG (and two kilobytes of its end, which tell whether it is complete); PNG and WebP chunk by
+Reads the head of a JPEG (and two kilobytes of its end, to check that it is complete); PNG and WebP chunk by
 chunk; TIFF through a memory map. A photo costs a few tens of microseconds.
 """
 
@@ -24,12 +24,12 @@ _HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", 
 
 
 class NotAPicture(Unreadable):
-    """A file with a picture's suffix is none or is damaged; the text is one sentence for the user."""
+    """A file with a picture's suffix is not a picture, or is damaged; the text is one sentence for the user."""
 
 
 @dataclass(slots=True)
 class Container:
-    """What a picture file says about itself.
+    """Kind, size and metadata of a picture file.
 
     Attributes:
         kind: "jpeg", "png", "webp", "tiff" or "bmp".
@@ -49,7 +49,7 @@ class Container:
 
 
 def read_container(path: Path) -> Container:
-    """Look into a picture file.
+    """Read a picture file's kind, size and metadata.
 
     Raises:
         NotAPicture: empty, unreadable, of another type, or cut off.
@@ -60,7 +60,7 @@ def read_container(path: Path) -> Container:
         raise NotAPicture(f"the file cannot be opened ({error.strerror}); check its permissions") from None
     try:
         state = os.fstat(fd)
-        if not stat.S_ISREG(state.st_mode):  # reading a named pipe would wait for ever
+        if not stat.S_ISREG(state.st_mode):  # reading from a named pipe could block for ever
             raise NotAPicture("this is not a file but a pipe or a device; copy the picture itself here")
         size = state.st_size
         head = os.read(fd, _HEAD)

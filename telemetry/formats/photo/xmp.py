@@ -1,6 +1,6 @@
-"""XMP of drone cameras: properties by their names, whether they are written as attributes or as elements.
+"""XMP of drone cameras: properties by name, written as attributes or as elements.
 
-Only flat properties are needed, so the packet is searched, not parsed: a damaged one still gives what it has.
+Only flat properties are needed, so the packet is searched, not parsed: a damaged packet still gives what it contains.
 Sources: DJI, Parrot and Pix4D ("Camera" name space; senseFly, MicaSense, Autel and Sequoia write it) manuals.
 """
 
@@ -63,7 +63,7 @@ def _structure(packet: bytes, name: bytes) -> dict[str, str]:
 
 
 def number(found: Properties, *names: str) -> float | None:
-    """The first of several properties that is a finite number ("+12.30", "1/2" and "12,5" are understood)."""
+    """The first of several properties that is a finite number ("+12.30", "1/2" and "12,5" are accepted)."""
     for name in names:
         value = found.get(name)
         if value is None:

@@ -4,7 +4,8 @@ A line with the projection ("EPSG:4326", a PROJ string, "WGS84 UTM 17N"), then, 
 
     name x y [z] [yaw] [pitch] [roll] [horizontal accuracy] [vertical accuracy] [anything else]
 
-z is an absolute altitude. Pitch is 0 at nadir in some files and -90 in others; the file's own values decide. Angles of
+z is an absolute altitude. Pitch is 0 at nadir in some files and -90 in others, which is decided by the file's values.
+Angles of
 0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "Image Geolocation Files".
 """
 
@@ -21,7 +22,7 @@ _MOST_NUMBERS = 8
 
 
 def is_geo_txt(path: Path) -> bool:
-    """Whether a text file looks like ODM's geo.txt: by its name or by a projection in its first line."""
+    """Whether a text file is ODM's geo.txt, by its name or by a projection in its first line."""
     if path.suffix.lower() != ".txt":
         return False
     try:
@@ -109,7 +110,7 @@ def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
 
 
 def _fields(line: str) -> tuple[str | None, list[float]]:
-    """Name and the numbers after it; a name with blanks ends where its suffix does."""
+    """Name and the numbers after it; a name with blanks ends with its suffix."""
     words = line.split()
     ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
     first = next(ends, 0) + 1

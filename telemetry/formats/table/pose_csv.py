@@ -1,10 +1,10 @@
-"""Tables of poses with a header, of this program and of others; and Pix4D's, which has none.
+"""Tables of poses with a header, of this and other programs; and Pix4D's, which has no header.
 
 | program | recognised by | coordinates | angles |
 |---|---|---|---|
 | this one | `lat_deg`, `lon_deg` | degrees | pitch -90 at nadir |
 | Metashape, reference | `X/Longitude` or `X/Easting` | degrees, or metres with `#CoordinateSystem` | pitch 0 at nadir |
-| Metashape and Pix4D, calibrated cameras | `Omega`, `Phi`, `Kappa` | as above; `.prj` beside | x, y, z axes |
+| Metashape and Pix4D, calibrated cameras | `Omega`, `Phi`, `Kappa` | as above; `.prj` next to it | x, y, z axes |
 | | (Metashape: `PhotoID` without a suffix, commas in the header, tabs below) | | |
 | Mission Planner, location.txt | `latitude/Y` | degrees | the airframe's, camera fixed under it |
 | ExifTool -csv | `SourceFile` | degrees, also as text | the gimbal's |
@@ -63,13 +63,13 @@ _PIX4D_COLUMNS = {
 
 
 def read_pose_csv(path: Path) -> PoseTable | None:
-    """Read a table of poses; None where it is none (some other text).
+    """Read a table of poses; None if the file is some other text.
 
     Raises:
-        InputError: it is one, and cannot be read: no projection, too large.
+        InputError: it is a table of poses that cannot be read: no projection, too large.
     """
     try:
-        with path.open("rb") as handle:  # most tables beside pictures are none of poses, and may be large
+        with path.open("rb") as handle:  # most tables next to pictures are not tables of poses, and may be large
             head = handle.read(_HEAD_BYTES).decode("utf-8-sig", "replace").replace("\0", "").splitlines()
     except OSError:
         return None
@@ -101,7 +101,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _column(cell: str) -> str:
-    """What a column's title stands for, "" if nothing here: without units, comment marks and capitals."""
+    """The field that a column's title names, "" if unknown; units, comment marks and capitals are ignored."""
     text = re.sub(r"\[.*?\]|\(.*?\)", "", cell).strip().lstrip("#").strip().lower()
     return _COLUMNS.get(re.sub(r"[\s_]+", "_", text).strip("_"), "")
 
@@ -136,7 +136,7 @@ def _read(path: Path, header_at: int, separator: str, header: Sequence[str], tit
             named = _row(header, cells)
             if named is not None:
                 table[named[0]] = named[1]
-    except csv.Error:  # a cell without end: nothing after it can be told apart
+    except csv.Error:  # an unterminated quoted cell: nothing after it can be separated
         pass
     if "lat_deg" not in header:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)
@@ -150,7 +150,7 @@ def _read(path: Path, header_at: int, separator: str, header: Sequence[str], tit
 
 
 def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
-    """Of coordinates x and y: named in the table, in a .prj beside it, or degrees by their range."""
+    """Of coordinates x and y: named in the table, in a .prj next to it, or degrees by their range."""
     for line in before:
         match = _COORDINATE_SYSTEM.match(line)
         if match:
@@ -162,7 +162,7 @@ def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
     if places and all(abs(x) <= 180.0 and abs(y) <= 90.0 for x, y in places):
         return "EPSG:4326"
     raise InputError(
-        f"{path.name} does not name the projection of its coordinates; put its .prj beside it, or write a geo.txt"
+        f"{path.name} does not name the projection of its coordinates; put its .prj next to it, or write a geo.txt"
     )
 
 
@@ -207,7 +207,7 @@ def _number(cell: str) -> float | None:
 
 
 def _time(written: str) -> float | None:
-    """Epoch seconds; None where it is none."""
+    """Epoch seconds; None if it is not a time."""
     try:
         value = float(written)
     except ValueError:
@@ -217,7 +217,7 @@ def _time(written: str) -> float | None:
 
 
 def names_pictures(path: Path) -> bool:
-    """Whether the first lines of a text name picture files: then somebody meant it for them."""
+    """Whether the first lines of a text name picture files, so that it is probably meant for them."""
     try:
         with path.open("rb") as handle:
             words = re.split(r"[\s,;\"']+", handle.read(_HEAD_BYTES).decode("utf-8", "replace"))

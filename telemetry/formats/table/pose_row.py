@@ -1,4 +1,4 @@
-"""What a table says about pictures, whichever program wrote it."""
+"""Poses of pictures from a table, in a common form."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ MOST_BYTES = 256 << 20
 
 @dataclass(slots=True)
 class PoseRow:
-    """What a table says about one picture; None where it says nothing."""
+    """A table's values for one picture; None where it has none."""
 
     lat_deg: float | None = None
     lon_deg: float | None = None
@@ -29,7 +29,7 @@ class PoseTable(dict[str, PoseRow]):
     """Lower-case picture name (or relative path with forward slashes) -> row.
 
     Attributes:
-        useless: lines that name a picture and give no position that can be one.
+        useless: number of lines that name a picture without a valid position.
     """
 
     useless: int = 0
@@ -41,7 +41,7 @@ def lookup(table: PoseTable, relative: str) -> PoseRow | None:
 
 
 def names_of(relative: str) -> tuple[str, str, str]:
-    """What a table may call a picture whose path relative to the table's folder is this: the path, name, stem."""
+    """Names that a table may use for a picture at this path relative to the table's folder: path, name, stem."""
     path = relative.lower()
     name = path.rsplit("/", 1)[-1]
     return path, name, name.rsplit(".", 1)[0]
@@ -62,7 +62,7 @@ def read_text(path: Path) -> str:
 
 
 def pitch_by_value(table: PoseTable) -> None:
-    """Bring pitch to -90 looking straight down: some programs count from nadir, which the usual value shows."""
+    """Convert pitch to -90 at nadir: some programs count from nadir, which the median value shows."""
     pitches = sorted(r.pitch_deg for r in table.values() if r.pitch_deg is not None)
     if pitches and pitches[len(pitches) // 2] > -45.0:
         for row in table.values():

@@ -1,1 +1,1 @@
-"""Metadata inside and beside videos: SEI, KLV, djmd, subtitles."""
+"""Metadata in videos and next to them: SEI, KLV, djmd, subtitles."""

@@ -1,4 +1,4 @@
-"""H.264 and H.265 byte streams as far as SEI needs them: NAL units, emulation prevention, SEI messages.
+"""The parts of H.264 and H.265 byte streams needed for SEI: NAL units, emulation prevention, SEI messages.
 
 Sources: ITU-T H.264 (7.3.1, 7.3.2.3, annex B), H.265 (7.3.1, 7.3.5), ISO/IEC 14496-15 for length prefixes.
 """
@@ -16,7 +16,7 @@ MAX_PAYLOAD = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class StreamFormat:
-    """How NAL units lie in a packet.
+    """Framing of NAL units in a packet.
 
     Attributes:
         codec: "h264" or "hevc". prefix: bytes of the length before each unit, 0 for Annex B start codes.
@@ -117,7 +117,7 @@ def escape(data: bytes) -> bytes:
 def sei_messages(packet: bytes, form: StreamFormat) -> list[tuple[int, bytes]]:
     """Payload type and payload of every SEI message in a packet, at most MAX_MESSAGES; damage ends a unit's list.
 
-    The suffix SEI of H.265 follows the slices, so all of a packet is looked through there.
+    In H.265 a suffix SEI follows the slices, so the complete packet is searched.
     """
     found: list[tuple[int, bytes]] = []
     for start, end in nal_units(packet, form):
@@ -147,7 +147,7 @@ def _messages(body: bytes) -> list[tuple[int, bytes]]:
 
 
 def _run(body: bytes, at: int) -> tuple[int, int]:
-    """A number written as a run of 255 and a last byte, and where it ends."""
+    """A number coded as a run of 255 and a last byte, and the offset after it."""
     total, size = 0, len(body)
     while at < size and body[at] == 0xFF:
         total += 255
@@ -164,7 +164,7 @@ def sei_unit(kind: int, payload: bytes, form: StreamFormat) -> bytes:
 
 
 def insert_unit(packet: bytes, unit: bytes, form: StreamFormat) -> bytes:
-    """A packet with a NAL unit put right before its first slice (or at its end if it has none)."""
+    """The packet with a NAL unit inserted before its first slice (or at its end if it has none)."""
     at = len(packet)
     for start, _ in nal_units(packet, form):
         if form.is_picture(form.kind(packet[start])):

@@ -85,7 +85,7 @@ def _scaled(fields: Fields, number: int, scale: float) -> float | None:
 
 
 def read_djmd(data: bytes) -> Sample | None:
-    """Pose of one message; None where it holds none (action cameras without GPS, other data). Never raises."""
+    """Pose of one message; None if it has none (action cameras without GPS, other data). Never raises."""
     body = _inner(parse_message(data), 3)
     if not body:
         return None
@@ -113,7 +113,7 @@ def read_djmd(data: bytes) -> Sample | None:
         roll_deg=_scaled(gimbal, 2, 0.1),
         yaw_deg=_scaled(gimbal, 3, 0.1),
     )
-    # Protobuf leaves out zeros: with a gimbal or an airframe at all, a missing angle is zero.
+    # Protobuf omits zeros: where a gimbal or an airframe is present, a missing angle is zero.
     if gimbal:
         sample.pitch_deg, sample.roll_deg, sample.yaw_deg = (
             v or 0.0 for v in (sample.pitch_deg, sample.roll_deg, sample.yaw_deg)

@@ -33,7 +33,7 @@ def is_gpmf(data: bytes) -> bool:
 
 
 def read_gpmf(data: bytes) -> list[Sample]:
-    """Positions of one packet in order, evenly spread over its duration; empty where it holds none. Never raises."""
+    """Positions of one packet in order, evenly spread over its duration; empty if it has none. Never raises."""
     samples: list[Sample] = []
     for stream in _streams(data, 0):
         entries = {entry.key: entry for entry in stream}

@@ -1,7 +1,7 @@
 """MISB KLV metadata: ST 0601 local sets and EG 0104 universal sets, to samples.
 
 Packets are found by their 16-byte keys, so it does not matter whether a transport stream carries them
-asynchronously (bare) or synchronously (with access unit headers), nor how many lie in one packet.
+asynchronously (bare) or synchronously (with access unit headers), nor how many are in one packet.
 Sources: MISB ST 0601.17, EG 0104.5, ST 0107 (BER), SMPTE 336M. Latitudes are WGS 84, angles degrees.
 """
 
@@ -25,8 +25,8 @@ class Packet:
     """One KLV packet.
 
     Attributes:
-        kind: "ST 0601" or "EG 0104". sample: its pose, None where it has none or is damaged.
-        error: why it was refused, "" if it was not. values: what was read, by name.
+        kind: "ST 0601" or "EG 0104". sample: its pose, None if it has none or is damaged.
+        error: why it was refused, "" if it was not. values: the values read, by name.
     """
 
     kind: str
@@ -36,7 +36,7 @@ class Packet:
 
 
 def packets(data: bytes) -> Iterator[Packet]:
-    """Every ST 0601 and EG 0104 packet in a run of bytes; damaged ones come with their reason. Never raises."""
+    """Every ST 0601 and EG 0104 packet in a run of bytes; damaged ones with the reason. Never raises."""
     at = data.find(_PREFIX)
     while at >= 0:
         kind = _kind(data[at : at + 16])
@@ -63,7 +63,7 @@ def _kind(key: bytes) -> str | None:
 
 
 def ber_length(data: bytes, at: int) -> tuple[int | None, int]:
-    """A BER length (short or long form) and where it ends; None where it is damaged."""
+    """A BER length (short or long form) and the offset after it; None if damaged."""
     if at >= len(data):
         return None, at
     first = data[at]

@@ -7,7 +7,7 @@ A decoder of your own: a callable from the payload to a `Sample` (or None), regi
 
 or named in the entry point group `orthoswarm.sei` of a package, as an object of type `Decoder`. For payload type 5
 (user_data_unregistered) the function gets what follows the UUID, for other types the whole payload. It need not
-guard against damaged bytes: what it raises counts as "not understood".
+guard against damaged bytes: an exception counts as "not understood".
 
 Our payload, type 5, UUID 0470547e-ac27-4f00-856a-5455b0eaf430, big-endian:
 
@@ -21,7 +21,7 @@ Our payload, type 5, UUID 0470547e-ac27-4f00-856a-5455b0eaf430, big-endian:
     92      n     vehicle's id, UTF-8
     92 + n  4     CRC-32 (zlib) of all before it, from the version on
 
-A later version may append fields before the CRC; readers take what they know.
+A later version may append fields before the CRC; readers ignore fields that they do not know.
 """
 
 import calendar
@@ -81,7 +81,7 @@ def _load_entry_points() -> None:
     for point in entry_points(group=ENTRY_POINTS):
         try:
             decoder = point.load()
-        except Exception:  # a user's broken plug-in must not stop the reading of everything else
+        except Exception:  # a user's broken plug-in must not stop the reading of other messages
             continue
         if isinstance(decoder, Decoder):
             register(decoder)
@@ -89,14 +89,14 @@ def _load_entry_points() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the SEI messages of one picture said: the sample, and which decoders it came from."""
+    """The content of the SEI messages of one picture: the sample, and the decoders that gave it."""
 
     sample: Sample
     decoders: tuple[str, ...]
 
 
 def read(messages: Iterable[tuple[int, bytes]]) -> Reading | None:
-    """Read a picture's SEI messages; None where none is recognised (an encoder's settings are not)."""
+    """Read a picture's SEI messages; None if none is recognised (an encoder's settings are not)."""
     _load_entry_points()
     merged: Sample | None = None
     names: list[str] = []
@@ -111,7 +111,7 @@ def read(messages: Iterable[tuple[int, bytes]]) -> Reading | None:
             sample = None
         if sample is not None:
             names.append(decoder.name)
-            # A message with a position is worth more than a bare time stamp.
+            # A message with a position takes precedence over one with only a time.
             if merged is None:
                 merged = sample
             elif sample.has_position and not merged.has_position:
@@ -130,7 +130,7 @@ _ENCODER_SETTINGS = frozenset(
 
 
 def unknown(messages: Iterable[tuple[int, bytes]]) -> list[tuple[str, int]]:
-    """UUID and payload size of each private message that no decoder knows; an encoder's settings are none."""
+    """UUID and payload size of each private message without a decoder; an encoder's settings are not counted."""
     found = []
     for kind, payload in messages:
         if kind == USER_DATA_UNREGISTERED and len(payload) >= 16 and payload[:16] not in _ENCODER_SETTINGS:
@@ -176,8 +176,9 @@ def _decode_ours(body: bytes) -> Sample | None:
 def _decode_misb_time(body: bytes) -> Sample | None:
     """MISB ST 0604 precision time stamp: status, then 8 bytes with FF between the pairs.
 
-    Micro- or nanoseconds by the UUID, but real encoders write nanoseconds under the microseconds' one: what would
-    be later than the year 4000 in microseconds is taken as nanoseconds.
+    The UUID names micro- or nanoseconds, but real encoders write nanoseconds under the UUID of microseconds: a value
+    that would
+    be later than the year 4000 in microseconds is read as nanoseconds.
     """
     value = _misb_integer(body)
     if value is None:
@@ -248,7 +249,7 @@ def _dji_pose(value: bytes, sample: Sample) -> bool:
     sample.lat_deg = home_lat + metres[0] / degree_m
     sample.lon_deg = home_lon + metres[1] / (degree_m * math.cos(math.radians(home_lat)))
     sample.altitude_m = -metres[2]
-    sample.height_m = -metres[2] + home_altitude / 1000.0  # home altitude is stored with its sign turned
+    sample.height_m = -metres[2] + home_altitude / 1000.0  # home altitude is stored with the opposite sign
     sample.yaw_deg = yaw * 1e-7
     sample.pitch_deg = tilt * 1e-7 - 90.0
     sample.roll_deg = roll * 1e-7

@@ -1,4 +1,4 @@
-"""A maker's private SEI message, described in a file instead of code.
+"""A manufacturer's private SEI message, described by a file instead of code.
 
 A TOML file:
 
@@ -28,10 +28,10 @@ _FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.
 
 
 def read_sei_layout(path: Path) -> Decoder:
-    """A decoder for the message that a file describes.
+    """A decoder for the message described by a file.
 
     Raises:
-        InputError: the file cannot be read, or describes no message; says which entry is wrong.
+        InputError: the file cannot be read, or does not describe a message; names the wrong entry.
     """
     try:
         entries = tomllib.loads(path.read_text("utf-8"))

@@ -1,6 +1,6 @@
-"""DJI subtitles: telemetry in an SRT file beside a video, or in a subtitle track within it.
+"""DJI subtitles: telemetry in an SRT file next to a video, or in its subtitle track.
 
-At least six layouts are in the field. They are told apart by what stands in each block, not by model:
+At least six layouts are in use. They are distinguished by the content of each block, not by model:
 
     [latitude: 41.42] [longitude: 2.23] [rel_alt: 1.3 abs_alt: 117.0] [gb_yaw: 90 gb_pitch: -90 gb_roll: 0]
     GPS(36.6146,-6.1120,0.0M) BAROMETER:0.3M                                      latitude first
@@ -9,8 +9,8 @@ At least six layouts are in the field. They are told apart by what stands in eac
     GPS (8.2090, 47.4692, 18), D 49.21m, H 45.60m, H.S ..., V.S ...               longitude first
     (no position at all)
 
-The order of a GPS tuple is settled for the whole file: by range, by the distance to HOME that is written beside it,
-else by layout. `altitude` is kept apart from heights, because models differ in what they mean by it.
+The order of a GPS tuple is determined once per file: by range, by the distance to HOME written in the same block,
+else by layout. `altitude` is not used as a height, because its meaning differs between models.
 """
 
 import math
@@ -42,7 +42,7 @@ _COUNT = re.compile(r"\b(?:FrameCnt|SrtCnt)\s*:\s*(\d{1,9})")
 
 @dataclass(slots=True)
 class Cue:
-    """One block: from and to in seconds of the video, and what it says (None where it says nothing)."""
+    """One block: start and end in seconds of the video, and its sample (None if it has none)."""
 
     start_s: float
     end_s: float
@@ -51,11 +51,11 @@ class Cue:
 
 @dataclass(slots=True)
 class Subtitles:
-    """What was read of a file.
+    """The content of an SRT file.
 
     Attributes:
         cues: in order of the file. latitude_first: order of the GPS tuples, None where there are none.
-        notes: what is odd, one sentence each, by code.
+        notes: irregularities by code, one sentence each.
     """
 
     cues: list[Cue] = field(default_factory=list)
@@ -71,7 +71,7 @@ class _Raw:
 
 
 def read_srt(path: Path) -> Subtitles:
-    """Read an SRT file; what cannot be understood is left out.
+    """Read an SRT file; blocks that are not understood are left out.
 
     Raises:
         OSError: the file cannot be read.
@@ -105,7 +105,7 @@ def _blocks(text: str) -> Iterator[_Raw]:
 
 
 def _undated_blocks(text: str) -> Iterator[_Raw]:
-    """Blocks of a file without cue times: placed by the dates in them, from the first one on."""
+    """Blocks of a file without cue times, timed by their dates relative to the first one."""
     first: float | None = None
     for block in re.split(r"\n\s*\n", text.replace("\r", "")):
         date = _DATE.search(block)
