@@ -318,8 +318,6 @@ class Daemon:
     def vehicles(self) -> list[dict[str, Any]]:
         """All vehicles that were heard or sent pictures, as JSON values."""
         linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
-        for vehicle, takeoff in ({} if self.takeoffs is None else self.takeoffs.rows()).items():
-            linked.setdefault(vehicle, {"id": vehicle})["takeoff"] = takeoff
         return views.vehicle_rows(
             self.journal, self.settings.vehicles, self.sources, linked, self.buses, self.poses.origins()
         )

@@ -39,7 +39,7 @@ class Takeoffs:
         self._names: dict[int, str] = {}
         self._failed: dict[str, str] = {}
         self._checking = self._closed = False
-        links.cancel_takeoff = self.cancel
+        links.cancel_takeoff, links.takeoffs = self.cancel, self.rows
 
     def preflight(
         self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None, **limits: float | None

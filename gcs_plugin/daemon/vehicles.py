@@ -79,6 +79,7 @@ class VehicleLinks:
         traffic: other aircraft that vehicles have heard of.
         latest: the rows of `rows` when they were last watched, at most half a second ago.
         cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
+        takeoffs: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class VehicleLinks:
         self._stop = threading.Event()
         self.latest: list[dict[str, Any]] = []
         self.cancel_takeoff: Callable[[str], float | None] = lambda _: None
+        self.takeoffs: Callable[[], Mapping[str, dict[str, Any]]] = dict
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
@@ -145,13 +147,14 @@ class VehicleLinks:
         raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
 
     def rows(self) -> list[dict[str, Any]]:
-        """All vehicles on the links as JSON values."""
+        """All vehicles on the links as JSON values; `takeoff` of each is None where none waits or failed."""
 
         def collect() -> list[dict[str, Any]]:
             now = time.monotonic()
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
-        return self.fleet.call(collect).result(5.0)
+        takeoffs = self.takeoffs()
+        return [row | {"takeoff": takeoffs.get(row["id"])} for row in self.fleet.call(collect).result(5.0)]
 
     @staticmethod
     def clock() -> float:

@@ -148,11 +148,11 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     assert answer.json()["takeoffs_in_s"] == {
         v: pytest.approx(t - min(starts.values()), abs=0.1) for v, t in starts.items()
     }
-    waiting = served.until("/api/vehicles", lambda rows: [r for r in rows if "takeoff" in r])
-    assert [r["id"] for r in waiting if "takeoff" in r and r["takeoff"]["in_s"] > 1.0] == [later]
+    waiting = served.until("/api/vehicles", lambda rows: [r for r in rows if r["takeoff"]])
+    assert [r["id"] for r in waiting if r["takeoff"] and r["takeoff"]["in_s"] > 1.0] == [later]
     assert "under way" in served.command(go).json()["detail"]
     served.until("/api/vehicles", lambda rows: sum(r["mission"]["phase"] == "active" for r in rows) == 1)
     assert "cancelled" in served.command(f"/api/missions/{later}/rtl").json()["reason"]
     served.until("/api/completions", lambda rows: len(rows) == 1)  # and the other one stays on the ground
     rows = {r["id"]: r for r in served.get("/api/vehicles").json()}
-    assert "takeoff" not in rows[later] and not rows[later]["armed"]
+    assert rows[later]["takeoff"] is None and not rows[later]["armed"]

@@ -57,6 +57,14 @@ def test_no_press_is_lost_while_96_vehicles_send(browser):
         press(page, 60, 40)
 
 
+def test_a_takeoff_that_was_waited_for_is_over_once_the_daemon_no_longer_names_it(browser):
+    with standing(vehicle(1, takeoff={"in_s": 4.0})) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".word:has-text('takes off in')")
+        station.gets["/api/vehicles"] = [vehicle(1)]
+        send(page, {"type": "vehicle_event", "vehicle": "v1", "kind": "armed"})
+        page.wait_for_selector(".word:has-text('on mission 7/13')")
+
+
 @pytest.mark.slow
 def test_a_thousand_presses_arrive(browser):
     with standing(*many()) as station, opened(browser, station.url) as page:

@@ -11,18 +11,18 @@ import { heardCommand } from "/static/fly/commands.js";
 const HEALTH_MS = 5000;
 const list = (value) => (Array.isArray(value) ? value : []);
 
-const takeVehicle = guarded("a vehicle", (message) => {
+const takeVehicle = guarded("a vehicle", (message, whole) => {
   const id = message?.id == null ? "" : String(message.id);
   if (!id) return;
   if (!state.vehicles.has(id) && message.state === undefined) { soon("/api/vehicles"); return; } // only what has changed of one not known yet
-  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), performance.now()));
+  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), performance.now(), whole === true));
   changed("vehicles");
 });
 const takeTraffic = (rows) => { state.traffic = list(rows).map(aircraft).filter((row) => row.id && row.position); changed("traffic"); };
 const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); changed("jobs"); } };
 
 const READS = {
-  "/api/vehicles": (rows) => list(rows).forEach(takeVehicle),
+  "/api/vehicles": (rows) => list(rows).forEach((row) => takeVehicle(row, true)),
   "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
   "/api/jobs": (rows) => list(rows).forEach(takeJob),
   "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },

@@ -33,9 +33,10 @@ export function messages(list) {
     : { text: text(object(m).text, 300), time: number(object(m).time), severity: number(object(m).severity, 0, 7) ?? 6 })).filter((m) => m.text);
 }
 
-// A vehicle as the page keeps it. `before` keeps what this message leaves out: its name, trail and counts.
-export function vehicle(message, before, now) {
-  const row = { ...(before?.raw ?? {}), ...message };
+// A vehicle as the page keeps it. Messages hold what has changed, so that `before` gives the rest; a whole row replaces
+// it, and what that leaves out is over.
+export function vehicle(message, before, now, whole = false) {
+  const row = { ...(whole ? {} : before?.raw ?? {}), ...message };
   const moved = position(row.lon_deg, row.lat_deg);
   const trail = Array.isArray(message.trail) ? points(message.trail) : (before?.trail ?? []);
   if (moved && !Array.isArray(message.trail)) extend(trail, moved);
