@@ -20,10 +20,11 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
+from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
 from orthoswarm.coverage.coverage_files import write_gaps
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, State
 from orthoswarm.coverage.gaps import PlannedFlight, find_gaps
-from orthoswarm.coverage.missing_pictures import missing_pictures
+from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import LocalGrid
@@ -51,12 +52,23 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class Flown:
+    """What a flight gave: the pictures that arrived, the camera events, and numbers of the pictures that did not."""
+
+    shots: list[Shot]
+    events: list[CameraEvent]
+    not_arrived: set[str]
+
+
+@dataclass(frozen=True)
 class Outcome:
     """One flight: shares of the area.
 
     Attributes:
         faults: what happened. seen: said to be seen. falsely_seen: said so and not true. falsely_missed: said to be
             missed though a true camera saw it well. doubtful: said to be seen poorly though it was seen well.
+        named: share of the pictures behind a dead link that were listed by their number (1 without any).
+        misnamed: pictures listed so that were not taken.
         after: truly seen well after the gap flights. pictures: how many. ms: time a picture, milliseconds of CPU.
     """
 
@@ -65,6 +77,8 @@ class Outcome:
     falsely_seen: float
     falsely_missed: float
     doubtful: float
+    named: float
+    misnamed: int
     after: float
     pictures: int
     ms: float
@@ -80,7 +94,8 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     vehicles = int(rng.integers(2, 5))
     plan = plan_area(area, vehicles, height, foot)
     true_fov = fov_deg * (rng.uniform(0.6, 0.8) if "narrow lens" in faults else rng.uniform(1.0, 1.1))
-    shots = _fly(plan, area.grid, rng, faults, true_fov)
+    flown = _fly(plan, area.grid, rng, faults, true_fov)
+    shots = flown.shots
     cells = Cells.of_area(EPSG, area.ground, area.no_fly)
     cover = CoverageGrid(cells)
     views = [s.view for s in shots]
@@ -92,13 +107,17 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     said = cover.states()
     wanted = cells.wanted
     solved = footprint(height, math.radians(true_fov * 0.996))
-    after = _fly_gaps(plan, cover, truth, solved, rng, true_fov, foot)
+    missing = missing_by_events(cover.views, flown.events).pictures
+    listed = {m.view.image for m in missing if m.cause is Cause.NOT_ARRIVED}
+    after = _fly_gaps(plan, cover, truth, solved, rng, true_fov, foot, flown.events)
     return Outcome(
         faults=faults,
         seen=float((said == State.SEEN)[wanted].mean()),
         falsely_seen=float(((said == State.SEEN) & ~truth)[wanted].mean()),
         falsely_missed=float(((said == State.MISSED) & truth)[wanted].mean()),
         doubtful=float(((said == State.POOR) & truth)[wanted].mean()),
+        named=len(listed & flown.not_arrived) / max(1, len(flown.not_arrived)) if flown.not_arrived else 1.0,
+        misnamed=len(listed - flown.not_arrived),
         after=after,
         pictures=len(shots),
         ms=1e3 * spent,
@@ -119,19 +138,25 @@ def _area(rng: np.random.Generator, side_m: float) -> Area:
 
 def _fly(
     plan: Plan, grid: LocalGrid, rng: np.random.Generator, faults: tuple[str, ...], fov_deg: float, first: int = 0
-) -> list[Shot]:
-    """Pictures of a plan's legs; faults hit the first vehicle, wind all of them."""
+) -> Flown:
+    """Pictures of a plan's legs; faults hit the first vehicle, wind all of them.
+
+    Behind a dead link pictures are taken and do not arrive; their camera events come over the vehicle's other link.
+    """
     lens = Lens(_WIDTH, _HEIGHT, focal_px(math.radians(fov_deg), _WIDTH))
     believed = Lens(_WIDTH, _HEIGHT, lens.focal_px * (1.0 + 0.001 * rng.standard_normal()))
     wind = rng.uniform(0.0, 2.0 * np.pi)
-    shots, number = [], first
+    shots: list[Shot] = []
+    events: list[CameraEvent] = []
+    not_arrived: set[str] = set()
+    number = first
     for vehicle in plan.vehicles:
         hit = vehicle.number == 1
         legs = [leg for s in vehicle.sorties for leg in s.legs]
         lost = int(rng.integers(0, len(legs))) if hit and "lost vehicle" in faults else len(legs)
         dead = int(rng.integers(0, len(legs))) if hit and "dead link" in faults else len(legs)
         cut = int(rng.integers(0, len(legs))) if hit and "cut leg" in faults else -1
-        for k, leg in enumerate(legs[: min(lost, dead)]):
+        for k, leg in enumerate(legs[:lost]):
             ends = grid.to_grid([w.lat_deg for w in leg], [w.lon_deg for w in leg])
             way = ends[1] - ends[0]
             length = float(np.hypot(*way))
@@ -163,8 +188,13 @@ def _fly(
                     placed, f"DJI_{number:05d}.JPG", vehicle.id, sigma, 10.0 * number, focal_sigma=0.001,
                     flaws=NO_FLAW if sharp else Flaw.BLURRED,
                 )  # fmt: skip
-                shots.append(Shot(true, view, sharp))
-    return shots
+                at_m = np.array([*(at[:2] + rng.normal(0.0, 1.0, 2)), 0.0])
+                events.append(CameraEvent(vehicle.id, number, 10.0 * number + float(rng.normal(0.0, 0.5)), at_m))
+                if k < dead:
+                    shots.append(Shot(true, view, sharp))
+                else:
+                    not_arrived.add(f"event {number}")
+    return Flown(shots, events, not_arrived)
 
 
 def _truly_seen(cells: Cells, shots: list[Shot]) -> NDArray[np.bool_]:
@@ -191,7 +221,7 @@ def _truly_seen(cells: Cells, shots: list[Shot]) -> NDArray[np.bool_]:
 
 def _fly_gaps(
     plan: Plan, cover: CoverageGrid, truth: NDArray[np.bool_], solved: Footprint, rng: np.random.Generator,
-    fov_deg: float, planned: Footprint,
+    fov_deg: float, planned: Footprint, events: list[CameraEvent],
 ) -> float:  # fmt: skip
     """Fly gaps without further faults until none is left; returns the share that was truly seen in the end."""
     cells, grid = cover.cells, LocalGrid(EPSG)
@@ -201,9 +231,8 @@ def _fly_gaps(
     legs = grid.to_grid(places[..., 0], places[..., 1])
     fov = 2.0 * math.atan(0.5 * planned.width_m / plan.altitude_m)
     for _ in range(_ROUNDS):
-        gaps = find_gaps(
-            cover, missing_pictures(cover.views), PlannedFlight(legs, planned.width_m, planned.height_m, fov)
-        )
+        missing = missing_by_events(cover.views, events).pictures
+        gaps = find_gaps(cover, missing, PlannedFlight(legs, planned.width_m, planned.height_m, fov))
         if not gaps.gaps:
             break
         with tempfile.TemporaryDirectory() as folder:
@@ -211,9 +240,10 @@ def _fly_gaps(
             found = read_gaps(Path(folder) / "gaps.geojson")
         target = gap_area(found, [], solved, fly_not_arrived=True).area
         again = plan_gaps(replace(target, no_fly=shapely.MultiPolygon()), 2, plan.altitude_m, solved, Options())
-        shots = _fly(again, grid, rng, (), fov_deg, len(cover.views) * 10)
-        cover.put(s.view for s in shots)
-        seen |= _truly_seen(cells, shots)
+        flown = _fly(again, grid, rng, (), fov_deg, len(cover.views) * 10)
+        cover.put(s.view for s in flown.shots)
+        seen |= _truly_seen(cells, flown.shots)
+        events = [*events, *flown.events]
     return float(seen[wanted].mean())
 
 
@@ -241,6 +271,8 @@ def main() -> None:
         "worst_falsely_seen": max(r.falsely_seen for r in rows),
         "worst_falsely_missed": max(r.falsely_missed for r in rows),
         "mean_doubtful": float(np.mean([r.doubtful for r in rows])),
+        "least_named": min(r.named for r in rows),
+        "misnamed": sum(r.misnamed for r in rows),
         "least_after": min(r.after for r in rows),
         "below_999_after": sum(r.after < 0.999 for r in rows),
         "mean_ms_a_picture": float(np.mean([r.ms for r in rows])),

@@ -20,6 +20,8 @@ _MATCH_SHARE = 0.45
 _LEAST_MATCHED = 0.5
 """Share of a vehicle's pictures that must have an event: else its clocks disagree, and the events say nothing."""
 _SURE = 0.95
+_BORROWED_LENS = 0.6
+"""Confidence in what a vehicle has seen of which no picture has arrived: its lens is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +89,25 @@ def missing_by_events(
         found += [
             h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=_SURE) for h in holes
         ]
+    for vehicle in sorted(set(by_vehicle) - set(rows)):
+        found += _none_arrived(vehicle, by_vehicle[vehicle], views)
     return Missing(found, warnings)
+
+
+def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[View]) -> list[MissingPicture]:
+    """The pictures of a vehicle of which none has arrived, each seen as by the nearest picture of another vehicle."""
+    if not views:
+        return []
+    places = np.array([view.position[:2] for view in views])
+    found = []
+    for event in events:
+        if event.position is None:
+            continue
+        near = views[int(np.hypot(*(places - event.position[:2]).T).argmin())]
+        place = np.array([*event.position[:2], near.position[2]])
+        view = replace(near.moved_to(place, f"event {event.number}", event.time_s), vehicle=vehicle)
+        found.append(MissingPicture(view, "", Cause.NOT_ARRIVED, _BORROWED_LENS))
+    return found
 
 
 def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[CameraEvent]:

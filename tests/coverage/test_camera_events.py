@@ -53,3 +53,12 @@ def test_events_of_another_time_are_not_used_and_that_is_said() -> None:
     views = _views()
     found = missing_by_events(views, _events(views, later_s=86_400.0))
     assert found.pictures == [] and "not at the times" in found.warnings[0]
+
+
+def test_a_vehicle_of_which_no_picture_has_arrived_is_listed_by_its_events() -> None:
+    views = _views()
+    silent = [CameraEvent("silent", e.number, e.time_s, e.position) for e in _events(views, lambda k: k < 12)]
+    found = missing_by_events(views, [*_events(views), *silent])
+    assert {(m.view.vehicle, m.cause) for m in found.pictures} == {("silent", Cause.NOT_ARRIVED)}
+    assert [m.view.image for m in found.pictures] == [f"event {100 + k}" for k in range(12)]
+    assert max(m.confidence for m in found.pictures) < 0.9  # its lens is not known
