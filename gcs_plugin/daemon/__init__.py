@@ -1,1 +1,1 @@
-"""The daemon: one process that ties missions, telemetry, pictures and mosaic together. It ties, it does not compute."""
+"""The daemon: one process that connects missions, telemetry, pictures and mosaic; computing is done by libraries."""

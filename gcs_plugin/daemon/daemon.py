@@ -1,4 +1,4 @@
-"""The daemon without its web server: owns the workspace, takes pictures and telemetry in, has maps made of them."""
+"""The daemon without its web server: owns the workspace, receives pictures and telemetry, has maps made from them."""
 
 import json
 import logging
@@ -67,18 +67,18 @@ class Daemon:
     """All of the daemon but HTTP.
 
     Attributes:
-        settings: what it was told. journal, store, layers, tiles, events, drawer, jobs: its parts.
+        settings: of the daemon. journal, store, layers, tiles, events, drawer, jobs: its parts.
         started: when, UTC epoch seconds.
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Take over a workspace and go on where the last daemon stopped.
+        """Open a workspace and continue where the last daemon stopped.
 
         Raises:
-            InputError: another daemon runs in the workspace, or the basemap is of no use.
+            InputError: another daemon runs in the workspace, or the basemap cannot be used.
             OrthoSwarmError: the workspace cannot be written.
         """
-        cv2.setNumThreads(1)  # its threads wait for cores that the daemon's own threads use
+        cv2.setNumThreads(1)  # its threads would compete with the daemon's own for cores
         self.settings, self.started = settings, time.time()
         self.events = Events()
         self._lock = take_over(settings.workspace)
@@ -193,7 +193,7 @@ class Daemon:
         ]
 
     def start(self) -> None:
-        """Begin to draw and to work."""
+        """Start drawing and processing."""
         if self.drawer.area is not None:
             self._area_changed(self.drawer.area)
         self.drawer.start()
@@ -214,7 +214,7 @@ class Daemon:
             bus.start()
 
     def close(self) -> None:
-        """Stop; what is under way goes on at the next start."""
+        """Stop; unfinished work continues at the next start."""
         self.jobs.give_up()
         self._close_sources()
         for bus in self.buses:
@@ -239,7 +239,7 @@ class Daemon:
         self._lock.close()
 
     def _close_sources(self) -> None:
-        """Stop all at once; one that waits for a silent or dead stream is left to its time-out, and takes nothing."""
+        """Stop all sources at once; one that waits for a silent stream ends at its time-out and stores nothing."""
         for source in self.sources:
             source.stop()
         end = time.monotonic() + _SOURCES_S
@@ -257,14 +257,14 @@ class Daemon:
     # -- pictures -------------------------------------------------------------------------------------------------
 
     def add_picture(self, pose: PostedPose, data: bytes) -> tuple[int, bool]:
-        """Take a picture in; when this returns it is safe on the disk.
+        """Store a picture; when this returns, it is safe on the disk.
 
         Returns:
-            The frame's number, and False if it was there already (the first one stays).
+            The frame's number, and False if it existed already (the first one stays).
 
         Raises:
             InputError: the file is not a picture.
-            OrthoSwarmError: the disk is full or gone; nothing was kept.
+            OrthoSwarmError: the disk is full or missing; nothing was stored.
         """
         came = time.time()
         key = frame_key(pose.vehicle, pose.image)
@@ -295,7 +295,7 @@ class Daemon:
         return seq, new
 
     def _with_fix(self, pose: PostedPose) -> PostedPose:
-        """The pose; where its receiver had no fix, with what the vehicle's link says about that moment."""
+        """The pose; if its receiver had no fix, with the values of the vehicle's link at that time."""
         if pose.has_fix or pose.time_s is None:
             return pose
         linked = linked_pose(pose.vehicle, pose.image, pose.time_s, self.poses.at(pose.vehicle, pose.time_s))
@@ -312,11 +312,11 @@ class Daemon:
     def frames(
         self, vehicle: str | None = None, since: float | None = None, limit: int | None = None
     ) -> list[dict[str, Any]]:
-        """Frames in the order in which they came, as JSON values; see the HTTP API."""
+        """Frames in the order of arrival, as JSON values; see the HTTP API."""
         return views.frame_rows(self.journal, vehicle, since, limit)
 
     def vehicles(self) -> list[dict[str, Any]]:
-        """All vehicles that were heard or sent pictures, as JSON values."""
+        """All vehicles that were heard or that sent pictures, as JSON values."""
         linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
         return views.vehicle_rows(
             self.journal, self.settings.vehicles, self.sources, linked, self.buses, self.poses.origins()
@@ -327,11 +327,11 @@ class Daemon:
         return views.leg_features(self.journal)
 
     def completions(self) -> list[dict[str, Any]]:
-        """When vehicles completed, and what followed."""
+        """Completions of vehicles and their results."""
         return completion_rows(self.journal)
 
     def _link_log(self, vehicle: str, out: Path) -> bool:
-        """Write what a vehicle has said on the links, in this run or before, into a log of its own."""
+        """Write a vehicle's packets on the links, of this and earlier runs, into its own log."""
         from gcs_plugin.daemon.intake.vehicle_log import write_link_log
 
         systems = {v.id: v.system for v in self.settings.vehicles}
@@ -349,7 +349,7 @@ class Daemon:
         return views.layer_rows(self.layers, self.tiles.basemap)
 
     def _anchor(self) -> Anchor | None:
-        """What says where the map lies before any picture does: the basemap, else the newest plan."""
+        """The location of the map before the first picture: the basemap, else the newest plan."""
         basemap = self.tiles.basemap
         if basemap is not None:
             return Anchor.of_ground("the basemap", basemap.epsg, basemap.bounds)
@@ -384,11 +384,11 @@ class Daemon:
         return [self.jobs.add("refine", name, sortie) for name, sortie in wanted]
 
     def _card_read(self, vehicle: str) -> None:
-        """A card was read after landing: a sortie that was complete before is refined with what its camera kept."""
+        """A memory card was read after landing: a sortie that was complete before is refined with its pictures."""
         self._refine_late(vehicle, self.sortie(vehicle))
 
     def _refine_late(self, vehicle: str, sortie: int) -> None:
-        """Pictures that came after their vehicle was refined (over a slow link) are laid beside the others."""
+        """Register pictures that arrived after their vehicle's refinement (over a slow link) to the others."""
         waits = self.journal.one(
             "SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = ? AND sortie = ? AND state = 'queued'",
             (packed(vehicle), sortie),
@@ -397,7 +397,7 @@ class Daemon:
             self.jobs.add("refine", vehicle, sortie, trigger="late")
 
     def _leg_over(self, vehicle: str, sortie: int, silent: bool) -> None:
-        """A leg is over: its pictures go on the coarse layer as soon as nothing better is to be done."""
+        """A leg is finished: queue its pictures for the coarse layer, at low priority."""
         complete = self.journal.one(
             "SELECT 1 FROM completions WHERE vehicle = ? AND sortie = ?", (packed(vehicle), sortie)
         )
@@ -405,7 +405,7 @@ class Daemon:
             self.jobs.add("coarse", vehicle, sortie, **({"over": True} if silent else {}))
 
     def _watch_what_came_before(self) -> None:
-        """Pictures of which nothing was made before the last end of the daemon."""
+        """Queue pictures that the last daemon left unprocessed."""
         for row in self.journal.rows("SELECT DISTINCT vehicle, sortie FROM completions"):
             self._refine_late(unpacked(row["vehicle"]), int(row["sortie"]))
         rows = self.journal.rows(
@@ -419,14 +419,14 @@ class Daemon:
             self.leg_watch.add(unpacked(row["vehicle"]), int(row["sortie"]), time_s, pose["lat_deg"], pose["lon_deg"])
 
     def _make_way(self, vehicle: str, layer: str | None) -> None:
-        """A refinement begins, or needs a layer: what is done in the background stands aside."""
+        """A refinement begins or needs a layer: background jobs give way."""
         self.together.give_up()
         if layer is None:
             self.jobs.drop("coarse", vehicle, _REPLACED)
         self.coarse.give_up(None, layer)
 
     def _after_job(self, job: Job) -> None:
-        """Note what a completion led to; write the products once nothing is left to refine."""
+        """Record the result of a completion; export the products once nothing is left to refine."""
         if job.kind == "refine":
             self._note_refined(job)
             self.jobs.wake()
@@ -462,7 +462,7 @@ class Daemon:
         return self.jobs.add("export", formats=list(dict.fromkeys(formats)))
 
     def _facts(self) -> dict[str, Any]:
-        """What only the daemon knows for the report."""
+        """The daemon's own facts for the report."""
         return facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
             time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
@@ -471,7 +471,7 @@ class Daemon:
     # -- health ---------------------------------------------------------------------------------------------------
 
     def problems(self) -> list[str]:
-        """What is wrong at present, in words."""
+        """The present problems, in words."""
         found = [
             self.drawer.problem,
             self.drawer.overload,
@@ -486,5 +486,5 @@ class Daemon:
         return [text for text in found if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:
-        """A picture that is safe on the disk cannot be on the map."""
+        """Report a stored picture that cannot be on the map."""
         self.refused.note("place" if misplaced else "map", reason, frame.vehicle, frame.image)

@@ -23,12 +23,12 @@ from orthoswarm.model.errors import InputError
 
 
 class Exports:
-    """Writes what the workspace holds in the forms of other programs.
+    """Exports the workspace to the formats of other programs.
 
     Args:
         settings: of the daemon. journal, store, layers, console: the workspace's.
-        workers: where files are written. area: gives the map's area, None before the first picture.
-        vehicles: gives the rows of /api/vehicles. facts: gives what only the daemon knows for the report.
+        workers: write the files. area: returns the map's area, None before the first picture.
+        vehicles: returns the rows of /api/vehicles. facts: returns the daemon's facts for the report.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Exports:
         area = self._area()
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
-        with contextlib.ExitStack() as held:  # a generation that another one replaces stays while it is read
+        with contextlib.ExitStack() as held:  # a replaced generation stays while it is read
             canvases = {name: held.enter_context(layer.reading()) for name, layer in self._layers.items()}
             folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
             task = replace(self._task(area), formats=tuple(job.detail["formats"]), canvases=folders)
@@ -70,7 +70,7 @@ class Exports:
         return lambda db: None
 
     def places(self) -> list[Place]:
-        """The finds, and the vehicles that said where they are."""
+        """The finds, and the vehicles with a known position."""
         return self._places(self._console.finds())
 
     def find_pictures(self, number: int) -> list[dict[str, Any]]:
@@ -105,7 +105,7 @@ class Exports:
         return places_of(self._settings.workspace.resolve().name, finds, self._vehicles(), time.time())
 
     def _task(self, area: Area) -> ExportTask:
-        """What the workspace holds, without layers and formats."""
+        """The export task of the workspace, without layers and formats."""
         rows = self._journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
         kept, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
         solutions = self._journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")

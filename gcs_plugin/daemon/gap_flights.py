@@ -1,4 +1,4 @@
-"""Flights over what was missed: planned here from the gaps of the coverage, uploaded and started by the operator."""
+"""Flights over missed ground: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
 import math
@@ -38,7 +38,7 @@ class GapFlights:
         self._coverage, self._plans, self._links, self._takeoffs = coverage, plans, links, takeoffs
 
     def vehicles(self) -> list[dict[str, Any]]:
-        """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: to be asked), `busy` (why not now).
+        """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: unknown), `busy` (why not now).
 
         Minutes are those until the reserve, by what the vehicle's flight so far has cost. `in_air` is true for a busy
         one that may be given the gaps in the air, if the operator says so for this vehicle.
@@ -57,7 +57,7 @@ class GapFlights:
         return rows
 
     def plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Plan a flight over the gaps, with the lens as it was solved.
+        """Plan a flight over the gaps, with the solved lens.
 
         Args:
             body: `vehicles` {id: minutes that it can fly, or null for what its battery says}; `altitude_m`, that of the
@@ -68,7 +68,7 @@ class GapFlights:
             The plan's figures with its `id`, and `names`: the plan's vehicle -> the daemon's.
 
         Raises:
-            InputError: a value is of no use, a battery is not known, or there is no gap.
+            InputError: a value is invalid, a battery level is unknown, or there is no gap.
             OrthoSwarmError: a vehicle is still flying.
         """
         known = {row["id"]: row for row in self.vehicles()}

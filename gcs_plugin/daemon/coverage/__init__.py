@@ -1,1 +1,1 @@
-"""Coverage in flight: which ground of the planned area was seen well, which was missed, and why."""
+"""Coverage in flight: which ground of the planned area was covered well, which was missed, and why."""

@@ -1,4 +1,4 @@
-"""How long vehicles can still fly: by their battery, and by what their flight so far has cost."""
+"""Remaining flight time of vehicles, from their battery level and its use so far."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ _SWAPPED: Final = 0.05
 
 @dataclass(slots=True)
 class _Flight:
-    """A vehicle's flight: when it was first seen in the air and with how much, and what is left now (shares)."""
+    """A vehicle's flight: time and battery level when first seen in the air, and the present level (shares)."""
 
     begun_s: float
     begun_with: float
@@ -20,13 +20,13 @@ class _Flight:
 
 
 class BatteryUse:
-    """Follows batteries; only a drop of 3 % over a minute in the air tells what flying costs."""
+    """Tracks batteries; the rate is known once the level dropped by 3 % over at least a minute in the air."""
 
     def __init__(self) -> None:
         self._flights: dict[str, _Flight] = {}
 
     def look(self, row: Mapping[str, Any], flies: bool, now_s: float) -> None:
-        """Take what a vehicle's link says, at a moment of any clock in seconds."""
+        """Process a vehicle's state from its link, at a time of any clock in seconds."""
         vehicle, battery = str(row["id"]), row.get("battery")
         if battery is None:
             return
@@ -35,19 +35,19 @@ class BatteryUse:
             self._flights[vehicle] = _Flight(now_s, battery, battery)
             return
         if battery > flight.left + _SWAPPED or not flies:
-            flight.begun_s, flight.begun_with = now_s, battery  # what flying cost before still holds
+            flight.begun_s, flight.begun_with = now_s, battery  # the rate found before remains valid
         flight.left = battery
         spent, took = flight.begun_with - battery, now_s - flight.begun_s
         if spent >= _LEAST_DROP and took >= _LEAST_S:
             flight.rate = spent / took
 
     def left(self, vehicle: str) -> float | None:
-        """What is left of a vehicle's battery, 0 to 1; None where it does not say."""
+        """Battery level of a vehicle, 0 to 1; None if it is not reported."""
         flight = self._flights.get(vehicle)
         return None if flight is None else flight.left
 
     def seconds(self, vehicle: str, reserve: float) -> float | None:
-        """How long it can fly until a share is left, by what its flight so far cost; None where that is not known."""
+        """Flight time in seconds until a level is reached, at the rate so far; None if unknown."""
         flight = self._flights.get(vehicle)
         if flight is None or flight.rate is None:
             return None

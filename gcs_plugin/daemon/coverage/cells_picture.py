@@ -15,7 +15,7 @@ _SHOWN_FIRST: Final = (State.MISSED, State.POOR, State.PLANNED, State.SEEN, Stat
 
 
 def cells_png(states: NDArray[np.uint8]) -> bytes:
-    """A PNG with a palette, uint8 (rows, columns) of State; large areas are reduced so that no gap vanishes."""
+    """A PNG with a palette, uint8 (rows, columns) of State; large areas are reduced without losing gaps."""
     from PIL import Image
 
     step = -(-max(states.shape) // _LARGEST_PX)

@@ -1,4 +1,4 @@
-"""The exposures that vehicles report on their links, kept in the journal."""
+"""The exposures that vehicles report on their links, stored in the journal."""
 
 import sqlite3
 from collections import deque
@@ -21,10 +21,10 @@ Row = tuple[str, int, float, float | None, float | None]
 
 
 class ExposureJournal:
-    """Takes camera events in, in the links' thread, and hands them out in the coverage's.
+    """Receives camera events in the links' thread and provides them in the coverage's.
 
     Args:
-        journal: of the workspace. name_of: gives a vehicle's id for its MAVLink system id.
+        journal: of the workspace. name_of: returns a vehicle's id for its MAVLink system id.
     """
 
     def __init__(self, journal: Journal, name_of: "Callable[[int], str]") -> None:
@@ -35,19 +35,19 @@ class ExposureJournal:
         self._last: dict[int, tuple[int, float]] = {}
 
     def message(self, vehicle: "Vehicle", message: Any, utc_s: float) -> None:
-        """Take a message of MESSAGES; of a vehicle that sends both kinds, only the one that came first counts."""
+        """Process a message of MESSAGES; of a vehicle that sends both kinds, only the kind received first is used."""
         kind, system = message.get_type(), vehicle.system
         if self._kinds.setdefault(system, kind) != kind:
             return
         if kind == "CAMERA_FEEDBACK":
             number, time_s, lat, lon = message.img_idx, message.time_usec * 1e-6, message.lat, message.lng
         elif message.capture_result == 0:
-            return  # the camera failed to take it
+            return  # the camera failed
         else:
             number, lat, lon = message.image_index, message.lat, message.lon
             time_s = self._dated(system, message, utc_s)
         if self._last.get(system) == (number, time_s):
-            return  # said twice
+            return  # a repetition
         self._last[system] = number, time_s
         place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
         self._fresh.append((packed(self._name_of(system)), int(number), _utc(time_s, utc_s), *place))
@@ -60,7 +60,7 @@ class ExposureJournal:
         return dated_s if dated_s > _AFTER_2001_S else boot_s + late_s
 
     def write(self) -> bool:
-        """Write what has come since the last call; whether there was anything."""
+        """Write the events since the last call; returns whether there were any."""
         rows = [self._fresh.popleft() for _ in range(len(self._fresh))]
 
         def change(db: sqlite3.Connection) -> None:
@@ -71,7 +71,7 @@ class ExposureJournal:
         return bool(rows)
 
     def events(self, grid: LocalGrid) -> list[CameraEvent]:
-        """All events in a grid; their heights are not used."""
+        """All events in grid coordinates, without heights."""
         rows = self._journal.rows("SELECT vehicle, number, time, lat, lon FROM exposures ORDER BY vehicle, time")
         found = []
         for row in rows:
@@ -83,5 +83,5 @@ class ExposureJournal:
 
 
 def _utc(time_s: float, received_s: float) -> float:
-    """When it was taken: as the message says, or when that came where its clock has no date."""
+    """Time of exposure: from the message, or its arrival if its clock has no date."""
     return time_s if time_s > _AFTER_2001_S else received_s

@@ -1,4 +1,4 @@
-"""Which pictures are blurred, damaged or without contrast in comparison with their neighbours, as they come."""
+"""Finds pictures that are blurred, damaged or without contrast compared with their neighbours, as they arrive."""
 
 import bisect
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ _NO_TIME: Final = 0.0
 
 
 class FlawedPictures:
-    """Flaws of pictures; that of one can change until the pictures after it have come."""
+    """Flaws of pictures; they can change until the following pictures have arrived."""
 
     def __init__(self) -> None:
         self._cameras: dict[tuple[str, int, int], list[tuple[float, str, PictureQuality]]] = {}
@@ -21,7 +21,7 @@ class FlawedPictures:
         self._flaws: dict[Key, Flaw] = {}
 
     def add(self, pictures: Iterable[tuple[View, PictureQuality | None]]) -> None:
-        """Add pictures as they come; one that was not measured (None) has no flaw."""
+        """Add pictures as they arrive; one without a measurement (None) has no flaw."""
         for view, quality in pictures:
             if quality is None:
                 continue
@@ -30,17 +30,17 @@ class FlawedPictures:
             entry = (view.time_s if view.time_s is not None else _NO_TIME, view.image, quality)
             at = bisect.bisect_left(row, entry[:2], key=lambda e: e[:2])
             if at < len(row) and row[at][:2] == entry[:2]:
-                row[at] = entry  # drawn again
+                row[at] = entry  # drawn a second time
             else:
                 row.insert(at, entry)
             self._first[camera] = min(at, self._first.get(camera, at))
 
     def judged(self) -> set[Key]:
-        """Judge pictures that came since the last call; vehicle and image of those whose flaws have changed."""
+        """Assess pictures that arrived since the last call; returns vehicle and image of those with changed flaws."""
         changed = set()
         for camera, first in self._first.items():
             row = self._cameras[camera]
-            begin = max(0, first - 2 * NEIGHBOURS)  # the median of the first one judged needs those before it
+            begin = max(0, first - 2 * NEIGHBOURS)  # the median for the first one needs those before it
             found = picture_flaws([quality for *_, quality in row[begin:]])
             for k in range(max(0, first - NEIGHBOURS), len(row)):
                 key = camera[0], row[k][1]

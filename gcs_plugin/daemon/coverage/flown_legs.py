@@ -1,4 +1,4 @@
-"""Which legs of a plan are over, by where vehicles were seen: on their links, or by the places of their pictures."""
+"""Which legs of a plan are finished, from the vehicles' positions on their links or in their pictures."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,18 +19,19 @@ _MISSION_OVER: Final = ("complete", "aborted")
 
 @dataclass
 class FlownLegs:
-    """Follows vehicles along the legs of a plan.
+    """Tracks vehicles along the legs of a plan.
 
     A leg is over once a vehicle has flown along it from end to end (it may wait there), or the vehicle that is to fly
     it has ended that flight. When nobody flies and no picture has come for a minute, all that was not seen is missed.
 
     Attributes:
-        legs: of the plan. reach_m: how far beside a leg a vehicle still flies along it.
-        ahead_m: how far from a leg's ends it is seen first and last; at least a picture distance where only pictures
-            tell where it is.
+        legs: of the plan. reach_m: largest cross-track distance of a vehicle on a leg.
+        ahead_m: how far from a leg's ends the first and last position may be; at least a picture spacing where only
+        pictures
+            give positions.
         flown: bool (n,), legs flown from end to end.
-        flights: vehicle -> number of flights that it has begun. down: vehicles that have left their mission or are
-            lost. grounded: those that have been on the ground since.
+        flights: vehicle -> number of flights begun. down: vehicles that have left their mission or are
+            lost. grounded: those of them that have landed since.
     """
 
     legs: PlannedLegs
@@ -51,21 +52,21 @@ class FlownLegs:
         self._way = step / self._length[:, None]
 
     def state(self) -> dict[str, Any]:
-        """What has to survive a restart, as JSON values."""
+        """The state to be stored for a restart, as JSON values."""
         return {
             "flown": np.nonzero(self.flown)[0].tolist(), "flights": dict(self.flights), "down": sorted(self.down),
             "grounded": sorted(self.grounded),
         }  # fmt: skip
 
     def resume(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state` of the same plan."""
+        """Continue from a `state` of the same plan."""
         self.flown[state["flown"]] = True
         self.flights, self.down = dict(state["flights"]), set(state["down"])
         self.grounded = set(state["grounded"])
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """Legs that are over, bool (n,): flown, or of a flight that has ended."""
+        """Finished legs, bool (n,): flown, or part of a flight that has ended."""
         ended = [
             self.flights.get(v, 0) >= s + (v not in self.down)
             for v, s in zip(self.legs.vehicles, self.legs.sorties.tolist(), strict=True)
@@ -73,7 +74,7 @@ class FlownLegs:
         return np.asarray(self.flown | np.array(ended, bool))
 
     def pass_by(self, vehicle: str, east: float, north: float) -> None:
-        """A vehicle is at a place, grid metres; called in the order of time."""
+        """Process a vehicle's position, grid metres; call in the order of time."""
         if not len(self.flown):
             return
         away = np.array([east, north]) - self.legs.ends[:, 0]
@@ -87,11 +88,11 @@ class FlownLegs:
         seen[1] = np.where(on, np.maximum(seen[1], along), -np.inf)
 
     def picture_came(self, time_s: float) -> None:
-        """A picture came, at a moment in UTC epoch seconds."""
+        """Record the arrival of a picture, UTC epoch seconds."""
         self._last_picture_s = time_s
 
     def look(self, rows: list[dict[str, Any]]) -> None:
-        """Take what the vehicles' links say (`VehicleLinks.rows`)."""
+        """Process the vehicles' states (`VehicleLinks.rows`)."""
         for row in rows:
             vehicle = str(row["id"])
             if flies(row):
@@ -105,13 +106,13 @@ class FlownLegs:
                     self.grounded.add(vehicle)
 
     def all_over(self, rows: list[dict[str, Any]], now_s: float) -> bool:
-        """Whether the whole flight is over: nobody flies, and all legs are over or nothing has come for a minute."""
+        """Whether the operation is over: nobody flies, and all legs are finished or no picture came for a minute."""
         if self._last_picture_s is None or any(flies(row) for row in rows):
             return False
         return now_s - self._last_picture_s > _IDLE_S or (len(self.flown) > 0 and bool(self.over.all()))
 
     def remaining(self) -> dict[str, list[int]]:
-        """Vehicle that has left its mission or is lost -> its legs of the flights begun that nobody has flown."""
+        """Vehicle that has left its mission or is lost -> its legs of begun flights that are not flown."""
         return {
             vehicle: [
                 k
@@ -124,7 +125,7 @@ class FlownLegs:
 
 
 def flies(row: Mapping[str, Any]) -> bool:
-    """Whether a vehicle is on a mission that goes on."""
+    """Whether a vehicle is on a mission that continues."""
     if row["state"] == "lost" or row["mission"]["phase"] in _MISSION_OVER:
         return False
     return bool(row["armed"]) and row["flight"]["state"] not in (

@@ -1,7 +1,7 @@
-"""Coverage of the planned area in flight: one thread keeps it up to date with pictures, solutions and vehicles.
+"""Coverage of the planned area in flight, updated by one thread from pictures, solutions and vehicles.
 
-Pictures count with their recorded poses as soon as they are on the map, and with their placed ones once their leg was
-placed. Everything is rebuilt from the journal and the solution files at a start; which legs are over is in the journal.
+Pictures count with their recorded poses as soon as they are on the map, and with their placed ones once their leg is
+placed. At a start all is rebuilt from the journal and the solution files; the finished legs are in the journal.
 """
 
 import logging
@@ -50,13 +50,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Followed:
-    """An area under way.
+    """The area being covered.
 
     Attributes:
-        source: where it comes from. covered: the area and its plan. legs: which of its legs are over.
-        cover: by pictures as they are placed now. recorded: by recorded poses alone.
+        source: its source. covered: the area and its plan. legs: which of its legs are finished.
+        cover: by pictures as placed now. recorded: by recorded poses alone.
         flaws: of the pictures, by comparison with their neighbours.
-        stored: state of `legs` in the journal. over: legs by which the due cells were found last.
+        stored: state of `legs` in the journal. over: the finished legs for which the due cells were last computed.
     """
 
     source: AreaSource
@@ -71,7 +71,7 @@ class _Followed:
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """What was found last: the API's document, gaps as GeoJSON, and the picture of the cells."""
+    """The latest result: the API's document, gaps as GeoJSON, and the picture of the cells."""
 
     document: dict[str, Any]
     gaps: dict[str, Any]
@@ -89,16 +89,17 @@ _NOTHING: Final = _Result(
 
 
 class LiveCoverage:
-    """Keeps the coverage up to date.
+    """Updates the coverage.
 
     Args:
-        journal: of the workspace. events: told when the coverage has changed. views: of the workspace's pictures.
-        source: gives where the area comes from, None while there is none. epsg: gives the map's grid, None before it.
-        vehicles: gives the rows of the vehicles on the links, empty without links.
-        exposures: what vehicles said about their cameras.
+        journal: of the workspace. events: receives changes of the coverage. views: of the workspace's pictures.
+        source: returns the source of the area, None if there is none. epsg: returns the map's grid, None before it
+        exists.
+        vehicles: returns the rows of the vehicles on the links, empty without links.
+        exposures: reported by the vehicles.
 
     Attributes:
-        seconds: time that finding the gaps took last. battery: how long the vehicles can still fly.
+        seconds: duration of the last search for gaps. battery: remaining flight time of the vehicles.
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class LiveCoverage:
         self.battery = BatteryUse()
 
     def start(self) -> None:
-        """Begin, with what the workspace holds."""
+        """Start, with the content of the workspace."""
         self._thread.start()
 
     def close(self) -> None:
@@ -138,17 +139,17 @@ class LiveCoverage:
             self._thread.join()
 
     def add(self, placed: PlacedFrame, quality: PictureQuality | None) -> None:
-        """A picture is on the real-time layer as recorded, with what its pixels say; any thread."""
+        """A picture is on the real-time layer with its recorded pose and measured quality; any thread."""
         self._fresh.append((View.of_frame(placed), quality))
         self._bell.set()
 
     def look(self) -> None:
-        """Pictures were placed, or the plan has changed; any thread."""
+        """Announce that pictures were placed or the plan has changed; any thread."""
         self._bell.set()
 
     @property
     def document(self) -> dict[str, Any]:
-        """Shares, gaps and what is known about them, as JSON values."""
+        """Shares, and gaps with their causes, as JSON values."""
         return self._result.document
 
     @property
@@ -184,13 +185,13 @@ class LiveCoverage:
                 if changed and time.monotonic() >= self._rest_until:
                     self._find()
                     changed = False
-            except (OrthoSwarmError, sqlite3.Error) as error:  # a full disk, a torn file: tried again
+            except (OrthoSwarmError, sqlite3.Error) as error:  # a full disk or an incomplete file: tried again
                 _log.warning("coverage: %s", error)
             self._bell.wait(_LOOK_S)
             self._bell.clear()
 
     def _take(self) -> bool:
-        """Take in what is new; whether anything has changed."""
+        """Process new data; returns whether anything has changed."""
         source = self._source()
         if source is None or source == self._refused:
             self._fresh.clear()
@@ -213,7 +214,7 @@ class LiveCoverage:
         return self._follow(here) or changed
 
     def _begin(self, source: AreaSource, epsg: int | None) -> _Followed | None:
-        """Begin with an area: put in all pictures of the workspace."""
+        """Start with an area, adding all pictures of the workspace."""
         try:
             covered = read_covered_area(source, None if epsg is None else LocalGrid(epsg))
             area = covered.area
@@ -258,7 +259,7 @@ class LiveCoverage:
         return True
 
     def _follow(self, here: _Followed) -> bool:
-        """Follow the vehicles; whether other cells are due than before."""
+        """Track the vehicles; returns whether the due cells have changed."""
         rows = self._vehicles()
         grid = here.covered.area.grid
         for row in rows:
@@ -277,7 +278,7 @@ class LiveCoverage:
         return changed
 
     def _due_cells(self, here: _Followed, rows: Rows) -> "NDArray[np.bool_] | bool":
-        """Cells whose flight is over: below legs that are over, and below no leg that is still to be flown."""
+        """Cells that should be covered by now: below finished legs, and not below a leg that is still to be flown."""
         if here.legs.all_over(rows, time.time()):
             return True
         over, flight = here.legs.over, here.covered.flight
@@ -333,10 +334,10 @@ class LiveCoverage:
         return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), solved)
 
     def _missing(self, here: _Followed) -> tuple[list[MissingPicture], list[str]]:
-        """Pictures that are missing, and doubts about the camera events."""
+        """Missing pictures, and doubts about the camera events."""
         grid = here.covered.area.grid
         events = self._exposures.events(grid)
-        if self._due is not True:  # pictures of the newest ones are still on their way
+        if self._due is not True:  # pictures of the newest ones may still arrive
             last = max((event.time_s for event in events), default=0.0) - _ON_THE_WAY_S
             events = [event for event in events if event.time_s <= last]
         found = missing_by_events(here.cover.views, events, self._views.rejected())
@@ -360,7 +361,7 @@ def _shares(shares: Shares) -> dict[str, float]:
 
 
 def _offers(legs: FlownLegs) -> list[dict[str, Any]]:
-    """Legs that vehicles have left behind, to be flown by others: a row a vehicle."""
+    """Unflown legs of vehicles that have left their mission, to be flown by others: a row per vehicle."""
     rows = []
     for vehicle, left in legs.remaining().items():
         if left:

@@ -1,4 +1,4 @@
-"""Views of a workspace's pictures: recorded poses as they are drawn, placed ones from the solution files."""
+"""Views of a workspace's pictures: recorded poses as drawn, placed poses from the solution files."""
 
 import math
 import sqlite3
@@ -35,7 +35,7 @@ class PictureViews:
         self._read: dict[tuple[str, str, int], str] = {}
 
     def recorded(self, grid: LocalGrid) -> Iterator[Measured]:
-        """Views of all pictures on the real-time layer as recorded, in parts, in the order in which they came."""
+        """Views of all pictures on the real-time layer as recorded, in chunks, in the order of arrival."""
         last = 0
         while True:
             rows = self._journal.rows(
@@ -53,9 +53,9 @@ class PictureViews:
             yield part
 
     def placed_anew(self, epsg: int) -> tuple[list[View], list[Key]]:
-        """Views that were placed since the last call, and pictures that a refinement could not place.
+        """Views placed since the last call, and pictures that a refinement could not place.
 
-        A refined sortie hides what was placed of it in flight. Files that are being replaced are read at the next call.
+        A refined sortie replaces its placements in flight. Files that are being replaced are read at the next call.
 
         Args:
             epsg: the grid of the map.
@@ -89,12 +89,12 @@ class PictureViews:
         return views, dropped
 
     def rejected(self) -> list[Exposure]:
-        """Pictures that came and could not be used."""
+        """Pictures that arrived and could not be used."""
         rows = self._journal.rows("SELECT vehicle, image, time FROM frames WHERE reason IS NOT NULL AND time NOT NULL")
         return [Exposure(unpacked(r["vehicle"]), float(r["time"]), unpacked(r["image"])) for r in rows]
 
     def forget(self) -> None:
-        """Have `placed_anew` give everything again."""
+        """Make `placed_anew` return everything again."""
         self._read.clear()
 
 

@@ -1,4 +1,4 @@
-"""The area whose coverage is kept up to date: of the console's plan, else the drawn one, else of the newest plan."""
+"""The area whose coverage is computed: of the console's plan, else the drawn one, else of the newest plan."""
 
 import json
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from orthoswarm.planning.area.shape_files import parse_geojson
 
 @dataclass(frozen=True, slots=True)
 class PlannedLegs:
-    """Legs of a plan with who is to fly them.
+    """Legs of a plan with their vehicles.
 
     Attributes:
         ends: float64 (n, 2, 2), first and last ground point of each, grid metres.
@@ -35,11 +35,11 @@ class PlannedLegs:
 
 @dataclass(frozen=True, slots=True)
 class CoveredArea:
-    """An area and the plan by which it is flown.
+    """An area and its plan.
 
     Attributes:
         area: ground and no-fly zones. plan: id of the plan, None for a drawn area.
-        flight: what is to be flown, None for a drawn area. legs: the same by vehicle.
+        flight: the planned flight, None for a drawn area. legs: its legs by vehicle.
     """
 
     area: Area
@@ -50,7 +50,7 @@ class CoveredArea:
 
 @dataclass(frozen=True, slots=True)
 class AreaSource:
-    """Where the area comes from, comparable.
+    """The source of the area, for comparison.
 
     Attributes:
         plan: the plan's folder, None for a drawn area. drawn: the drawn area as GeoJSON text.
@@ -63,10 +63,10 @@ class AreaSource:
 
 
 def area_source(console: Mapping[str, Any], plans: Path) -> AreaSource | None:
-    """Which area is to be covered, None if there is none.
+    """The source of the area to be covered, None if there is none.
 
     Args:
-        console: the operator's plan (`ConsoleState.plan`). plans: folder of all plans. Flights over gaps are left out:
+        console: the operator's plan (`ConsoleState.plan`). plans: folder of all plans. Gap flights are left out:
             they belong to the area of the plan before.
     """
     names = tuple(sorted((str(k), str(v)) for k, v in (console.get("vehicles") or {}).items() if v))
@@ -83,7 +83,7 @@ def read_covered_area(source: AreaSource, grid: LocalGrid | None) -> CoveredArea
     """The area and its plan.
 
     Args:
-        source: of `area_source`. grid: in which both are wanted, None for the area's own UTM zone.
+        source: from `area_source`. grid: of the result, None for the area's own UTM zone.
 
     Raises:
         InputError: the area or the plan cannot be used.

@@ -1,1 +1,1 @@
-"""Pictures and poses into the daemon: posted, from streams, from watched folders, once each."""
+"""Intake of pictures and poses: posted, from streams, from watched folders, each picture once."""

@@ -1,7 +1,7 @@
 """A vehicle's CAN bus, read into its poses: over an adapter, or through the vehicle's own MAVLink link.
 
-Through the link the vehicle forwards its bus as CAN_FRAME and CANFD_FRAME messages for as long as it is asked to
-(MAV_CMD_CAN_FORWARD); it is asked to forward the few messages that are read, and nothing else (CAN_FILTER_MODIFY).
+Through the link the vehicle forwards its bus as CAN_FRAME and CANFD_FRAME messages as long as this is requested
+(MAV_CMD_CAN_FORWARD), limited to the few messages that are read (CAN_FILTER_MODIFY).
 """
 
 import logging
@@ -23,7 +23,7 @@ CAN: Final = "can:"
 
 _TUNNEL: Final = "mavlink"
 _AGAIN_S: Final = 2.0
-_ASK_S: Final = 1.0  # ArduPilot stops 5 s after it was asked last
+_ASK_S: Final = 1.0  # ArduPilot stops 5 s after the last request
 _SILENT_S: Final = 5.0
 _log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def check_bus(bus: str) -> None:
 
 
 class CanReader:
-    """Reads one vehicle's bus in a thread of its own.
+    """Reads one vehicle's bus in its own thread.
 
     Attributes:
         vehicle: id.
@@ -66,8 +66,8 @@ class CanReader:
 
         Args:
             vehicle: id. bus: for example "socketcan:can0", or "mavlink" for the one behind the vehicle's link.
-            poses: of the vehicle; what the bus tells goes there.
-            tell: called with what happens, in words.
+            poses: of the vehicle; receives the bus's poses.
+            tell: called with messages for the user.
             fleet: the links; None without any. system: the vehicle's MAVLink system id, None without.
 
         Raises:
@@ -122,21 +122,21 @@ class CanReader:
             self._stop.wait(_AGAIN_S)
 
     def _fail(self, reason: str) -> None:
-        """Say once what is wrong; it is tried again and again."""
+        """Report a problem once; the connection is retried all the time."""
         if reason != self._said:
             self._tell(f"the CAN bus of {self.vehicle}: {reason}")
         self._state = self._said = reason
 
 
 class _Tunnel:
-    """Asks a vehicle for the frames of one of its buses, and takes them from its link."""
+    """Requests the frames of one of a vehicle's buses, and receives them from its link."""
 
     def __init__(self, fleet: "Fleet", system: int, bus: int, take: Callable[[Any], None]) -> None:
         self._fleet, self._system, self._bus, self._take = fleet, system, bus, take
         fleet.subscribe(self._message, "CAN_FRAME", "CANFD_FRAME")
 
     def run_until(self, stop: threading.Event) -> Callable[[], None]:
-        """What asks again and again until stopped."""
+        """Repeat the request until stopped."""
 
         def run() -> None:
             while not stop.is_set():

@@ -1,4 +1,4 @@
-"""Whether a file that is being copied is whole already: pictures say so themselves by how they end."""
+"""Checks whether a file that is being copied is complete, by the end of its picture data."""
 
 import struct
 from pathlib import Path
@@ -12,9 +12,9 @@ _BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 
 
 def is_complete(data: bytes, suffix: str) -> bool:
-    """Whether a picture's bytes reach to its end; True for kinds that do not tell.
+    """Whether a picture's bytes are complete; True for formats in which this is unknown.
 
-    A copy that has stalled, or one whose space was reserved and is still zeros, is not whole.
+    A stalled copy, or one whose reserved space is still zeros, is not complete.
 
     Args:
         data: the file's bytes so far. suffix: of its name, with the dot.
@@ -34,7 +34,7 @@ def is_complete(data: bytes, suffix: str) -> bool:
 def _jpeg(data: bytes) -> bool:
     """Whether the main picture's end of image is there (ITU-T T.81, B.1): thumbnails in APP segments end earlier."""
     if not data.startswith(_SOI):
-        return len(data) > 4  # no JPEG at all: whoever reads it says so
+        return len(data) > 4  # not a JPEG: its reader reports that
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -62,7 +62,7 @@ def _opens(data: bytes) -> bool:
     try:
         picture_size(data)
     except PictureError:
-        return len(data) > 64  # no picture, or too large: whoever reads it says so
+        return len(data) > 64  # not a picture, or too large: its reader reports that
     try:
         with Image.open(io.BytesIO(data)) as picture:
             picture.load()
@@ -72,7 +72,7 @@ def _opens(data: bytes) -> bool:
 
 
 def is_video_complete(path: Path) -> bool:
-    """Whether an MP4 or MOV has all the boxes that it says it has, its index among them; True for other kinds.
+    """Whether an MP4 or MOV contains all its boxes, including the index; True for other formats.
 
     Raises:
         OSError: the file cannot be read.
@@ -86,7 +86,7 @@ def is_video_complete(path: Path) -> bool:
             head = file.read(16)
             length, kind = int.from_bytes(head[:4], "big"), head[4:8]
             if at == 0 and kind not in (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"skip", b"styp"):
-                return True  # no such file at all
+                return True  # not such a file
             if length == 1:
                 length = int.from_bytes(head[8:16], "big")
             index |= kind in (b"moov", b"moof")

@@ -1,4 +1,4 @@
-"""What was taken from a watched folder, so that a card that is put in again, or a restart, takes nothing twice."""
+"""Remembers the files read from a watched folder, so that none is read twice, even from a card read before."""
 
 import contextlib
 import hashlib
@@ -14,10 +14,10 @@ Stamp = tuple[int, int]
 
 
 class FolderState:
-    """What was taken from a folder, in a file of the workspace; of no use to another journal, and then begun anew.
+    """The files read from a folder, listed in a file of the workspace; started afresh for another journal.
 
     Args:
-        cache: where the file is. vehicle, folder: what it is about.
+        cache: folder of the file. vehicle, folder: the watched folder.
     """
 
     def __init__(self, cache: Path, vehicle: str, folder: Path) -> None:
@@ -31,7 +31,7 @@ class FolderState:
             lines = self._path.read_text(encoding="utf-8").splitlines()
         if lines and lines[0] == journal:
             for line in lines[1:]:
-                with contextlib.suppress(ValueError, TypeError, KeyError):  # torn by a power cut
+                with contextlib.suppress(ValueError, TypeError, KeyError):  # incomplete after a power cut
                     name, size, changed, digest = json.loads(line)
                     self._note(name, (size, changed), digest)
         else:
@@ -40,22 +40,22 @@ class FolderState:
                 self._path.write_text(journal + "\n", encoding="utf-8")
 
     def same(self, name: str, stamp: Stamp) -> bool:
-        """Whether a file was taken as it is, by its size and time of change."""
+        """Whether a file was read in its present state, by size and modification time."""
         return self._stamps.get(name) == stamp
 
     def holds(self, name: str, digest: str) -> bool:
-        """Whether this content was taken under this name."""
+        """Whether this content was stored under this name."""
         return digest in self._digests.get(name, ())
 
     def name(self, name: str, digest: str) -> str:
-        """The name to take a file under: another one where another picture has its own (a card begun anew)."""
+        """The name to store a file under: a different one if another picture has its name (a reformatted card)."""
         if not self._digests.get(name) or self.holds(name, digest):
             return name
         stem, suffix = os.path.splitext(name)
         return f"{stem}~{digest[:8]}{suffix}"
 
     def add(self, name: str, stamp: Stamp, digest: str) -> None:
-        """Remember a file whose pictures are all safe."""
+        """Remember a file whose pictures are all stored."""
         self._note(name, stamp, digest)
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps([name, *stamp, digest]) + "\n")
@@ -75,12 +75,12 @@ def _identity(path: Path) -> str:
 
 
 def digest_of(data: bytes) -> str:
-    """What tells contents apart."""
+    """Digest of a content."""
     return hashlib.sha256(data).hexdigest()[:32]
 
 
 def video_digest(path: Path) -> str:
-    """Of a video's length, beginning and end."""
+    """Digest of a video's length, beginning and end."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_HEAD)

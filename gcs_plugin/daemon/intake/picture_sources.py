@@ -1,4 +1,4 @@
-"""Where a vehicle's pictures come from besides HTTP: a live stream, or a folder into which files arrive (`folder`)."""
+"""Sources of a vehicle's pictures besides HTTP: a live stream, or a folder that receives files (`watched_folder`)."""
 
 import logging
 import threading
@@ -16,7 +16,7 @@ from telemetry.samples.sample import Sample
 if TYPE_CHECKING:
     from telemetry.live.live_stream import LivePicture
 
-_SILENT_S: Final = 20.0  # cameras that send at a vehicle's triggers are silent in its turns
+_SILENT_S: Final = 20.0  # triggered cameras are silent in the vehicle's turns
 _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://", "http://", "https://")
 STREAM_THREAD: Final = "pictures of "
 _log = logging.getLogger(__name__)
@@ -32,17 +32,17 @@ def is_stream(where: str) -> bool:
 
 
 class Source:
-    """Pictures of one vehicle, read in a thread of its own.
+    """Pictures of one vehicle, read in its own thread.
 
     Args:
         vehicle: id.
         where: stream or folder.
-        take: takes a picture in.
-        pose_at: the vehicle's pose at a moment from its link and bus, for pictures without one of their own.
-        tell: told what happens, in words.
-        cache: folder for pictures of videos, and for what is remembered of folders.
-        settled: told of a vehicle whose folder has come to rest after new pictures.
-        link_log: writes what a vehicle has said on its link into a .tlog; False if it has said nothing.
+        take: stores a picture.
+        pose_at: returns the vehicle's pose at a time from its link and bus, for pictures without their own.
+        tell: called with messages for the user.
+        cache: folder for pictures of videos and for the states of folders.
+        settled: called with the vehicle when its folder has stopped changing after new pictures.
+        link_log: writes a vehicle's packets into a .tlog; returns False if there are none.
     """
 
     def __init__(
@@ -71,12 +71,12 @@ class Source:
 
     @property
     def state(self) -> str:
-        """What it does, in words."""
+        """Its state, in words."""
         return self._state if self._reader is None or self._state.startswith("failed") else self._reader.state
 
     @property
     def without_pose(self) -> int:
-        """Pictures of a stream that were dropped, or files of a folder that wait, for want of a pose."""
+        """Number of stream pictures dropped, or of files waiting, for lack of a pose."""
         return self._without_pose if self._reader is None else len(self._reader.poseless)
 
     def start(self) -> None:
@@ -84,18 +84,18 @@ class Source:
         self._thread.start()
 
     def stop(self) -> None:
-        """Read no more; what waits inside a stream's library notices later."""
+        """Ask it to stop; a wait inside a stream's library ends later."""
         self._stop.set()
 
     def close(self, wait_s: float = 5.0) -> bool:
-        """Stop reading; returns whether it has ended within that time."""
+        """Stop reading; returns whether it ended within the time-out."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(wait_s)
         return not self._thread.is_alive()
 
     def document(self) -> dict[str, Any]:
-        """Its state as JSON values; addresses are not told, they may hold passwords."""
+        """Its state as JSON values, without addresses, which may contain passwords."""
         return {
             "kind": "stream" if is_stream(self.where) else "folder", "state": self.state, "taken": self.taken,
             "without_pose": self.without_pose,
@@ -107,7 +107,7 @@ class Source:
                 self._state = "waiting"
                 run()
                 return
-            except Exception:  # whatever a strange stream does, the vehicle's next picture counts
+            except Exception:  # a broken stream must not end the thread
                 _log.exception("the pictures of %s", self.vehicle)
                 self._state = "failed, tried again"
                 self._stop.wait(2.0)
@@ -120,14 +120,14 @@ class Source:
 
         def state(text: str) -> None:
             before, self._state = self._state, text.split(":")[0]
-            if self._state != before:  # a camera that sends nothing on the ground is lost at every attempt
+            if self._state != before:  # every attempt fails while a camera sends nothing on the ground
                 self._tell(f"the pictures of {self.vehicle}: {self._state}")
 
         for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
             self._offer(picture, partial(encode_jpeg, picture.rgb))
 
     def _offer(self, picture: "LivePicture", data: Callable[[], bytes]) -> None:
-        """Take a picture with the pose that it carries, gaps filled from the vehicle's link and bus."""
+        """Store a picture with its own pose, gaps filled from the vehicle's link and bus."""
         name, time_s, origin = f"live-{picture.time_s:.3f}.jpg", picture.time_s, picture.origin
         own = picture.sample if picture.sample is not None else Sample()
         given = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
@@ -145,7 +145,7 @@ class Source:
         self._keep(PostedPose(self.vehicle, name, time_s, values, origins), data())
 
     def _keep(self, pose: PostedPose, data: bytes) -> None:
-        """Take a picture in; with the disk full, wait until there is room."""
+        """Store a picture; if the disk is full, wait until there is room."""
         while not self._stop.is_set():
             try:
                 _, new = self._take(pose, data)

@@ -1,4 +1,4 @@
-"""Poses from files and links as if they had been posted."""
+"""Poses from files and links in the form of posted ones."""
 
 import math
 from collections.abc import Mapping

@@ -28,13 +28,13 @@ _NOWHERE_DEG: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class PostedPose:
-    """What was posted beside a picture.
+    """The pose posted with a picture.
 
     Attributes:
-        vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if it was not said.
-        values: lat_deg, lon_deg and what else is known, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE;
+        vehicle: id; image: name, as posted. time_s: UTC epoch seconds, None if not given.
+        values: lat_deg, lon_deg and further known values, in degrees and metres; `gps_fix`: MAVLink's GPS_FIX_TYPE;
             `damaged`: True for a picture that lost parts.
-        origin: where position, height, angles and time are from, as far as that is known.
+        origin: sources of position, height, angles and time, as far as known.
     """
 
     vehicle: str
@@ -45,12 +45,12 @@ class PostedPose:
 
     @property
     def has_fix(self) -> bool:
-        """Whether the position is one."""
+        """Whether the position is valid."""
         return is_position(self.values)
 
 
 def is_position(values: Mapping[str, Any]) -> bool:
-    """Whether a pose holds a position: a receiver without a fix gives 0, 0, or says so (GPS_FIX_TYPE below 2D)."""
+    """Whether a pose has a valid position: a receiver without a fix sends 0, 0 or a GPS_FIX_TYPE below 2D."""
     lat, lon = float(values["lat_deg"]), float(values["lon_deg"])
     return values.get("gps_fix", _FIX_2D) >= _FIX_2D and not (abs(lat) < _NOWHERE_DEG and abs(lon) < _NOWHERE_DEG)
 
@@ -59,11 +59,11 @@ def parse_pose(document: Any, image: str | None = None) -> PostedPose:
     """Check a pose.
 
     Args:
-        document: the JSON object; `vehicle`, `lat_deg` and `lon_deg` must be there.
-        image: the file's name, for a pose that does not say it.
+        document: the JSON object; `vehicle`, `lat_deg` and `lon_deg` are required.
+        image: the file's name, for a pose without it.
 
     Raises:
-        InputError: what is missing or wrong, in a sentence.
+        InputError: a value is missing or wrong.
     """
     if not isinstance(document, Mapping):
         raise InputError(
@@ -105,7 +105,7 @@ def parse_time(value: Any) -> float | None:
 
 def frame_of(values: Mapping[str, Any], *, image: str, path: Path, vehicle: str, time_s: float | None,
              size: tuple[int, int]) -> Frame:  # fmt: skip
-    """The frame of a stored picture and the pose values that `parse_pose` gave, with their `origin` if known."""
+    """The frame of a stored picture with the pose values from `parse_pose`, and their `origin` if known."""
     sample = Sample(time_s=time_s, **{field: values[key] for key, field in _FIELDS.items() if key in values})
     sample.height_is_ground = bool(values.get("height_is_ground"))
     if not is_position(values):

@@ -1,4 +1,4 @@
-"""Pictures that were refused, dropped or left off the map: counted by cause, and said while it is news."""
+"""Counts of pictures that were refused, dropped or left off the map, by cause, with recent ones as problems."""
 
 import threading
 import time
@@ -32,7 +32,7 @@ class RefusedPictures:
     """Counts them since the daemon's start; any thread.
 
     Args:
-        publish: called with each, as fields of an event. clock: UTC epoch seconds.
+        publish: called with the fields of an event for each. clock: UTC epoch seconds.
     """
 
     def __init__(self, publish: Callable[..., None], clock: Callable[[], float] = time.time) -> None:
@@ -59,7 +59,7 @@ class RefusedPictures:
             return {cause: self._by_cause[cause].count if cause in self._by_cause else 0 for cause in CAUSES}
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row a cause with `cause`, `text`, `count` and the last one's `vehicle`, `image`, `reason`, `time`."""
+        """A row per cause with `cause`, `text`, `count` and the last one's `vehicle`, `image`, `reason`, `time`."""
         with self._lock:
             return [
                 {

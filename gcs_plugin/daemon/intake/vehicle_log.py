@@ -1,4 +1,4 @@
-"""One vehicle's part of the daemon's telemetry log, for pictures that come long after they were taken."""
+"""One vehicle's part of the daemon's telemetry log, for pictures that arrive long after exposure."""
 
 import mmap
 import os
@@ -10,15 +10,15 @@ _MARKS: Final = (0xFD, 0xFE)
 
 
 def write_link_log(log: Path, system: int, out: Path) -> int:
-    """Copy a vehicle's packets of a telemetry log into one of its own, undecoded.
+    """Copy a vehicle's packets, undecoded, from a telemetry log into its own.
 
     Args:
-        log: `telemetry.tlog` of the workspace; it may be growing.
+        log: `telemetry.tlog` of the workspace; it may still grow.
         system: the vehicle's MAVLink system id.
-        out: written whole or not at all.
+        out: written completely or not at all.
 
     Returns:
-        How many packets; 0 if there is no log.
+        Number of packets; 0 if there is no log.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -37,7 +37,7 @@ def write_link_log(log: Path, system: int, out: Path) -> int:
             elif mark == 0xFE:
                 size = _STEP + 8 + data[at + _STEP + 1]
                 sender = data[at + _STEP + 3]
-            else:  # a torn record, after a power cut
+            else:  # an incomplete record after a power cut
                 at += 1
                 continue
             if at + size > end:

@@ -1,8 +1,8 @@
-"""A folder into which a vehicle's photos and videos arrive: over a network, from a card, half-written, all at once.
+"""Watches a folder that receives a vehicle's photos and videos, over a network or from a memory card.
 
-A file is taken when it is whole (`daemon.whole`) and has not changed between two looks. What was taken is remembered
-in the workspace, so that a card that is put in again, or a restart, costs a look at the names only. Pictures without a
-pose of their own get it from the vehicle's link, or from a log, subtitles or table that arrives beside them.
+A file is read when it is complete (`file_complete`) and has not changed between two scans. Files read are remembered
+in the workspace, so that after a restart, or for a known card, only the names are compared. Pictures without a
+pose of their own get it from the vehicle's link, or from a log, subtitles or table in the folder.
 """
 
 import contextlib
@@ -47,12 +47,12 @@ LinkLog = Callable[[Path], bool]
 
 @dataclass(slots=True)
 class _File:
-    """A file as it was last seen.
+    """The last known state of a file.
 
     Attributes:
-        stamp: size and time of change. since: when it was first seen so. done: True once it needs no more work.
-        again_at: when to look into it again, after it was found not whole.
-        told: True once the user knows that it does not get on.
+        stamp: size and modification time. since: when first seen in this state. done: True once it needs no more work.
+        again_at: time of the next check of an incomplete file.
+        told: True once the user was told that it makes no progress.
     """
 
     stamp: Stamp
@@ -64,17 +64,17 @@ class _File:
 
 @dataclass(slots=True)
 class PictureIntake:
-    """What a folder's reader needs from others.
+    """The callbacks and folders that a folder's reader needs.
 
     Attributes:
         vehicle: id.
-        keep: takes a picture in; returns when it is safe.
-        pose_at: the vehicle's pose at a moment (UTC) from its link.
-        link_log: writes what the vehicle has said so far to a .tlog; False if it has said nothing.
-        tell: told what happens, in words.
-        settled: told when the folder has come to rest after new pictures were taken from it.
-        cache: folder of the workspace for what is remembered, and for pictures of videos until they are kept.
-        stop: set when it is time to end.
+        keep: stores a picture; returns when it is safe.
+        pose_at: returns the vehicle's pose at a time (UTC) from its link.
+        link_log: writes the vehicle's packets so far to a .tlog; returns False if there are none.
+        tell: called with messages for the user.
+        settled: called when the folder has stopped changing after new pictures.
+        cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
+        stop: set to end.
     """
 
     vehicle: str
@@ -91,8 +91,8 @@ class FolderReader:
     """Reads one folder.
 
     Args:
-        folder: watched, with all that lies below it; it may come and go.
-        desk: see Desk.
+        folder: to watch, including subfolders; it may appear and disappear.
+        desk: see PictureIntake.
 
     Attributes:
         state: in words. poseless: files that wait for a pose.
@@ -127,7 +127,7 @@ class FolderReader:
     # -- looking --------------------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> None:
-        """One look at the folder, and what follows from it."""
+        """Scan the folder once, and process the result."""
         if not self.folder.is_dir():
             self.state = "the folder is not there"
             return
@@ -153,7 +153,7 @@ class FolderReader:
             self._intake.settled()
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
-        """Files of the wanted kinds with their stamps, by name; what cannot be read now is left for the next look."""
+        """Files of the wanted kinds with their stamps, by name; unreadable ones are left for the next scan."""
         try:
             with os.scandir(folder) as entries:
                 listed = sorted(entries, key=lambda entry: entry.name)
@@ -173,7 +173,7 @@ class FolderReader:
                 continue
 
     def _batches(self, photos: Sequence[Path]) -> Iterator[list[Path]]:
-        """Some photos at a time, as many as the memory bears."""
+        """Batches of photos limited by memory."""
         batch: list[Path] = []
         size = 0
         for path in photos:
@@ -193,7 +193,7 @@ class FolderReader:
         return path.relative_to(self.folder).as_posix()
 
     def _wait_for(self, path: Path, now: float) -> None:
-        """A file is not whole yet; after a while say so, once."""
+        """Handle an incomplete file; after a while the user is told, once."""
         file = self._files[path]
         file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.told:
@@ -203,7 +203,7 @@ class FolderReader:
     # -- taking ---------------------------------------------------------------------------------------------------
 
     def _take_photos(self, paths: Sequence[Path], now: float) -> None:
-        """Take photos in that are whole, those of one look together: only neighbours tell odd angles from good ones."""
+        """Store the complete photos of one scan together, as wrong angles are found by comparing neighbours."""
         whole: dict[Path, tuple[bytes, str]] = {}
         for path in paths:
             try:
@@ -215,7 +215,7 @@ class FolderReader:
                 self._wait_for(path, now)
                 continue
             digest = digest_of(data)
-            if self._taken.holds(self._name(path), digest):  # touched, or on another card
+            if self._taken.holds(self._name(path), digest):  # modification time changed, or on another card
                 self._done(path, digest)
             else:
                 whole[path] = data, digest
@@ -235,13 +235,13 @@ class FolderReader:
                 data, digest = whole.pop(photo)
                 self._keep(frame, self._taken.name(self._name(photo), digest), data)
                 self._done(photo, digest)
-        root = os.path.commonpath([path.parent.absolute() for path in asked])  # what names are relative to
+        root = os.path.commonpath([path.parent.absolute() for path in asked])  # the root of relative names
         self._without(
             {os.path.normpath(os.path.join(root, r.image)): r for r in found.rejected} if found else {}, whole
         )
 
     def _without(self, rejected: "dict[str, Rejection]", left: dict[Path, tuple[bytes, str]]) -> None:
-        """Photos that did not become frames: those without a position may still get one."""
+        """Handle photos that did not become frames; those without a position may still get one."""
         for path, (data, digest) in left.items():
             rejection = rejected.get(os.path.normpath(path.absolute()))
             self._files[path].done = True
@@ -258,7 +258,7 @@ class FolderReader:
             self._done(path, digest)
 
     def _take_video(self, path: Path, now: float) -> None:
-        """Take the pictures of a video in."""
+        """Store the pictures of a video."""
         try:
             if not is_video_complete(path):
                 self._wait_for(path, now)
@@ -295,7 +295,7 @@ class FolderReader:
         self._files[path].done = True
 
     def _keep(self, frame: "Frame", name: str, data: bytes) -> None:
-        """Take a frame in; height and angles that it lacks come from the link, if that agrees where it was."""
+        """Store a frame; missing height and angles come from the link, if its position agrees."""
         posted = posted_frame(frame, self._intake.vehicle, name)
         if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
             linked = linked_pose(posted.vehicle, name, posted.time_s, self._intake.pose_at(posted.time_s))
@@ -323,14 +323,14 @@ class FolderReader:
             return None
 
     def _tables(self, photos: Iterable[Path]) -> list[Path]:
-        """Tables of poses (geo.txt, CSV) beside photos, and above them within the folder."""
+        """Tables of poses (geo.txt, CSV) in the photos' folder or above it, within the watched folder."""
         above = {folder for photo in photos for folder in photo.parents if folder.is_relative_to(self.folder)}
         return [p for p in self._files if p.suffix.lower() in (".txt", ".csv") and p.parent in above and p.exists()]
 
     # -- poses from logs ------------------------------------------------------------------------------------------
 
     def _pair(self, here: Sequence[Path], now: float) -> None:
-        """Give pictures that have no pose the poses of a log beside them or of the vehicle's link, all at once."""
+        """Assign pictures without poses those of a log in the folder or of the vehicle's link, all at once."""
         waiting = sorted(self.poseless.intersection(here))
         if not waiting or any(now - self._files[path].since < _SETTLED_S for path in here):
             return
@@ -363,7 +363,7 @@ class FolderReader:
             frames.setdefault(frame.image.partition("#")[0], []).append(frame)
         for path in waiting:
             mine = frames.get(self._name(path), [])
-            with contextlib.suppress(OSError):  # gone meanwhile: at the next look
+            with contextlib.suppress(OSError):  # gone meanwhile: left for the next scan
                 if mine and "#" in mine[0].image:
                     self._keep_video(path, replace_frames(found, mine), video_digest(path))
                 elif mine:
@@ -374,14 +374,14 @@ class FolderReader:
 
 
 def replace_frames(found: "Ingest", frames: "list[Frame]") -> "Ingest":
-    """The same with other frames and nothing rejected."""
+    """A copy with other frames and nothing rejected."""
     from orthoswarm.model.frame import Ingest
 
     return Ingest(frames, [], found.warnings)
 
 
 def _stand_in(path: Path, place: Path) -> None:
-    """Put a file where it can be read together with others, without copying it where that is possible."""
+    """Make a file available in another folder, by a link where possible, else by a copy."""
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
         place.symlink_to(path.absolute())

@@ -1,1 +1,1 @@
-"""Jobs of the daemon: a durable queue, worker processes, refinement, and what they publish."""
+"""Jobs of the daemon: a durable queue, worker processes, refinement, and publishing."""

@@ -1,9 +1,9 @@
-"""Jobs: what takes long, kept in the journal from the wish to the result, so that none is forgotten or done twice.
+"""The queue of long jobs, stored in the journal from request to result, so that none is lost or done twice.
 
-A job that was queued or running when the daemon ended is queued again; what it does must be repeatable up to the one
-change of the journal that also marks it as done. Refinements have threads of their own; what belongs to the background
-(coarse maps in flight, neighbours solved together, exports) runs one at a time in another thread. Coarse maps and
-neighbours begin only while no refinement waits or runs.
+A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
+journal change that also marks it as done. Refinements have their own threads; background jobs
+(coarse maps in flight, joint refinements of neighbours, exports) run one at a time in another thread. Coarse maps and
+joint refinements start only while no refinement waits or runs.
 """
 
 import json
@@ -36,9 +36,9 @@ class Job:
     """One job.
 
     Attributes:
-        id: number. kind: refine, together, coarse, redraw or export. vehicle: whose, None for all. sortie: which.
-        state: queued, running, done or failed. progress: 0 to 1. message: what is being done, or why it failed.
-        created, started, ended: UTC epoch seconds. attempts: how often it was begun. detail: JSON values.
+        id: number. kind: refine, together, coarse, redraw or export. vehicle: its id, None for all. sortie: its number.
+        state: queued, running, done or failed. progress: 0 to 1. message: the present step, or why it failed.
+        created, started, ended: UTC epoch seconds. attempts: number of starts. detail: JSON values.
     """
 
     id: int
@@ -76,7 +76,7 @@ class Job:
 
 
 class Preempted(Exception):
-    """A handler's way to say that its work was taken away: to be done again later."""
+    """Raised by a handler that had to give way; the job is queued again."""
 
 
 ReportProgress = Callable[[float, str], None]
@@ -91,15 +91,15 @@ class Jobs:
     """The queue of jobs.
 
     Attributes:
-        problem: why the end of a job cannot be written at present; empty if all is well.
+        problem: why a job's end cannot be written at present, else empty.
 
     Args:
-        journal: where they are kept.
-        events: told of every change.
-        handlers: kind -> what does it.
-        slots: how many refinements can be computed at once. Two more may be at a part that needs no worker process
+        journal: stores the jobs.
+        events: receives every change.
+        handlers: kind -> function that does the job.
+        slots: number of refinements computed at once. Two more may be at a step that needs no worker process
             (waiting for a vehicle's last pictures, publishing).
-        on_drop: called with a running job that is not wanted any more, so that its work may be given up.
+        on_drop: called with a running job that was cancelled, to abandon its work.
     """
 
     def __init__(
@@ -130,30 +130,30 @@ class Jobs:
         self._after.append(listener)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start working."""
         for thread in self._threads:
             thread.start()
 
     @property
     def stopping(self) -> bool:
-        """True once nothing more is begun."""
+        """True once no more jobs are started."""
         return self._stop
 
     def give_up(self) -> None:
-        """Begin nothing more; what fails from now on is not a failure but the end."""
+        """Start no more jobs; errors from now on are due to the shutdown and not failures."""
         with self._condition:
             self._stop = True
             self._condition.notify_all()
 
     def close(self) -> None:
-        """Begin nothing more; what runs is given up by its workers and is queued again at the next start."""
+        """Start no more jobs; running ones are abandoned by their workers and queued again at the next start."""
         self.give_up()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(10.0)
 
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
-        """Queue a job; an equal one that waits already is given instead."""
+        """Queue a job; returns an equal waiting one if there is one."""
         job = self._journal.write(new_job(kind, vehicle, sortie, detail))
         self._tell(job)
         with self._condition:
@@ -161,7 +161,7 @@ class Jobs:
         return job
 
     def drop(self, kind: str, vehicle: str, why: str) -> None:
-        """Let go of a vehicle's jobs of a kind: those that wait end at once, one that runs is given up."""
+        """Cancel a vehicle's jobs of a kind: waiting ones end at once, a running one is abandoned."""
         self._journal.write(drop_change(kind, vehicle, why))
         with self._condition:
             running = [
@@ -175,7 +175,7 @@ class Jobs:
             self._on_drop(job)
 
     def wake(self) -> None:
-        """Look at the queue again: somebody else has put a job into the journal."""
+        """Check the queue again, after a job was put directly into the journal."""
         with self._condition:
             self._condition.notify_all()
 
