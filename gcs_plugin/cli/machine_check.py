@@ -41,7 +41,7 @@ class Check:
 
 
 def checks(workspace: Path) -> list[Check]:
-    """Look at everything; never raises."""
+    """Run all checks; never raises."""
     looks: dict[str, Callable[[], Check | list[Check]]] = {
         "python": _python,
         "cores": _cores,
@@ -59,7 +59,7 @@ def checks(workspace: Path) -> list[Check]:
     for name, look in looks.items():
         try:
             found = look()
-        except Exception as error:  # a check-up must not fall ill itself
+        except Exception as error:  # a check that fails itself is a finding
             found = Check(name, False, f"could not be checked: {error}", cost="install OrthoSwarm again")
         out += [found] if isinstance(found, Check) else found
     return out

@@ -130,7 +130,9 @@ class Daemon:
             make_way=self._make_way,
             stopped=lambda: self.jobs.stopping,
         )
-        self.together = JointRefinement(self.journal, publisher, self.background, settings.basemap, self._published)
+        self.together = JointRefinement(
+            self.journal, publisher, self.background, settings.basemap, settings.redraw_px, self._published
+        )
         self.exports = Exports(
             settings=settings,
             journal=self.journal,
@@ -154,7 +156,7 @@ class Daemon:
             self.jobs.add("redraw")
         for vehicle, sortie in publisher.outdated:
             self.jobs.add("refine", vehicle, sortie)
-        self.leg_watch = LegWatch(self._leg_over, self._refine_late)
+        self.leg_watch = LegWatch(self._leg_over, self._refine_late, silent_s=settings.silent_s)
         self.posted: Counter[str] = Counter()
         self.poses = Poses()
         self.links: VehicleLinks | None = None

@@ -66,7 +66,9 @@ class Settings:
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
         workers: processes that refine. coarse: whether legs are placed in flight.
         lost_after_s: when a silent vehicle's sortie counts as over.
-        vehicles: those that were named. token_file: where the token is, or goes.
+        silent_s: a vehicle without a new picture for so long is silent; then its legs and late pictures are placed.
+        redraw_px: a joint refinement that moves pictures by less, in pixels of the layer, is not drawn.
+        vehicles: those that were named. token_file: path of the token.
         tak: receivers of Cursor-on-Target events, see `tak_address`. tak_certificate: PEM file with this station's
             certificate and key for TLS. tak_authority: PEM file of the server's certificate authority.
     """
@@ -82,6 +84,8 @@ class Settings:
     workers: int = 1
     coarse: bool = True
     lost_after_s: float = 120.0
+    silent_s: float = 8.0
+    redraw_px: float = 0.1
     vehicles: tuple[VehicleSettings, ...] = field(default=())
     token_file: Path | None = None
     tak: tuple[str, ...] = ()

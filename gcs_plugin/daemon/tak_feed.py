@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from orthoswarm.export.tactical.cursor_on_target import event
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
@@ -20,34 +21,31 @@ class TakFeed:
     """Sends all vehicles every two seconds, and all finds when one is new and every half minute.
 
     Args:
-        addresses: the receivers. places: gives the finds and vehicles of the moment.
+        addresses: the receivers. places: returns the present finds and vehicles.
 
     Attributes:
-        problem: why a receiver gets nothing at present, empty if all do.
+        problem: why a receiver gets nothing at present, else empty.
     """
 
     def __init__(self, addresses: Sequence[TakAddress], places: Callable[[], Sequence[Place]]) -> None:
         self._senders = [TakSender(address) for address in addresses]
         self._places = places
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="tak", daemon=True)
+        self._thread = StoppableThread(self._run, "tak", join_s=10.0)
         self.problem = ""
 
     def start(self) -> None:
-        """Begin to send."""
+        """Start sending."""
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(10.0)
+        """Stop sending."""
+        self._thread.close()
         for sender in self._senders:
             sender.close()
 
-    def _run(self) -> None:
+    def _run(self, stop: threading.Event) -> None:
         number, known = 0, set[str]()
-        while not self._stop.wait(_EVERY_S):
+        while not stop.wait(_EVERY_S):
             try:
                 places = self._places()
             except (OrthoSwarmError, TimeoutError) as error:
@@ -62,7 +60,7 @@ class TakFeed:
 
 
 def _sent(sender: TakSender, events: Sequence[bytes]) -> str:
-    """Send all; gives what went wrong, empty if nothing did."""
+    """Send all events; returns the reason of a failure, else an empty text."""
     try:
         for one in events:
             sender.send(one)

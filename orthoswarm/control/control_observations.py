@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import Checkpoint, intersection, photo_named
+from orthoswarm.evaluation.checkpoints import Checkpoint, intersection
+from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain

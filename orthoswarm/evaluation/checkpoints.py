@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.geo import LocalGrid, projection_of
 
 Array = NDArray[np.float64]
 
@@ -276,12 +277,8 @@ def _transformer(system: str, name: str) -> Any:
     """To longitude and latitude, from a coordinate system as ODM and users write it."""
     import pyproj
 
-    words = system.upper().split()
-    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdigit():
-        zone, south = int(words[2][:-1]), words[2][-1] == "S"
-        system = f"EPSG:{(32700 if south else 32600) + zone}"
     try:
-        return pyproj.Transformer.from_crs(system, _GRID, always_xy=True)
+        return pyproj.Transformer.from_crs(projection_of(system) or system, _GRID, always_xy=True)
     except pyproj.exceptions.CRSError:
         raise InputError(
             f"{name}: '{system[:60]}' is not a coordinate system; write EPSG:32617 or a PROJ string"
@@ -352,25 +349,6 @@ class _Views:
         position = np.array([*place, float(camera["height_m"])])
         away = ground - position
         return position, away / np.linalg.norm(away)
-
-
-def photo_named(known: Mapping[str, Any], image: str) -> str | None:
-    """The photo of a name, None if there is none; a name without folders may stand for one photo only.
-
-    Args:
-        known: photos by their names in the products. image: as a table of points writes it.
-
-    Raises:
-        InputError: several photos have that name.
-    """
-    name = image.replace("\\", "/")
-    if name in known:
-        return name
-    tail = "/" + name.rsplit("/", 1)[-1].lower()
-    hits = [other for other in known if ("/" + other).lower().endswith(tail)]
-    if len(hits) > 1:
-        raise InputError(f"{len(hits)} photos are called {image}; write them with their folders")
-    return hits[0] if hits else None
 
 
 def intersection(

@@ -9,6 +9,7 @@ import numpy as np
 import rasterio
 from PIL import Image
 
+from orthoswarm.evaluation.photo_names import photos_named
 from orthoswarm.evaluation.pose_errors import Placement, PoseErrors, pose_errors
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.errors import InputError
@@ -67,10 +68,10 @@ def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
     except (OSError, ValueError) as error:
         raise InputError(f"{poses} cannot be read as frames ({error})") from None
     for record in records:
-        found = _match(record.get("image", ""), true)
-        if found is None or record.get("stage") == "rejected" or not record.get("homography"):
+        names = photos_named(true, record.get("image", ""))
+        if len(names) != 1 or record.get("stage") == "rejected" or not record.get("homography"):
             continue
-        vehicle, epsg, camera = true[found]
+        vehicle, epsg, camera = true[names[0]]
         homography = np.asarray(record["homography"], float)
         if int(record["epsg"]) != epsg:
             there = LocalGrid(epsg).to_geographic(camera.position[:2])
@@ -79,24 +80,13 @@ def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
                 [[1, 0, *(camera.position[:1] - moved[:1])], [0, 1, *(camera.position[1:2] - moved[1:])], [0, 0, 1.0]]
             )
             homography = shift @ homography
-        placed.append(Placement(found, vehicle, homography, record.get("fov_deg"), record.get("sigma_m")))
+        placed.append(Placement(names[0], vehicle, homography, record.get("fov_deg"), record.get("sigma_m")))
         cameras.append(camera)
     if not placed:
         raise InputError(f"no placed frame of {poses} stands in {truth}; do both belong to the same set?")
     report = poses.with_name("report.json")
     plane = float(json.loads(report.read_text()).get("ground_z_m") or 0.0) if report.exists() else 0.0
     return pose_errors(placed, cameras, plane, _ground_level(truth.with_name("dtm.tif"), cameras))
-
-
-def _match(image: str, names: dict[str, Any]) -> str | None:
-    """The truth's name of an image: the longest common tail of path parts."""
-    parts = image.replace("\\", "/").split("/")
-    for k in range(len(parts)):
-        tail = "/".join(parts[k:])
-        if tail in names:
-            return tail
-    hits = [name for name in names if name.endswith("/" + image)]
-    return hits[0] if len(hits) == 1 else None
 
 
 def _ground_level(dtm: Path, cameras: list[Any]) -> float:

@@ -43,6 +43,10 @@ class Source(Protocol):
         """Colours uint8 (rows, columns, 4) of a window of the picture reduced by a power of two."""
 
 
+CLASSIC_BYTES = 2**32 - 2**20
+"""Size that a classic TIFF with its 32-bit offsets can have, with some room."""
+
+
 def write_cog(
     source: Source,
     path: Path,
@@ -50,6 +54,7 @@ def write_cog(
     window: tuple[int, int, int, int] | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
+    classic_bytes: int = CLASSIC_BYTES,
 ) -> None:
     """Write a source as a COG: RGBA uint8, deflate, tiles of 512, overviews by powers of two.
 
@@ -59,6 +64,7 @@ def write_cog(
         window: rows and columns (row0, row1, col0, col1) to write, the first ones multiples of TILE_PX; None for all.
         progress: called with tiles written and tiles in all.
         threads: how many tiles are compressed at once.
+        classic_bytes: a file that may become larger is a BigTIFF.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
@@ -67,7 +73,7 @@ def write_cog(
     row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
     levels = _levels(row1 - row0, col1 - col0)
     with written_whole(path) as part, part.open("w+b") as file:
-        tables = _write_directories(file, source.grid, (row0, col0), levels)
+        tables = _write_directories(file, source.grid, (row0, col0), levels, _form_of(levels, classic_bytes))
         done, total = 0, sum(level.tiles for level in levels)
         for level, table in reversed(list(zip(levels, tables, strict=True))):
             for i, data in enumerate(_compressed(source, (row0, col0), level, threads)):
@@ -153,7 +159,6 @@ def _deflate(tile: Bytes) -> bytes:
 
 _SHORT, _LONG, _DOUBLE, _ASCII, _LONG8 = 3, 4, 12, 2, 16
 _FORMATS = {_SHORT: "H", _LONG: "I", _DOUBLE: "d"}
-_CLASSIC_BYTES = 2**32 - 2**20
 _TILE_BYTES = TILE_PX * TILE_PX * 4
 _WORST_TILE = _TILE_BYTES + _TILE_BYTES // 64 + 1024  # deflate stores what it cannot shrink, with some bytes a block
 
@@ -184,15 +189,16 @@ _CLASSIC = _Form(struct.pack("<2sH", b"II", 42), 4, "<H", "<I", _LONG)
 _BIG = _Form(struct.pack("<2sHHH", b"II", 43, 8, 0), 8, "<Q", "<Q", _LONG8)
 
 
-def _form_of(levels: list[_Level]) -> _Form:
-    """Classic where the file stays below 4 GiB at worst."""
+def _form_of(levels: list[_Level], classic_bytes: int) -> _Form:
+    """Classic TIFF if the file stays below this size at worst, else BigTIFF."""
     worst = sum(_WORST_TILE * level.tiles for level in levels)
-    return _CLASSIC if worst < _CLASSIC_BYTES else _BIG
+    return _CLASSIC if worst < classic_bytes else _BIG
 
 
-def _write_directories(file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level]) -> list[_Table]:
+def _write_directories(
+    file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level], form: "_Form"
+) -> list[_Table]:
     """Header and directories, with room for the tile tables; the file is left at the first tile's place."""
-    form = _form_of(levels)
     ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
     ghost += bytes(-len(ghost) % 16)
     at = len(form.header) + form.word + len(ghost)

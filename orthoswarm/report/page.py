@@ -101,7 +101,7 @@ def write_page(
         ortho = product_picture(best, view_grid(report["epsg"], product_bounds(best), 2000, least))
         there = None if basemap is None else MapView.read(basemap, ortho.grid)
         if basemap is not None and there is not None and not report.get("control"):  # which moved it off the map
-            shifts = _shifts(best, ortho, there, basemap, least)
+            shifts = shifts_against_map(best, ortho, there, basemap, least)
             values["edges"] = _edge_crops(best, ortho, there, basemap)
         values |= _pictures(out, ortho, report, placed, there, shifts)
     values["verdict"] = _verdict(report, placed, shifts)
@@ -118,20 +118,34 @@ def _against_map(shifts: Moved) -> dict[str, float | int]:
     return {"median": median, "p95": p95, "blocks": len(shifts.at)}
 
 
-def _shifts(best: Path, ortho: Picture, there: MapView, basemap: Basemap, least: float) -> Moved:
+def shifts_against_map(
+    best: Path,
+    ortho: Picture,
+    there: MapView,
+    basemap: Basemap,
+    least_gsd_m: float,
+    *,
+    fine_m: float = _FINE_M,
+    part_px: int = _PART_PX,
+) -> Moved:
     """Where blocks of the map are found in the orthoimage; of a large area in nine parts of it.
 
     Pixels of some metres would compare roofs, which lean, and not roads.
+
+    Args:
+        best: file of the orthoimage. ortho: the same, reduced. there: the map on its grid. basemap: the map.
+        least_gsd_m: of orthoimage and map, metres. fine_m: largest pixel with which blocks are compared, metres.
+        part_px: side of a part, pixels.
     """
-    if ortho.grid.gsd_m <= _FINE_M:
+    if ortho.grid.gsd_m <= fine_m:
         return _moved(ortho, there)
     west, south, east, north = ortho.grid.bounds
-    gsd = max(least, 0.5 * _FINE_M)
-    half = 0.5 * _PART_PX * gsd
+    gsd = max(least_gsd_m, 0.5 * fine_m)
+    half = 0.5 * part_px * gsd
     parts = []
     for i, j in itertools.product((1, 3, 5), repeat=2):
         x, y = west + i / 6 * (east - west), south + j / 6 * (north - south)
-        grid = GroundGrid(ortho.grid.epsg, x - half, y + half, gsd, _PART_PX, _PART_PX)
+        grid = GroundGrid(ortho.grid.epsg, x - half, y + half, gsd, part_px, part_px)
         part, its_map = product_picture(best, grid), MapView.read(basemap, grid)
         if its_map is not None and part.seen.any():
             parts.append(_moved(part, its_map))

@@ -375,8 +375,8 @@ def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone
     assert {p.name for p in out.iterdir()} >= {"report.html", "report.json", "frames.jsonl"}
 
 
-def test_a_large_area_is_compared_with_the_map_in_parts(flight, mapped, monkeypatch):
-    from orthoswarm.report import page
+def test_a_large_area_is_compared_with_the_map_in_parts(flight, mapped):
+    from orthoswarm.report.page import shifts_against_map
     from orthoswarm.report.report_pictures import MapView, product_bounds, product_picture, view_grid
 
     best = mapped[0] / "orthoimage.tif"
@@ -384,11 +384,9 @@ def test_a_large_area_is_compared_with_the_map_in_parts(flight, mapped, monkeypa
     basemap = Basemap.open(flight[2] / "map.tif", flight[0].grid.epsg, bounds)
     ortho = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 400, 0.3))
     there = MapView.read(basemap, ortho.grid)
-    whole = page._shifts(best, ortho, there, basemap, 0.3)
-    monkeypatch.setattr(page, "_FINE_M", 0.6)
-    monkeypatch.setattr(page, "_PART_PX", 160)
+    whole = shifts_against_map(best, ortho, there, basemap, 0.3)
     coarse = product_picture(best, view_grid(flight[0].grid.epsg, bounds, 100, 0.3))
     assert coarse.grid.gsd_m > 0.6
-    parts = page._shifts(best, coarse, MapView.read(basemap, coarse.grid), basemap, 0.3)
+    parts = shifts_against_map(best, coarse, MapView.read(basemap, coarse.grid), basemap, 0.3, fine_m=0.6, part_px=160)
     assert len(whole.at) > 3 and len(parts.at) > 3
     assert np.median(parts.size_m) < np.median(whole.size_m) + 0.3

@@ -102,7 +102,7 @@ def test_doctor_survives_what_it_looks_at(monkeypatch, tmp_path):
     def broken():
         raise RuntimeError("no such library")
 
-    monkeypatch.setattr(gcs_plugin.cli.machine_check, "_video", broken)
+    monkeypatch.setattr(gcs_plugin.cli.machine_check, "_video", broken)  # no machine has this fault at will
     (video,) = (c for c in checks(tmp_path) if c.name == "video")
     assert not video.ok and "no such library" in video.detail
 

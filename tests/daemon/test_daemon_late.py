@@ -24,10 +24,8 @@ def flight(tmp_path_factory):
 
 
 @pytest.fixture
-def daemon(tmp_path, flight, monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.5)
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.1)
-    settings = Settings(tmp_path / "w", basemap=flight[1], coarse=False)
+def daemon(tmp_path, flight):
+    settings = Settings(tmp_path / "w", basemap=flight[1], coarse=False, silent_s=0.5)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         yield daemon
@@ -79,10 +77,10 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
 
 
-def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight, monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 3600.0)  # it ends before it has noticed
+def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight):
     frames, basemap = flight
-    settings = Settings(tmp_path / "w", basemap=basemap, coarse=False)
+    # each daemon ends before it notices the silence
+    settings = Settings(tmp_path / "w", basemap=basemap, coarse=False, silent_s=3600.0)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         post(daemon, frames[:16])
@@ -112,11 +110,9 @@ def test_a_vehicle_that_stood_at_one_spot_stays_as_recorded_and_says_so(daemon, 
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
 
 
-def test_silence_is_told_however_few_pictures_came(monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.02)
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.2)
+def test_silence_is_told_however_few_pictures_came():
     asked, silent = [], []
-    watch = LegWatch(lambda *values: asked.append(values), lambda *values: silent.append(values))
+    watch = LegWatch(lambda *values: asked.append(values), lambda *values: silent.append(values), silent_s=0.2)
     watch.start()
     for count in (1, 2):
         watch.add("v1", 1, 1e9 + count, 48.0, 11.0)

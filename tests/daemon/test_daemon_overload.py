@@ -15,6 +15,7 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, add_frame
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
 from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.raster.picture_file import read_rgba
 from tests.kit.daemon_kit import GRID, SIZE, camera_at, jpeg, pose_of
 from tests.kit.mosaic_scene import EAST, NORTH
 
@@ -92,24 +93,41 @@ def wait_until(done):
         time.sleep(0.05)
 
 
-def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path, monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._IN_MEMORY", 12)
-    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._LATE_S", 0.2)
-    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer._LOOK_S", 0.05)
+class RecordedEvents(Events):
+    """Events that are recorded instead of handed to listeners."""
+
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def publish(self, kind, /, **fields):
+        self.told.append((kind, fields))
+
+
+def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path):
     in_time, may_read = threading.Event(), threading.Semaphore(0)
-    read = __import__("orthoswarm.raster.picture_file", fromlist=["read_rgba"]).read_rgba
 
     def slowly(path):
         if not in_time.is_set():
             assert may_read.acquire(timeout=120)
-        return read(path)
+        return read_rgba(path)
 
-    monkeypatch.setattr("gcs_plugin.daemon.layers.realtime_layer.read_rgba", slowly)
-    events, told = Events(), []
-    monkeypatch.setattr(events, "publish", lambda kind, /, **fields: told.append((kind, fields)))
+    events = RecordedEvents()
+    told = events.told
     journal, store, layer = Journal(tmp_path / "journal.db"), PictureStore(tmp_path / "p"), Layer("realtime")
     (tmp_path / "layers").mkdir()
-    drawer = Drawer(journal, store, layer, tmp_path / "layers", events, gsd_m=0.5)
+    drawer = Drawer(
+        journal,
+        store,
+        layer,
+        tmp_path / "layers",
+        events,
+        gsd_m=0.5,
+        in_memory=12,
+        late_s=0.2,
+        look_s=0.05,
+        read=slowly,
+    )
     drawer.start()
     data = jpeg(camera_at())
     for k in range(90):  # fifteen near one another at each of six places, one place after the other

@@ -32,8 +32,9 @@ def flights(tmp_path_factory):
 
 
 @pytest.fixture
-def daemon(tmp_path, flights):
-    settings = Settings(tmp_path / "w", basemap=flights[1], coarse=False)
+def daemon(tmp_path, flights, request):
+    """A daemon; its parameter is the movement, in pixels, below which a joint refinement is not drawn."""
+    settings = Settings(tmp_path / "w", basemap=flights[1], coarse=False, redraw_px=request.param)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         yield daemon
@@ -51,8 +52,8 @@ def errors(found, frames):
     return np.array([np.hypot(*(p.camera.to_ground(middle) - true[p.frame.image])) for p in found.placed])
 
 
-def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flights, monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.joint_refinement._LEAST_PX", 0.0)
+@pytest.mark.parametrize("daemon", [0.0], indirect=True)
+def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flights):
     frames, _ = flights
     versions = []
     for count, vehicle in enumerate(frames, 1):
@@ -81,8 +82,8 @@ def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flight
     assert sorted(path.name for path in (daemon.settings.workspace / "solutions").glob("solution*.part")) == []
 
 
-def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights, monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.joint_refinement._LEAST_PX", 1e6)
+@pytest.mark.parametrize("daemon", [1e6], indirect=True)
+def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights):
     frames, _ = flights
     for count, vehicle in enumerate(frames, 1):
         post(daemon, frames[vehicle])
@@ -192,7 +193,7 @@ class Placed:
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
     workers = StoppedWorkers()
-    work = JointRefinement(Rows(), Placed(tmp_path), workers, tmp_path / "map.tif")
+    work = JointRefinement(Rows(), Placed(tmp_path), workers, tmp_path / "map.tif", least_px=0.1)
     jobs = Jobs(journal, Events(), {"together": work.solve}, slots=1)
     job = jobs.add("together", "v1", 1)
     found = []

@@ -67,16 +67,14 @@ def test_only_the_newest_legs_are_placed_anew():
     assert len(long) == MOST
 
 
-def test_a_watch_asks_when_a_leg_is_over_and_when_a_vehicle_falls_silent(monkeypatch):
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._LOOK_S", 0.02)
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 3600.0)
+def test_a_watch_asks_when_a_leg_is_over_and_when_a_vehicle_falls_silent():
     asked, heard = [], threading.Event()
 
     def ask(*values):
         asked.append(values)
         heard.set()
 
-    watch = LegWatch(ask)
+    watch = LegWatch(ask, silent_s=3600.0)
     watch.start()
     frames = frames_at(lawn(2, 20))
     for frame in frames[:12]:
@@ -87,7 +85,7 @@ def test_a_watch_asks_when_a_leg_is_over_and_when_a_vehicle_falls_silent(monkeyp
     assert heard.wait(60)
     assert asked[0] == ("v1", 1, False)
     heard.clear()
-    monkeypatch.setattr("gcs_plugin.daemon.jobs.leg_watch._SILENT_S", 0.1)
+    watch.silent_s = 0.1
     assert heard.wait(60)
     assert asked[1] == ("v1", 1, True)
     heard.clear()

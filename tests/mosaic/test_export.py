@@ -16,7 +16,7 @@ from rasterio.warp import transform, transform_bounds
 from gcs_plugin.cli.main import main
 from orthoswarm.export import cog
 from orthoswarm.export.atomic_file import written_whole
-from orthoswarm.export.cog import TILE_PX, write_cog
+from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, write_cog
 from orthoswarm.export.cog_conversion import convert_cog
 from orthoswarm.export.kmz import write_kmz
 from orthoswarm.export.mbtiles import write_mbtiles
@@ -82,12 +82,10 @@ def test_a_cog_holds_the_pixels_and_its_overviews(raster, ortho):
     assert raster.largest <= TILE_PX**2
 
 
-@pytest.mark.parametrize(("limit", "version"), [(None, 42), (1, 43)])
-def test_a_picture_is_a_classic_tiff_unless_it_may_be_too_large(raster, tmp_path, monkeypatch, limit, version):
-    if limit is not None:
-        monkeypatch.setattr(cog, "_CLASSIC_BYTES", limit)
+@pytest.mark.parametrize(("limit", "version"), [(CLASSIC_BYTES, 42), (1, 43)])
+def test_a_picture_is_a_classic_tiff_unless_it_may_be_too_large(raster, tmp_path, limit, version):
     path = tmp_path / "o.tif"
-    write_cog(raster, path)
+    write_cog(raster, path, classic_bytes=limit)
     data = path.read_bytes()
     assert data[:4] == bytes([73, 73, version, 0])
     with rasterio.open(path) as image:
@@ -103,8 +101,8 @@ def test_a_picture_is_a_classic_tiff_unless_it_may_be_too_large(raster, tmp_path
 
 
 def test_a_city_is_a_classic_tiff_and_a_county_is_not():
-    assert cog._form_of(cog._levels(16_000, 14_000)) is cog._CLASSIC
-    assert cog._form_of(cog._levels(60_000, 50_000)) is cog._BIG
+    assert cog._form_of(cog._levels(16_000, 14_000), CLASSIC_BYTES) is cog._CLASSIC
+    assert cog._form_of(cog._levels(60_000, 50_000), CLASSIC_BYTES) is cog._BIG
     noise = np.random.default_rng(0).integers(0, 256, (TILE_PX, TILE_PX, 4), np.uint8)
     noise[..., 3] = np.maximum(noise[..., 3], 1)
     assert len(cog._deflate(noise)) + 8 < cog._WORST_TILE

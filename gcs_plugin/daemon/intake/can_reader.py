@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
+from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LivePoses
 
@@ -78,9 +79,8 @@ class CanReader:
         self.vehicle = vehicle
         self._bus, self._tell, self._state, self._said = bus, tell, "waiting", ""
         self._source = CanSource(poses)
-        self._stop = threading.Event()
         self._heard, self._count = float("-inf"), 0
-        run: Callable[[], None] = self._read
+        run = self._read
         if bus.partition(":")[0] == _TUNNEL:
             if fleet is None or system is None:
                 raise InputError(
@@ -88,18 +88,16 @@ class CanReader:
                     f"vehicle's system id in the workspace's orthoswarm.toml where its name is not v1 to v255"
                 )
             tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source.feed)
-            run = tunnel.run_until(self._stop)
-        self._thread = threading.Thread(target=run, name=f"CAN bus of {vehicle}", daemon=True)
+            run = tunnel.run
+        self._thread = StoppableThread(run, f"CAN bus of {vehicle}")
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start reading."""
         self._thread.start()
 
     def close(self) -> None:
         """Stop reading."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(5.0)
+        self._thread.close()
 
     def document(self) -> dict[str, Any]:
         """Its state as JSON values: `bus`, `state` and, by node id, messages `received` and `lost`."""
@@ -109,17 +107,17 @@ class CanReader:
         state = "receiving" if now - self._heard < _SILENT_S else self._state
         return {"bus": self._bus, "state": state, "nodes": self._source.nodes()}
 
-    def _read(self) -> None:
+    def _read(self, stop: threading.Event) -> None:
         import can
 
-        while not self._stop.is_set():
+        while not stop.is_set():
             try:
                 self._state = "waiting"
-                self._source.run(self._bus, self._stop)
+                self._source.run(self._bus, stop)
                 return
             except (OrthoSwarmError, OSError, can.CanError) as error:
                 self._fail(str(error))
-            self._stop.wait(_AGAIN_S)
+            stop.wait(_AGAIN_S)
 
     def _fail(self, reason: str) -> None:
         """Report a problem once; the connection is retried all the time."""
@@ -135,16 +133,12 @@ class _Tunnel:
         self._fleet, self._system, self._bus, self._take = fleet, system, bus, take
         fleet.subscribe(self._message, "CAN_FRAME", "CANFD_FRAME")
 
-    def run_until(self, stop: threading.Event) -> Callable[[], None]:
-        """Repeat the request until stopped."""
-
-        def run() -> None:
-            while not stop.is_set():
-                self._fleet.call(self._ask)
-                stop.wait(_ASK_S)
-            self._fleet.call(lambda: self._send([self._forward(0)]))
-
-        return run
+    def run(self, stop: threading.Event) -> None:
+        """Repeat the request until stopped, then end the forwarding."""
+        while not stop.is_set():
+            self._fleet.call(self._ask)
+            stop.wait(_ASK_S)
+        self._fleet.call(lambda: self._send([self._forward(0)]))
 
     def _message(self, vehicle: "Vehicle", message: "Message", utc_s: float) -> None:
         if vehicle.system == self._system and message.bus in (self._bus - 1, self._bus):

@@ -1,10 +1,10 @@
-"""Overlapping neighbours solved together: what was refined first has not yet seen those that completed after it.
+"""Joint refinement of overlapping neighbours: a sortie refined first does not use those that completed after it.
 
-A vehicle is refined when it completes, beside the neighbours that are there, which are held; the first one knows of
-nobody. Once a neighbour has been refined, all that overlap it pass once more, and so does it (the second pass of the
-batch, `orthoswarm.refine.strategy`): on a common level, their pictures linked, and what the map did not show is laid
-beside those that it did show. That is work for a quiet moment: it begins when no refinement waits, and gives way to
-any that comes.
+A vehicle is refined when it completes, with the neighbours refined so far held fixed; the first one has none. Once a
+neighbour has been refined, all sorties that overlap it are refined again together with it (the second pass of the
+batch, `orthoswarm.refine.strategy`): on a common height level, with ties between their pictures, so that sorties that
+could not be registered onto the map are registered to their neighbours. The job has low priority: it starts when no
+refinement waits, and gives way to any that arrives.
 """
 
 import json
@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress, new_job
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
@@ -23,9 +23,6 @@ from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
-
-_LEAST_PX: Final = 0.1
-"""What moves less, in pixels of the layer, is not drawn again."""
 
 
 def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable[[Any], Job]]:
@@ -43,12 +40,14 @@ class JointRefinement:
     Attributes:
         journal, publisher: what there is. workers: where the work runs; it is this one's alone while a job runs.
         basemap: the map. on_published: called with layer and job when pixels have changed.
+        least_px: pictures that move less, in pixels of the layer, are not drawn again.
     """
 
     journal: Journal
     publisher: Publisher
     workers: WorkerPool
     basemap: Path | None
+    least_px: float
     on_published: Callable[[str, Job], None] = lambda layer, job: None
     _working: bool = False
     _aside: bool = False
@@ -98,7 +97,7 @@ class JointRefinement:
             "frames": len(solved.stages), "neighbours": len(others), "moved_p95_m": round(moved_m, 3),
             "solve_cpu_s": round(solved.cpu_s, 3), "warnings": solved.warnings,
         }  # fmt: skip
-        if moved_m < _LEAST_PX * area.gsd_m:
+        if moved_m < self.least_px * area.gsd_m:
             return _note(job, "it lies well beside its neighbours")
         with self.publisher.turn("fine"):
             now = solution_row(self.journal, job)

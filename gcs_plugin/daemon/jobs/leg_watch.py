@@ -1,6 +1,6 @@
-"""Notices, while vehicles fly, when a leg is over, and asks for its coarse map; cheap enough for every frame.
+"""Detects finished legs in flight and asks for their coarse maps; fast enough to be called for every frame.
 
-It notices, too, when a vehicle falls silent: that may be the end of a leg, and of pictures that came late.
+It also detects when a vehicle falls silent, which may be the end of a leg, or of pictures that arrived late.
 """
 
 import logging
@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 
+from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from orthoswarm.refine.flight.finished_legs import ended_legs
 
 FEWEST: Final = 10
-"""New pictures of legs that are over, before a coarse map of them is worth its while."""
+"""Least number of new pictures of finished legs for a coarse map."""
 _LOOK_S: Final = 0.5
-_SILENT_S: Final = 8.0
 _METRES_A_DEGREE: Final = 111_320.0
 _log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ Ask = Callable[[str, int, bool], None]
 
 @dataclass(slots=True)
 class _Path:
-    """Where a sortie's pictures were taken since the last leg that was asked for."""
+    """Times and positions of a sortie's pictures since the last leg that was asked for."""
 
     times: list[float] = field(default_factory=list)
     places: list[tuple[float, float]] = field(default_factory=list)
@@ -38,48 +38,54 @@ class LegWatch:
     """Watches the paths of all vehicles, in a thread.
 
     Args:
-        ask: called with vehicle, sortie and whether it has fallen silent, when legs are over.
-        silent: called with vehicle and sortie when no picture has come for 8 s, however few came before.
+        ask: called with vehicle, sortie and whether it has fallen silent, when legs are finished.
+        silent: called with vehicle and sortie when a vehicle falls silent, however few pictures it sent before.
+
+    Attributes:
+        silent_s: a vehicle is silent when no picture has arrived for so long, seconds.
     """
 
-    def __init__(self, ask: Ask, silent: Callable[[str, int], None] = lambda vehicle, sortie: None) -> None:
-        self._ask, self._silent = ask, silent
+    def __init__(
+        self,
+        ask: Ask,
+        silent: Callable[[str, int], None] = lambda vehicle, sortie: None,
+        *,
+        silent_s: float,
+    ) -> None:
+        self._ask, self._silent, self.silent_s = ask, silent, silent_s
         self._lock = threading.Lock()
         self._paths: dict[tuple[str, int], _Path] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="legs", daemon=True)
+        self._thread = StoppableThread(self._run, "legs")
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Start watching."""
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no more."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(5.0)
+        """Stop watching."""
+        self._thread.close()
 
     def add(self, vehicle: str, sortie: int, time_s: float, lat_deg: float, lon_deg: float) -> None:
-        """A picture has come; any thread."""
+        """Record a picture; any thread."""
         with self._lock:
             path = self._paths.setdefault((vehicle, sortie), _Path())
             path.times.append(time_s)
             path.places.append((lat_deg, lon_deg))
             path.heard, path.dirty = time.monotonic(), True
 
-    def _run(self) -> None:
-        while not self._stop.wait(_LOOK_S):
+    def _run(self, stop: threading.Event) -> None:
+        while not stop.wait(min(_LOOK_S, 0.25 * self.silent_s)):
             now = time.monotonic()
             with self._lock:
                 due = [
                     (key, path)
                     for key, path in self._paths.items()
-                    if (path.dirty and len(path.times) >= FEWEST) or 0 < path.heard < now - _SILENT_S
+                    if (path.dirty and len(path.times) >= FEWEST) or 0 < path.heard < now - self.silent_s
                 ]
             for key, path in due:
                 try:
                     self._look(key, path, now)
-                except Exception:  # whatever one path looks like, the others are watched on
+                except Exception:  # an error in one path must not end the watch of the others
                     _log.exception("the legs of %s", key[0])
 
     def _look(self, key: tuple[str, int], path: _Path, now: float) -> None:
@@ -87,10 +93,10 @@ class LegWatch:
             order = sorted(range(len(path.times)), key=path.times.__getitem__)
             times = [path.times[k] for k in order]
             places = [path.places[k] for k in order]
-            silent = now - path.heard > _SILENT_S
+            silent = now - path.heard > self.silent_s
             path.dirty = False
             if silent:
-                path.heard = 0.0  # told once
+                path.heard = 0.0  # reported once
         if silent:
             self._silent(*key)
         if len(times) < FEWEST:

@@ -68,6 +68,10 @@ class Drawer:
         anchor: Callable[[], Anchor | None] = lambda: None,
         on_rejected: Callable[[Frame, str, bool], None] = lambda frame, reason, misplaced: None,
         on_drawn: Callable[[PlacedFrame, PictureQuality | None], None] = lambda placed, quality: None,
+        in_memory: int = _IN_MEMORY,
+        late_s: float = _LATE_S,
+        look_s: float = _LOOK_S,
+        read: Callable[[Path], Bytes] = read_rgba,
     ) -> None:
         """Take up where the last daemon stopped; `start` begins to draw.
 
@@ -83,11 +87,16 @@ class Drawer:
             anchor: gives where the map is to lie, None to go by the pictures.
             on_rejected: called with each frame that cannot be on the map, why, and whether that is for its place.
             on_drawn: called with each frame that is on the map as recorded, and what its pixels say (None: too small).
+            in_memory: most frames that wait in memory; the journal has the others.
+            late_s: a frame drawn later than this after its arrival is late, seconds.
+            look_s: time between looks for late frames, seconds.
+            read: reads a picture file, uint8 (rows, columns, 4).
         """
+        self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
         self._on_rejected, self._on_drawn = on_rejected, on_drawn
         self._begun = 0
-        self._queue = DrawQueue(_IN_MEMORY)
+        self._queue = DrawQueue(self._in_memory)
         self._waiting: set[int] = set()
         self._looked = 0.0
         self._more, self._looking = True, False
@@ -188,11 +197,11 @@ class Drawer:
     def _tell_overload(self) -> None:
         """Say how many frames are put off, when that has changed; the journal knows."""
         now = time.monotonic()
-        if now - self._looked < _LOOK_S or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
+        if now - self._looked < self._look_s or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
             return
         self._looked = now
         query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?"
-        row = self._journal.one(query, (time.time() - _LATE_S,))
+        row = self._journal.one(query, (time.time() - self._late_s,))
         before, self.put_off = self.put_off, 0 if row is None else int(row["n"])
         if bool(before) != bool(self.put_off):
             _log.warning("%s", self.overload or "all pictures are on the map again")
@@ -211,17 +220,17 @@ class Drawer:
 
     def _refill(self) -> None:
         with self._condition:
-            if not self._more or len(self._queue) > _IN_MEMORY // 2:
+            if not self._more or len(self._queue) > self._in_memory // 2:
                 return
             self._more, self._looking = False, True
-        most = _IN_MEMORY + len(self._waiting) + 1
+        most = self._in_memory + len(self._waiting) + 1
         rows = self._journal.rows(f"SELECT {_COLUMNS} FROM frames WHERE drawn = 0 ORDER BY seq LIMIT ?", (most,))
         with self._condition:
             self._looking = False
             self._more = self._more or len(rows) == most
             for row in rows:
                 if row["seq"] not in self._waiting:
-                    if len(self._queue) >= _IN_MEMORY:
+                    if len(self._queue) >= self._in_memory:
                         self._more = True
                         break
                     self._put(Pending(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
@@ -258,7 +267,7 @@ class Drawer:
     def _note(self, pending: Pending, result: Drawn) -> None:
         took = time.time() - pending.arrived
         self.drawn += 1
-        self.late += took > _LATE_S
+        self.late += took > self._late_s
         self.latencies.append(took)
         del self.latencies[:-1000]
 
@@ -279,7 +288,7 @@ class Drawer:
                 self._on_rejected(frame, place, True)
                 return self._report(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
-            picture = read_rgba(frame.path)
+            picture = self._read(frame.path)
             mosaic = self._site.mosaic
             assert mosaic is not None
             added = mosaic.add(picture, camera, weak=frame.damaged)

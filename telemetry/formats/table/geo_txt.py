@@ -5,15 +5,14 @@ A line with the projection ("EPSG:4326", a PROJ string, "WGS84 UTM 17N"), then, 
     name x y [z] [yaw] [pitch] [roll] [horizontal accuracy] [vertical accuracy] [anything else]
 
 z is an absolute altitude. Pitch is 0 at nadir in some files and -90 in others, which is decided by the file's values.
-Angles of
-0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "Image Geolocation Files".
+Angles of 0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "Image Geolocation Files".
 """
 
 import math
-import re
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import projection_of
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
 from telemetry.samples.sample import is_position
@@ -31,19 +30,6 @@ def is_geo_txt(path: Path) -> bool:
     except OSError:
         return False
     return path.name.lower() == "geo.txt" or (path.name.lower().startswith("geo") and projection_of(first) is not None)
-
-
-def projection_of(line: str) -> str | None:
-    """The projection that a line names, None where it names none."""
-    text = line.strip()
-    if re.fullmatch(r"EPSG:\d{4,6}", text, re.IGNORECASE):
-        return text.upper()
-    if "+proj" in text or "+init" in text:
-        return text
-    match = re.fullmatch(r"WGS\s*84\s*/?\s*UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", text, re.IGNORECASE)
-    if match and 1 <= int(match[1]) <= 60:
-        return f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
-    return None
 
 
 def read_geo_txt(path: Path) -> PoseTable:
