@@ -39,3 +39,15 @@ def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
                 page.focus(".find-pictures button")
                 page.keyboard.press("Escape")
                 page.wait_for_selector(".find-pictures", state="hidden")
+
+
+def test_the_ground_under_a_vehicle_can_be_marked(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        station.answer = lambda method, path, body: (200, {"id": 1} | body)
+        page.wait_for_selector(".vehicle")
+        page.click("#tab-map")
+        page.fill("input[aria-label='Note of the find']", "Under a vehicle")
+        page.click("text=Mark on the map")
+        box = page.locator("button.vehicle").bounding_box()
+        with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/api/finds")):
+            page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)

@@ -1,5 +1,6 @@
 // Which tool has the map's clicks: one at a time, Escape puts it down.
 
+import { setAttribute } from "/static/core/dom.js";
 import { map } from "/static/map/map.js";
 
 export const tool = { active: null };
@@ -10,6 +11,7 @@ export function takeTool(name, end) {
   tool.active = name;
   ends.set(name, end);
   map.getCanvas().style.cursor = "crosshair";
+  setAttribute(map.getContainer(), "data-tool", name);
   map.doubleClickZoom.disable();
 }
 
@@ -17,6 +19,7 @@ export function dropTool(name) {
   if (tool.active !== name) return;
   tool.active = null;
   map.getCanvas().style.cursor = "";
+  setAttribute(map.getContainer(), "data-tool", null);
   setTimeout(() => map.doubleClickZoom.enable(), 400);
 }
 
