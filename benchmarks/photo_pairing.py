@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from tests.telemetry.exposure_grid import exposures, scored
+from tests.telemetry.ingest.exposure_grid import exposures, scored
 
 
 def main() -> None:

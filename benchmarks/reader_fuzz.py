@@ -38,18 +38,11 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     from telemetry.video.picture_poses import Poses
     from telemetry.video.video_file import scan
     from telemetry.write.sei_writer import add_sei
-    from tests.telemetry import (
-        test_can_logs,
-        test_flight_logs,
-        test_gpmf,
-        test_klv,
-        test_photos,
-        test_reader_fuzz,
-        test_srt,
-        test_video,
-    )
-    from tests.telemetry.test_exposure_lists import write_mrk, write_pos
-    from tests.telemetry.test_tables import TABLES
+    from tests.telemetry.formats import test_can_logs, test_flight_logs, test_gpmf, test_klv, test_reader_fuzz, test_srt
+    from tests.telemetry.formats.test_exposure_lists import write_mrk, write_pos
+    from tests.telemetry.formats.test_tables import TABLES
+    from tests.telemetry.ingest import test_photos
+    from tests.telemetry.video import test_video
 
     def file(read: Callable[[Path], Any], name: str) -> Reader:
         def run(data: bytes, folder: Path) -> None:
@@ -128,7 +121,7 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
 
 def _feed(name: str, inputs: int, seed: int, result: Any) -> None:
     """Feed one reader within limits; sends inputs done, failures, one failure as text and seconds."""
-    from tests.telemetry.test_reader_fuzz import mutated
+    from tests.telemetry.formats.test_reader_fuzz import mutated
 
     seconds = max(_LEAST_SECONDS, int(inputs * _SECONDS_AN_INPUT))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))

@@ -76,7 +76,7 @@ def whole(path: Path) -> bool:
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     """A small flight."""
-    from tests.daemon.test_picture_sources import tagged
+    from tests.daemon.intake.test_picture_sources import tagged
 
     folder = tmp_path_factory.mktemp("photos") / "v1"
     folder.mkdir()

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from telemetry.formats.log.flight_logs import read_log
 from telemetry.ingest.event_pairing import by_time, pair
 from telemetry.ingest.ingest import load
-from tests.telemetry.exposure_grid import exposures, scored
-from tests.telemetry.test_photos import gps_exif, jpeg
+from tests.telemetry.ingest.exposure_grid import exposures, scored
+from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 

@@ -7,7 +7,7 @@ import pytest
 
 from telemetry.formats.log.flight_logs import NotALog, read_log
 from telemetry.ingest.ingest import load, survey
-from tests.telemetry.test_photos import gps_exif, jpeg
+from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 WEEK, TOW = 2264, 400_373.5
 UTC_S = 315_964_800 + WEEK * 604_800 + TOW - 18

@@ -9,7 +9,7 @@ import pytest
 import telemetry
 from orthoswarm.model.errors import InputError
 from telemetry.ingest.ingest import LoadOptions, load, require_frames, survey
-from tests.telemetry.test_photos import gps_exif, jpeg
+from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 
 def photo(path: Path, lat=47.5, lon=8.25, second=0, *, yaw=None, flight=None, pitch=-90.0, roll=0.0, height=100.0):

@@ -12,7 +12,7 @@ from telemetry.formats.table.geo_txt import read_geo_txt
 from telemetry.formats.table.pose_csv import read_pose_csv
 from telemetry.ingest.ingest import load, survey
 from telemetry.samples.rotations import camera_angles_from_opk_deg
-from tests.telemetry.test_photos import jpeg
+from tests.telemetry.ingest.test_photos import jpeg
 
 GEO_ROWS = {
     # columns as OpenDroneMap documents them, whatever follows

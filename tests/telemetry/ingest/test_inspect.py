@@ -9,9 +9,9 @@ import pytest
 from gcs_plugin.cli.main import main
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.ingest.summary import summarise
-from tests.telemetry.test_ingest import flight, photo
-from tests.telemetry.test_photos import gps_exif, jpeg
-from tests.telemetry.test_video import make_video, pose
+from tests.telemetry.ingest.test_ingest import flight, photo
+from tests.telemetry.ingest.test_photos import gps_exif, jpeg
+from tests.telemetry.video.test_video import make_video, pose
 
 from telemetry.write.sei_writer import add_sei  # isort: skip
 

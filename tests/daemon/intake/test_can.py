@@ -16,7 +16,7 @@ from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
 from telemetry.live.live_poses import LivePoses
-from tests.daemon.test_daemon_flight import fly
+from tests.daemon.flight.test_daemon_flight import fly
 from tests.kit.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.sim_cameras import square

@@ -13,8 +13,8 @@ from telemetry.formats.photo.picture_container import NotAPicture, read_containe
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.video import bitstream, djmd, klv, sei, srt
 from telemetry.photos.photo_tags import read_photo
-from tests.telemetry.test_sei import dji_payload, packet
-from tests.telemetry.test_srt import djmd as djmd_message
+from tests.telemetry.formats.test_sei import dji_payload, packet
+from tests.telemetry.formats.test_srt import djmd as djmd_message
 
 SLOWEST_S = 2.0
 
@@ -61,7 +61,7 @@ def parse_sei(data: bytes) -> None:
 
 
 def klv_seeds(real_data) -> list[bytes]:
-    from tests.telemetry.test_klv import NADIR, _klv_of, local_set
+    from tests.telemetry.formats.test_klv import NADIR, _klv_of, local_set
 
     folder = real_data("kwiver_klv")
     streams = [_klv_of((folder / name).read_bytes()) for name in ("aphill_short.ts", "h264_klv.ts")]

@@ -22,7 +22,7 @@ import pytest
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.web.guard import take_token
 from orthoswarm.model.errors import InputError
-from tests.daemon.test_daemon_crash import check, post_until_gone
+from tests.daemon.faults.test_daemon_crash import check, post_until_gone
 from tests.kit.daemon_kit import line, serving, start, stop, tile_over
 from tests.kit.sim_cameras import square
 

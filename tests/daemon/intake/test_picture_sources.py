@@ -22,7 +22,7 @@ from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from telemetry.samples.sample import Sample
 from telemetry.write.sei_writer import add_sei
 from telemetry.write.tag_writer import with_pose
-from tests.daemon.test_daemon_flight import fly
+from tests.daemon.flight.test_daemon_flight import fly
 from tests.kit.daemon_kit import GRID, camera_at, jpeg, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.sim_cameras import square

@@ -8,7 +8,7 @@ import pytest
 import telemetry
 from telemetry.formats.log.flight_logs import NotALog, read_log
 from telemetry.ingest.ingest import survey
-from tests.telemetry.test_ingest import photo
+from tests.telemetry.ingest.test_ingest import photo
 
 can = pytest.importorskip("can")
 pytest.importorskip("dronecan")

@@ -1,0 +1,1 @@
+"""Crashes, power cuts, overload, start and stop."""

@@ -1,0 +1,1 @@
+"""The daemon with vehicles on its links: missions, coverage, gaps, terrain data."""

@@ -1,0 +1,1 @@
+"""The daemon's HTTP API, its pages and its tiles."""

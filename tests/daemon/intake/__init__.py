@@ -1,0 +1,1 @@
+"""Pictures, poses and events into the daemon."""

@@ -1,0 +1,1 @@
+"""Jobs of the daemon: queue, legs in flight, refinement, late pictures."""

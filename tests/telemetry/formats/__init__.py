@@ -1,0 +1,1 @@
+"""Readers of single formats: logs, tags, tables, metadata in videos."""

@@ -1,0 +1,1 @@
+"""From inputs to frames: photos, pairing with logs, inspection."""

@@ -1,0 +1,1 @@
+"""Pictures and poses of videos, from files and live."""
