@@ -10,6 +10,8 @@ from dataclasses import dataclass
 class BundleConfig:
     """Bundle adjustment: priors, robust weights, steps, covariance."""
 
+    track_robust_c: float = 9.0
+    """Robust scale of image observations once an adjustment is near its minimum, squared sigmas: 3 sigmas (chosen)."""
     tie_robust_c: float = 9.0
     """Robust scale of ties to the map, squared sigmas, where a step names no other (chosen; not measured)."""
     position_robust_c: float = 9.0
@@ -46,6 +48,8 @@ class BundleConfig:
     """What an offset exceeds so many sigmas by enters the sigma of the field of view (chosen; not measured)."""
     covariance_every_photos: int = 24
     """Covariances are computed for every so many-th photo and interpolated between (chosen for its cost)."""
+    sigma_floor_m: float = 0.05
+    """Least sigma of a photo on the ground where no map tells it, metres (chosen; not measured)."""
     stated_sigma_factor: float = 1.25
     """The stated sigma is this times the sigma of an axis, to stand between both meanings of "the error" of a point on
     the ground: of Gaussian errors 79 and 98.8 % of each axis lie within one and two of it, and 54 and 95.6 % of their

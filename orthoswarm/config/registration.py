@@ -163,8 +163,6 @@ class RegistrationConfig:
     """Tie points this near to the line agree with it, metres (chosen; not measured)."""
     line_apart_m: float = 0.7
     """A leg whose line is nowhere farther from the common shift is moved by the common shift, metres (chosen)."""
-    track_scale: float = 9.0
-    """Robust scale of image observations in the absolute orientation: 3 sigmas (chosen)."""
     first_tie_scales: tuple[float, float, float, float] = (36.0, 9.0, 6.0, 6.0)
     """Robust scales of the first tie points in its steps (chosen; not measured)."""
     tie_scales: tuple[float, float] = (9.0, 6.0)

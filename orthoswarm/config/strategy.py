@@ -17,6 +17,21 @@ class StrategyConfig:
     near_schedule: tuple[float, ...] = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
     """The same from a start that is known to be near: wrong tracks, far off, weigh less from the first step on
     (chosen)."""
+    full_lens_steps: int = 4
+    """Steps at the last scale more where all parameters of a lens are solved (chosen; not measured)."""
+    records_weighed_step: int = 3
+    """After this step, counted from 0, records are weighed by what the pictures say of them, and ground is fitted from
+    there on (chosen: the adjustment is near by then)."""
+    first_steps: int = 2
+    """Steps, from the first, with the wide height prior of the next two fields (chosen) ..."""
+    first_ground_sigma_m: float = 3.0
+    """Sigma of points about the expected ground in these steps, metres (chosen; not measured)."""
+    first_ground_robust_c: float = 1e3
+    """Robust scale of that prior, squared sigmas: nearly none (chosen; not measured)."""
+    ground_sigma_m: float = 2.0
+    """The sigma in all later steps, metres (chosen; not measured)."""
+    ground_robust_c: float = 1.0
+    """The robust scale in all later steps, squared sigmas (chosen; not measured)."""
     flow_pairs: int = 6
     """So many pairs of pictures must have told the focal length by their flow before an adjustment is held against it
     (chosen; not measured)."""
@@ -53,6 +68,12 @@ class StrategyConfig:
     """Ties that agree on an offset of so many sigmas beside a picture show an error that the adjustment does not know
     (chosen; not measured)."""
 
+    # Neighbours
+    neighbour_reach_heights: float = 1.5
+    """Vehicles whose paths come within so many flying heights share ground (chosen; not measured)."""
+    second_steps: int = 4
+    """Steps of the second pass without a map (chosen; not measured)."""
+
     # What the field of view's sigma takes in
     takeoff_level_sigma_m: float = 2.0
     """How well the takeoff spot is known to lie at the level of the ground, metres (chosen; not measured)."""
@@ -65,6 +86,12 @@ class StrategyConfig:
     decentred_share: float = 0.02
     """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share (measured:
     1.6 %)."""
+
+    # Terrain
+    terrain_reach_heights: float = 1.1
+    """Terrain is made to so many flying heights beyond the cameras (chosen: a wide lens sees as far)."""
+    terrain_points: int = 60
+    """Fewer points make no common terrain; that of the first vehicle is taken (chosen; not measured)."""
 
     # A given height model
     dem_differs_m: float = 0.2

@@ -315,7 +315,7 @@ def resettle(
 def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
     """One Gauss-Newton step with tie points, heights held near the ground."""
     prior = surface.height_prior(flight.adjustment.points)
-    flight.adjustment.step(active().registration.track_scale, prior, ties, tie_scale)
+    flight.adjustment.step(active().bundle.track_robust_c, prior, ties, tie_scale)
 
 
 def _second_round(

@@ -55,8 +55,8 @@ def second_pass(
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
     else:
-        for _ in range(4):
-            flight.adjustment.step(9.0, state.surface.height_prior(flight.adjustment.points))
+        for _ in range(active().strategy.second_steps):
+            flight.adjustment.step(active().bundle.track_robust_c, state.surface.height_prior(flight.adjustment.points))
     watch.lap("second adjustment")
     _own_errors(state, others, ground)
     release(flight)
@@ -77,10 +77,12 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     flight = state.flight
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
-    floor = 0.05
+    config = active().bundle
+    floor = config.sigma_floor_m
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
-    sigma, fov_sigma = frame_sigmas(adj, 9.0, state.surface.height_prior(adj.points), ties, 6.0, floor)
+    track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
+    sigma, fov_sigma = frame_sigmas(adj, track_c, state.surface.height_prior(adj.points), ties, tie_c, floor)
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     if not lies_on_map(state):

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
     """The other vehicles whose flight paths come near enough for common ground."""
     own = state.flight.adjustment.cameras.position
-    reach = 1.5 * float(np.median(own[:, 2]))
+    reach = active().strategy.neighbour_reach_heights * float(np.median(own[:, 2]))
     low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
     out = []
     for other in states:
@@ -61,10 +61,10 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     own = [ground_points(s.flight.adjustment) for s in states]
     points = np.concatenate([p for p, _ in own] + [s.dense[0] for s in states])
     sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
-    if len(points) < 60:
+    if len(points) < active().strategy.terrain_points:
         return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
-    reach = 1.1 * float(np.median(path[:, 2]))
+    reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
     bounds = BoundingBox.around_points(path[:, :2], reach)
     lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
@@ -107,7 +107,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
         return None
     paths = [s.coarse.position for s in states]
     path = np.concatenate(paths)
-    reach = 1.1 * float(np.median(path[:, 2]))
+    reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
     step = max(min(steps), float(np.sqrt(np.prod(high - low) / active().surface.drawn_nodes)))
     columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()

@@ -130,9 +130,9 @@ def from_flight(
     learned: bool = True,
 ) -> VehicleState:
     """Sigmas of a vehicle that is adjusted without a map, and its registration where there is a map."""
-    adj = flight.adjustment
+    adj, c = flight.adjustment, active().bundle
     belief = surface.height_prior(adj.points)
-    coarse_sigma, fov_sigma = frame_sigmas(adj, 9.0, belief, None, 9.0, 0.05)
+    coarse_sigma, fov_sigma = frame_sigmas(adj, c.track_robust_c, belief, None, c.tie_robust_c, c.sigma_floor_m)
     coarse = replace(
         adj.cameras,
         position=adj.cameras.position.copy(),
@@ -206,17 +206,17 @@ def ran_away(flight: Flight) -> bool:
 
 
 def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -> GroundModel:
-    schedule = list(schedule)
+    config, schedule = active().strategy, list(schedule)
+    wide = config.first_ground_sigma_m, config.first_ground_robust_c
+    narrow = config.ground_sigma_m, config.ground_robust_c
     for k, c in enumerate(schedule):
-        first = k < 2
-        flight.adjustment.step(
-            c, surface.height_prior(flight.adjustment.points, 3.0 if first else 2.0, 1e3 if first else 1.0)
-        )
-        if k == 3:
+        prior = wide if k < config.first_steps else narrow
+        flight.adjustment.step(c, surface.height_prior(flight.adjustment.points, *prior))
+        if k == config.records_weighed_step:
             weigh_records(flight)
             if free_full_lens(flight):
-                schedule += [9.0] * 4
-        if k >= 3:
+                schedule += [active().bundle.track_robust_c] * config.full_lens_steps
+        if k >= config.records_weighed_step:
             surface = fit_surface(flight.adjustment, surface)
     return surface
 
@@ -253,7 +253,7 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     """Take steps at the final robust scale; the ground, and the focal length in pixels after each step."""
     focal_px = []
     for _ in range(count):
-        flight.adjustment.step(9.0, surface.height_prior(flight.adjustment.points))
+        flight.adjustment.step(active().bundle.track_robust_c, surface.height_prior(flight.adjustment.points))
         surface = fit_surface(flight.adjustment, surface)
         focal_px.append(float(flight.adjustment.cameras.lens[0, F]))
     return surface, focal_px
