@@ -3,7 +3,7 @@
     python -m benchmarks.wrong_maps SET... --out DIR [--town OTHER_SET] [--kinds mirror_ns blank ...]
 
 SET is a folder of `orthoswarm twin make`. Each kind of map is made of the set's basemap, lies at the same place and
-is given to a refiner. A line a run: how many legs are `matched`, `carried`, `failed`, how many pictures are
+is given to a refiner. A line a run: how many legs are `refine_matched`, `carried`, `failed`, how many pictures are
 `fine`, and the median error of their middles on the ground.
 """
 

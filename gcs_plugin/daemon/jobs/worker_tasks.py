@@ -116,7 +116,7 @@ def solve(task: SolveTask) -> SortieResult:
 
 def register_late(task: SolveTask) -> SortieResult:
     """Lay pictures that came late beside the others of their sortie, which was refined without them."""
-    from orthoswarm.refine.registration.late_pictures import lay_late
+    from orthoswarm.refine.registration.late_pictures import register_late_pictures
     from orthoswarm.refine.strategy.vehicle_passes import read_frame
 
     assert task.before is not None
@@ -124,7 +124,9 @@ def register_late(task: SolveTask) -> SortieResult:
     before = read_solution(task.before)
     refined = before.solution
     known = {p.frame.image for p in refined.placed} | set(refined.dropped)
-    placed, dropped = lay_late([f for f in task.frames if f.image not in known], refined, task.epsg, read_frame)
+    placed, dropped = register_late_pictures(
+        [f for f in task.frames if f.image not in known], refined, task.epsg, read_frame
+    )
     whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
     thumbnails = before.thumbnails | task.thumbnails
     gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)

@@ -1,1 +1,1 @@
-"""Onto the map and onto neighbours: coarse registration, tie points, absolute orientation, late pictures."""
+"""Registration on the map and to neighbours: coarse registration, tie points, absolute orientation, late pictures."""

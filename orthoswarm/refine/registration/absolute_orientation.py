@@ -26,12 +26,12 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(slots=True)
-class Settled:
-    """What settling found, besides the cameras in the flight's adjustment.
+class AbsoluteOrientation:
+    """What the absolute orientation found, besides the cameras in the flight's adjustment.
 
     Attributes:
-        surface: the ground. ties: the last round's. matches: the matches they come from.
-        roofs: matches of raised points and their heights, for a vote over several vehicles.
+        surface: the ground. ties: the last tie points. matches: the matches that they come from.
+        roofs: matches of raised points and their heights, for the lean of the map, which all vehicles vote on.
         links: observations added between legs.
     """
 
@@ -52,7 +52,7 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
     return LoadedMap.load(basemap, origin, BoundingBox.around_points(cameras.position[:, :2], reach), gsd_m)
 
 
-def tie_round(
+def tie_matches(
     flight: Flight,
     surface: GroundModel,
     ground: LoadedMap,
@@ -61,10 +61,14 @@ def tie_round(
     half_m: float | None = None,
     pictures: NDArray[np.bool_] | None = None,
 ) -> MapMatches:
-    """Ground points, one in a cell and leg, found on the map; every match is returned, sure ones are `accepted`.
+    """Match ground points, one for each cell and leg, to the map; `clear_matches` tells the sure ones.
 
-    Ground is compared by its texture: strong edges belong to what leans and casts shadows. pictures: bool (N,), the
-    ones to compare, None for all.
+    Ground is compared by its texture: strong edges belong to what leans and casts shadows.
+
+    Args:
+        flight: its adjusted cameras and points. surface: its ground. ground: the map below it.
+        cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as configured. All metres.
+        pictures: bool (N,), the ones to compare, None for all.
     """
     config = active().registration
     adj = flight.adjustment
@@ -99,12 +103,14 @@ def _ground_matches(
     )
 
 
-def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float) -> Array:
-    """How far (2,), metres, strong edges pull ties away from where texture alone puts them; zero if that is not known.
+def edge_displacement(
+    flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float
+) -> Array:
+    """Mean displacement (2,), metres, of strong edges against texture at the same tie points; zero if it is not known.
 
-    Shadows of another hour and what leans in the map displace strong edges most, but texture a little, too: by as much
-    again. (Regressed over simulated cities with exact truth: 1.0 to 1.1 times this is what is left in the ties.) So
-    taking it off extrapolates to no edges at all.
+    Shadows of another hour and what leans in the map displace strong edges most, but texture, too, by as much as edges
+    differ from it. (Regression over simulated cities with exact truth: an error of 1.0 to 1.1 times this difference is
+    left in tie points by texture.) So subtracting it extrapolates to ground without edges.
     """
     config = active().registration
     step = max(1, -(-len(matches.point) // config.edge_most))
@@ -112,7 +118,7 @@ def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: 
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
     half_m = config.tie_half_m
-    edges = accepted(_ground_matches(flight, surface, ground, some.point, camera, reach_m, half_m, gradient_field))
+    edges = clear_matches(_ground_matches(flight, surface, ground, some.point, camera, reach_m, half_m, gradient_field))
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
     if len(away) < config.edge_fewest:
@@ -121,7 +127,7 @@ def edge_pull(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: 
     return np.asarray(away.mean(0)) if len(away) >= config.edge_fewest else np.zeros(2)
 
 
-def accepted(matches: MapMatches, ratio: float | None = None) -> MapMatches:
+def clear_matches(matches: MapMatches, ratio: float | None = None) -> MapMatches:
     """Matches with a clear peak; ratio: largest ratio of the second peak to the first, None: as configured."""
     config = active().registration
     ratio = config.tie_ratio if ratio is None else ratio
@@ -129,7 +135,7 @@ def accepted(matches: MapMatches, ratio: float | None = None) -> MapMatches:
 
 
 def mode_shift(shift: Array) -> Array:
-    """Most agreed shift (2,) of ties (Q, 2): most neighbours within `mode_m`, then reweighted."""
+    """Mode (2,) of the shifts (Q, 2) of tie points: the one with most others near it, then reweighted."""
     config = active().registration
     if len(shift) == 0:
         return np.zeros(2)
@@ -142,11 +148,11 @@ def mode_shift(shift: Array) -> Array:
 
 
 def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
-    """Move the cameras to where their first matches are, and give the matches as they are from there.
+    """Shift the cameras to where their first matches lie; returns the matches with what is left of their shifts.
 
-    All cameras by the shift that most matches agree on, and a leg whose own matches lie on another line by that line:
-    where the chain of pictures broke at a corner the coarse correction of the two legs runs into one another, and an
-    adjustment would take the right matches at the beginning of a leg for wrong ones.
+    All cameras move by the mode of the shifts, but a leg whose own matches agree on another line of shifts moves along
+    that line. Where the tracks broke at a corner, the coarse corrections of the two legs are interpolated into each
+    other, and the adjustment would reject the right matches at the beginning of a leg as outliers.
     """
     points = flight.adjustment.points[matches.point].copy()
     correction = leg_corrections(flight.leg, matches, mode_shift(matches.shift))
@@ -191,16 +197,17 @@ def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
-    """Ties for the adjustment: where the map shows the ground that each point's surroundings lie on.
+    """Tie points for the adjustment: each ground point with its place on the map, metres, and a first sigma.
 
-    What was compared is ground, which does not lean; so a jump of the height datum cannot throw the map.
+    The surroundings of a point were compared, which are ground and do not lean. So an error of the height datum does
+    not displace them.
     """
     sigma = np.full(len(matches.point), active().registration.tie_sigma_m)
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
-def weighed(ties: MapTies, residual: Array) -> MapTies:
-    """The same ties with the sigma that their residuals show: maps of the day are decimetres, old ones a metre."""
+def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
+    """The same tie points with the sigma that their residuals show: decimetres on new maps, a metre on old ones."""
     config = active().registration
     if len(residual) < config.tie_fewest_for_sigma:
         return ties
@@ -208,8 +215,8 @@ def weighed(ties: MapTies, residual: Array) -> MapTies:
     return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 
-def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
-    """Raised points found on the map, and their heights over the ground."""
+def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
+    """Matches of raised points (roofs) with the map, and their heights over the ground (Q,), metres."""
     config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
@@ -222,12 +229,12 @@ def roof_round(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple
     half = max(config.tie_half_px, round(config.roof_half_m / ground.gsd_m))
     reach = max(config.tie_half_px, round(config.roof_reach_m / ground.gsd_m))
     found = match_points(adj.cameras, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
-    found = accepted(found, config.roof_ratio)
+    found = clear_matches(found, config.roof_ratio)
     return found, height[found.point]
 
 
 def add_links(flight: Flight, gsd_m: float) -> int:
-    """Observe points of each leg in pictures of other legs; the adjustment is begun anew with them."""
+    """Observe points of each leg in pictures of other legs and add these observations; returns how many."""
     config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
@@ -241,12 +248,14 @@ def add_links(flight: Flight, gsd_m: float) -> int:
         adj.cameras, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
     )
     if len(camera):
-        extend(flight, camera, point, uv, config.link_sigma_px)
+        add_observations(flight, camera, point, uv, config.link_sigma_px)
     return len(camera)
 
 
-def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float) -> None:
-    """Add observations to a flight's adjustment, keeping its state."""
+def add_observations(
+    flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float
+) -> None:
+    """Add observations (K,), uv (K, 2) in working pixels, to a flight's adjustment; its unknowns keep their values."""
     old = flight.adjustment
     tracks = Tracks(
         np.concatenate([old.tracks.camera, camera]),
@@ -260,24 +269,24 @@ def extend(flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], 
 
 
 def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMatches:
-    """Tie points of a flight that lies on the map within some metres."""
+    """Tie points of a flight that the coarse registration put on the map within some metres."""
     config = active().registration
     cell_m = config.first_tie_cell_sparse_m if flight.sparse else config.first_tie_cell_m
-    return accepted(tie_round(flight, surface, ground, cell_m, config.first_tie_reach_m))
+    return clear_matches(tie_matches(flight, surface, ground, cell_m, config.first_tie_reach_m))
 
 
 def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
-    """The same with smaller patches beside each other: evidence where few large ones fit, too noisy to be used."""
+    """The same with small patches that touch each other: more evidence where few large ones fit; too noisy for ties."""
     reach = active().registration.first_tie_reach_m
-    return accepted(tie_round(flight, surface, ground, 2.0 * half_m, reach, half_m))
+    return clear_matches(tie_matches(flight, surface, ground, 2.0 * half_m, reach, half_m))
 
 
-def settle(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: GroundModel) -> Settled:
-    """Two rounds of ties and links.
+def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: GroundModel) -> AbsoluteOrientation:
+    """Adjust a flight with tie points on the map: first with those of the coarse registration, then with new ones.
 
     Args:
         flight: after the coarse registration. ground: the map below it.
-        matches: its first ties, which confirm that it lies there.
+        matches: the tie points that confirm the coarse registration.
         surface: ground after the relative adjustment.
     """
     config = active().registration
@@ -287,24 +296,26 @@ def settle(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: Grou
         _step(flight, surface, ties, c)
         if k in (1, 3):
             surface = refit_ground(flight, surface, as_smooth=k == 3)
-    roofs = roof_round(flight, surface, ground)
+    roofs = roof_matches(flight, surface, ground)
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     _step(flight, surface, ties, config.tie_scales[1])
     surface = refit_ground(flight, surface, as_smooth=True)
     surface, ties, matches = _second_round(flight, ground, surface, config.second_steps)
-    return Settled(surface, ties, matches, roofs, links)
+    return AbsoluteOrientation(surface, ties, matches, roofs, links)
 
 
-def resettle(
+def reorient_on_map(
     flight: Flight,
     ground: LoadedMap,
     surface: GroundModel,
     ties: MapTies,
     pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
-    """Fresh ties and four iterations, for a flight that lies on the map already (its level may have moved).
+    """Adjust a flight that lies on the map with new tie points, as after its level was shifted.
 
-    pictures: bool (N,), the ones to compare with the map, None for all.
+    Args:
+        flight: on the map. ground: the map below it. surface: its ground. ties: its tie points so far.
+        pictures: bool (N,), the ones to compare with the map, None for all.
     """
     config = active().registration
     for _ in range(2):
@@ -325,23 +336,23 @@ def _second_round(
     rounds: int,
     pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
-    """Ties compared on the ground as it is now (fitted by the caller: the points moved, with their level, too)."""
+    """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     config = active().registration
     cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
-    matches = accepted(tie_round(flight, surface, ground, cell_m, reach_m, pictures=pictures))
-    matches = replace(matches, shift=matches.shift - edge_pull(flight, surface, ground, matches, reach_m))
+    matches = clear_matches(tie_matches(flight, surface, ground, cell_m, reach_m, pictures=pictures))
+    matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches, reach_m))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         _step(flight, surface, ties, config.tie_scales[min(k, 1)])
         if k in (0, 1):
-            ties = weighed(ties, flight.adjustment.tie_residual)
+            ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
         if k == rounds - 2:
             surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
 
 
 def working_gsd(flight: Flight) -> float:
-    """Pixel for comparing pictures with each other: about their own."""
+    """Ground pixel in which pictures are compared with each other, metres: about their own."""
     cameras = flight.cameras()
     return (
         active().registration.picture_gsd_share * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
@@ -349,7 +360,7 @@ def working_gsd(flight: Flight) -> float:
 
 
 def map_gsd(flight: Flight, basemap: MapWindow) -> float:
-    """Pixel for comparing pictures with the map: no finer than either shows, no finer than needed."""
+    """Ground pixel in which pictures are compared with the map, metres: no finer than either of them."""
     config = active().registration
     cameras = flight.cameras()
     picture = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])

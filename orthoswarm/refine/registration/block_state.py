@@ -1,4 +1,4 @@
-"""What the refiner keeps of a vehicle between its passes, and its conversion to a Solution."""
+"""The state of a vehicle's block between the passes of the refiner, and its conversion to a Solution."""
 
 from dataclasses import dataclass, field, replace
 from time import process_time
@@ -27,14 +27,14 @@ CARRIED = "the map does not show what this flight saw; pictures of its neighbour
 
 @dataclass(slots=True)
 class VehicleState:
-    """One vehicle between passes; everything is picklable, decoded pictures are let go.
+    """One vehicle between passes. It can be pickled; decoded pictures are not part of it.
 
     Attributes:
         vehicle: id. flight: frames, records, adjustment. coarse: cameras before the map was used, coarse_surface: the
             ground below them in the same frame.
         surface: its ground. ties, matches: of the last round (empty without a map).
         roofs: raised points on the map and their heights.
-        unfound: True where there is a map and the flight was not found on it yet.
+        unfound: True where there is a map and learned matching is still to be tried.
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
@@ -76,14 +76,14 @@ def lies_on_map(state: VehicleState) -> bool:
 
 
 def findings(state: VehicleState) -> list[str]:
-    """What has to be said of a vehicle: findings of its records, and how it came to lie where it does."""
+    """Warnings about a vehicle: findings of its records, and how it was registered."""
     if state.carried:
         return [*state.flight.warnings, CARRIED]
     return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
 
 
-def seen_from_above(state: VehicleState) -> Array:
-    """Points (K, 3) at free positions, on whatever is seen there: ground, and what stands on it."""
+def surface_points(state: VehicleState) -> Array:
+    """Densified points (K, 3) on the visible surface: ground, and what stands on it."""
     return np.concatenate([state.dense[0], state.high])
 
 

@@ -1,4 +1,4 @@
-"""One vehicle brought near its place on the map: windows by correlation, a consensus line, a smooth correction."""
+"""Coarse registration of one vehicle: strips correlated with the map, a consensus line, a smooth correction."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -32,9 +32,9 @@ class CoarseFit:
 
 
 def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[CoarseFit]:
-    """Guesses where a flight lies on the map, one after the other, for the caller to confirm.
+    """Hypotheses where a flight lies on the map, the likeliest first, for the caller to verify.
 
-    Windows of each leg near their records; where these are refuted all windows together; then windows farther off.
+    Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
     """
     config = active().registration
     gsd = float(np.clip(_picture_width(flight) / config.strip_across_px, *config.strip_gsd_m))
@@ -47,7 +47,7 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
 
 
 def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
-    """One shift for the whole flight, from what all its windows say together (see `stacked`)."""
+    """One shift for the flight, from the sum of the correlations of all its strips (see `stacked`)."""
     cameras, windows = flight.cameras(), _strips(flight)
     strips = [strip_and_map(cameras, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
     found = stacked([s for s in strips if s is not None])
@@ -72,8 +72,8 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
-def second_look(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
-    """Learned matching of a few strips where edges found no consensus; None if it finds none either."""
+def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
     config = active().registration
     cameras, reach_m = flight.cameras(), config.learned_reach_m
     gsd = float(np.clip(_picture_width(flight) / config.learned_across_px, *config.learned_gsd_m))

@@ -1,4 +1,4 @@
-"""Coarse registrations are guesses; the first that tie points confirm is taken, none where they confirm none."""
+"""Hypotheses of the coarse registration are verified by tie points; the first that is confirmed counts."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

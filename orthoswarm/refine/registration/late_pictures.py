@@ -1,9 +1,9 @@
-"""Pictures that come after their vehicle was refined: laid beside its refined ones, which stay as they are.
+"""Pictures that arrive after their vehicle was refined: resected by its refined ones, which stay as they are.
 
-First by what refinement changed in their neighbours (`carried.carry`), then by points followed into the neighbours'
-pictures and onto their ground: six numbers a picture, so a handful costs no second refinement. Measured on simulated
-flights over debris, water and haze (640x480 from 150 m): by correction alone 0.2 to 2.6 m off, by points no farther off
-than its neighbours in the midst of them, 0.1 to 0.3 m more beside them or beyond them, 0.07 s a picture.
+A picture starts from what the refinement changed in its neighbours. Its corners are followed into the neighbours'
+pictures, whose ground points resect it: six unknowns, so a few pictures need no second refinement. Measured on
+simulated flights over debris, water and haze (640x480 from 150 m): by the start alone 0.2 to 2.6 m off; by resection as
+accurate as its neighbours among them, 0.1 to 0.3 m worse beside or beyond them; 0.07 s a picture.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 
-def lay_late(
+def register_late_pictures(
     frames: Sequence[Frame], refined: Solution, epsg: int, read: Callable[[Frame], Gray]
 ) -> tuple[list[PlacedFrame], dict[str, str]]:
     """Place pictures of a vehicle that was refined without them.
@@ -38,10 +38,10 @@ def lay_late(
         read: gives a picture's grey values at full size.
 
     Returns:
-        The placed frames in order of time, and image -> reason for those that cannot be placed. Those that the
-        neighbours' pictures do not hold are `weak`, placed by the neighbours' corrections alone. The sigma of the
-        others is that of the neighbours, with the resection's own, and with what corners that stand a little above the
-        terrain move a picture by that has its neighbours on one side: that much of their distance over the height.
+        The placed frames in order of time, and image -> reason for those that cannot be placed. Those that too few
+        points resect are `weak`, placed by the neighbours' corrections alone. The sigma of the
+        others combines that of the neighbours, that of the resection, and the effect of corners above the terrain on a
+        picture that has its neighbours on one side: their height times the neighbours' distance over the flying height.
     """
     late = {frame.image for frame in frames}
     everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))
@@ -72,7 +72,9 @@ def lay_late(
             dropped[guess.frame.image] = str(error)
             continue
         near = _nearest(guess, holds)
-        placed.append(_fitted(guess, [sights(guess, picture, other, small(other), terrain) for other in near], near))
+        placed.append(
+            _fitted(guess, [ground_observations(guess, picture, other, small(other), terrain) for other in near], near)
+        )
     return placed, dropped
 
 
@@ -87,8 +89,10 @@ def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFram
     return [others[i] for i in np.argsort(away, kind="stable")[: active().late.neighbours]]
 
 
-def sights(one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrain: Terrain) -> tuple[Array, Array]:
-    """Points of a picture found in a refined one.
+def ground_observations(
+    one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrain: Terrain
+) -> tuple[Array, Array]:
+    """Ground points of a picture, by its corners followed into a refined one.
 
     Args:
         one: a picture near its place. gray: it, at working size. other: a refined one. known: it, at working size.
@@ -152,7 +156,7 @@ def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
 
 
 def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Sequence[PlacedFrame]) -> PlacedFrame:
-    """The frame with its camera fitted to what its neighbours see, the guess where they do not agree."""
+    """The frame with its camera resected by the neighbours' ground points; the start where too few of them agree."""
     config = active().late
     if sum(len(uv) for uv, _ in seen) < config.fewest:
         return guess

@@ -1,8 +1,8 @@
 """Heights of the ground that only oblique views show, from where the map has it.
 
-Beyond the outermost leg the ground is seen at 40 degrees and more, from one side and by few pictures: its height is
-poorly triangulated, and what is wrong with it (or with the cameras out there) moves the orthoimage by nearly as much.
-The map tells: seen by one camera, ground that is higher than believed is drawn farther out, along the line of sight.
+Beyond the outermost leg ground is seen at 40 degrees and more off nadir, from one side and by few pictures: its height
+is poorly triangulated, and an error of it displaces the orthoimage by nearly as much. The map shows it: ground that is
+higher than assumed appears farther out in a picture, displaced along the line of sight.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock
 from orthoswarm.refine.features.patch_matching import texture_field
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.absolute_orientation import accepted
+from orthoswarm.refine.registration.absolute_orientation import clear_matches
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import match_points
 from orthoswarm.refine.surface.ground_densification import cells_near, flying_height, sight_reach
@@ -35,7 +35,7 @@ def map_heights(
     Args:
         flight: adjusted on the map. surface: its ground.
         ground: the map under it.
-        others: float64 (M, 2), where other vehicles' cameras were; ground that they see better is left to them.
+        others: float64 (M, 2), where other vehicles' cameras were; ground that they see more steeply is left out.
         tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
         pictures: bool (N,), the ones to compare with the map, None for all on legs.
     """
@@ -50,7 +50,9 @@ def map_heights(
     half = max(config.tie_half_px, round(config.tie_half_m / ground.gsd_m))
     reach = max(config.tie_reach_px, round(config.oblique_reach_m / ground.gsd_m))
     gray, level = flight.pictures.gray, points[:, 2]
-    found = accepted(match_points(cameras, points, chosen, camera, gray, ground, half, reach, level, texture_field))
+    found = clear_matches(
+        match_points(cameras, points, chosen, camera, gray, ground, half, reach, level, texture_field)
+    )
     sight = points[found.point] - cameras.position[found.camera]
     out = np.hypot(sight[:, 0], sight[:, 1])
     slope = out / np.maximum(-sight[:, 2], 1.0)
@@ -65,7 +67,7 @@ def map_heights(
 
 
 def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
-    """Centres (K, 2) of cells that own cameras see obliquely and nobody sees better."""
+    """Centres (K, 2) of cells that own cameras see obliquely and no other vehicle sees more steeply."""
     config = active().registration
     path, reach = flight.cameras().position[:, :2], sight_reach(flight)
     cell = max(config.oblique_cell_share * height_m, config.oblique_cell_m)

@@ -1,9 +1,9 @@
-"""How far the map lies from where the receivers say, and whether their errors explain it.
+"""Offset of the map against the vehicles' receivers, and whether the receivers' errors explain it.
 
-The orthoimage follows the map, and against the map it is exact to centimetres. Whether the map itself lies where it
-should only the receivers can tell. Each vehicle's mean difference is one observation of the offset: its sigma is the
-receiver's own bias (multipath, the satellites it tracks) and what it wanders by during the flight. What all receivers
-of an hour and a place have in common (ionosphere) no number of vehicles takes away.
+The orthoimage agrees with the map to centimetres. Whether the map itself is in the right place only the receivers show.
+Each vehicle's mean difference is one observation of the offset; its sigma consists of the receiver's own bias
+(multipath, the satellites it tracks) and of its drift during the flight. The error that all receivers share at a time
+and place (ionosphere) does not become smaller with more vehicles.
 """
 
 from collections.abc import Sequence

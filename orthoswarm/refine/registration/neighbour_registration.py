@@ -1,7 +1,7 @@
-"""A vehicle that the map does not show (blank there, or changed), laid beside neighbours that were found on it.
+"""A vehicle that is not found on the map (blank there, or changed) is registered to neighbours that are.
 
-First as a whole, its strips correlated with the neighbours' pictures as if those were the map; then point by point in
-their pictures, which are held, so that ground off the level does not matter.
+First as a whole: its strips are correlated with a mosaic of the neighbours' pictures, as if that were the map. Then by
+its points, which are observed in these pictures, whose cameras are fixed; so relief does not matter.
 """
 
 from copy import deepcopy
@@ -16,7 +16,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, shift_cameras
-from orthoswarm.refine.registration.neighbour_ties import Held, held_cameras, link_to_held, release
+from orthoswarm.refine.registration.neighbour_ties import FixedCameras, fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
 Array = NDArray[np.float64]
@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 _BLOCK_PX = 512
 
 
-class HeldMosaic:
-    """The pictures of held cameras as a map of the ground (placement.MapWindow), drawn where it is asked for."""
+class FixedCameraMosaic:
+    """The pictures of fixed cameras as a map of the ground (placement.MapWindow), drawn where a window is read."""
 
-    def __init__(self, held: Held, epsg: int, origin: Array) -> None:
+    def __init__(self, fixed: FixedCameras, epsg: int, origin: Array) -> None:
         self.epsg = epsg
-        self._held, self._origin = held, origin
-        cameras = held.cameras
+        self._fixed, self._origin = fixed, origin
+        cameras = fixed.cameras
         focal = cameras.lens[cameras.lens_id, 0]
         self._reach_m = (
             cameras.position[:, 2]
@@ -42,7 +42,7 @@ class HeldMosaic:
     @property
     def bounds(self) -> BoundingBox:
         """West, south, east, north of what the cameras may see, in the area's grid."""
-        xy = self._held.cameras.position[:, :2] + self._origin[:2]
+        xy = self._fixed.cameras.position[:, :2] + self._origin[:2]
         return BoundingBox.around(np.hstack([xy - self._reach_m[:, None], xy + self._reach_m[:, None]]))
 
     def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -58,7 +58,7 @@ class HeldMosaic:
     def _draw(
         self, grid: GroundGrid, rows: slice, cols: slice, gray: NDArray[np.float32], valid: NDArray[np.bool_]
     ) -> None:
-        cameras, gsd = self._held.cameras, grid.gsd_m
+        cameras, gsd = self._fixed.cameras, grid.gsd_m
         west = grid.west + cols.start * gsd - float(self._origin[0])
         north = grid.north - rows.start * gsd - float(self._origin[1])
         high, wide = gray.shape
@@ -70,7 +70,7 @@ class HeldMosaic:
             & (y < north + reach)
             & (y > north - high * gsd - reach)
         )
-        drawn = strip_mosaic(cameras, np.flatnonzero(near), self._held.small, 0.0, gsd) if near.any() else None
+        drawn = strip_mosaic(cameras, np.flatnonzero(near), self._fixed.small, 0.0, gsd) if near.any() else None
         if drawn is None:
             return
         seen, known, left, top = drawn
@@ -79,8 +79,8 @@ class HeldMosaic:
         valid[:] = cv2.warpAffine(known.astype(np.uint8), move, (wide, high), flags=cv2.INTER_NEAREST) > 0
 
 
-def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
-    """Lay a vehicle that was not found on the map beside neighbours that lie on it.
+def register_to_neighbours(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
+    """Register a vehicle that was not found on the map to neighbours that lie on it.
 
     Args:
         item: the vehicle, and neighbours.
@@ -92,11 +92,11 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
     state, others = item
     others = [other for other in others if lies_on_map(other)]
     out = deepcopy(state)
-    out.carried = True  # so that neighbours on the map are held
-    held = held_cameras(out, others)
-    if held is None:
+    out.carried = True  # so that the cameras of neighbours on the map are fixed
+    fixed = fixed_cameras_near(out, others)
+    if fixed is None:
         return state
-    for fit in coarse_fits(out.flight, HeldMosaic(held, epsg, origin), origin):
+    for fit in coarse_fits(out.flight, FixedCameraMosaic(fixed, epsg, origin), origin):
         out = deepcopy(state)
         out.carried = True
         if _linked(out, fit, others):
@@ -108,14 +108,14 @@ def lay_beside(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, orig
 
 
 def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> bool:
-    """Adjust a vehicle with its points observed in held pictures; False where too few of them agree."""
+    """Adjust a vehicle with its points observed in fixed pictures; False where too few of them agree."""
     config = active().registration
     flight = state.flight
     shift_cameras(flight, fit.correction)
-    held = held_cameras(state, others)
-    if held is None:
+    fixed = fixed_cameras_near(state, others)
+    if fixed is None:
         return False
-    found = link_to_held(flight, held, working_gsd(flight), config.unfound_reach_px)
+    found = link_to_fixed(flight, fixed, working_gsd(flight), config.unfound_reach_px)
     if found < config.unfound_fewest:
         return False
     adj = flight.adjustment
@@ -125,6 +125,6 @@ def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> 
     agree = int((adj.obs_weight[linked] > config.unfound_agrees).sum())
     if agree < max(config.unfound_fewest, config.unfound_least_share * found):
         return False
-    release(flight)
+    remove_fixed(flight)
     state.confidence = agree / found
     return True

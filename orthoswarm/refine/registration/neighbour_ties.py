@@ -1,4 +1,4 @@
-"""The second pass of a vehicle: on the common level, tied to neighbours that are held."""
+"""Links to neighbouring vehicles: own points observed in pictures of their cameras, which stay fixed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +20,12 @@ Gray = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """Cameras of neighbours that may see a vehicle's ground, as they are: cameras and how to read their pictures.
+class FixedCameras:
+    """Cameras of neighbours that may show a vehicle's ground; they do not move in its adjustment.
 
-    `gray` gives one at working scale, `small` a reduced one.
+    Attributes:
+        cameras: M of them. vehicle: int32 (M,), number of their vehicle.
+        gray: picture i at working scale. small: picture i, reduced.
     """
 
     cameras: CameraBlock
@@ -32,7 +34,7 @@ class Held:
     small: Callable[[int], Gray]
 
 
-def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | None:
+def fixed_cameras_near(state: VehicleState, others: Sequence[VehicleState]) -> FixedCameras | None:
     """The neighbours' cameras near a vehicle's path (not all are needed); None where there are none."""
     config = active().registration
     own = state.flight.adjustment.cameras.position[:, :2]
@@ -59,7 +61,7 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     )
     vehicle = np.concatenate([np.full(len(near), k, np.int32) for k, (_, near) in enumerate(parts)])
     where = [(o, int(i)) for o, near in parts for i in near]
-    return Held(
+    return FixedCameras(
         cameras,
         vehicle,
         lambda j: where[j][0].flight.pictures.gray(where[j][1]),
@@ -67,10 +69,14 @@ def held_cameras(state: VehicleState, others: Sequence[VehicleState]) -> Held | 
     )
 
 
-def link_to_held(
-    flight: Flight, held: Held, gsd_m: float, reach_px: int | None = None, pictures: NDArray[np.bool_] | None = None
+def link_to_fixed(
+    flight: Flight,
+    fixed: FixedCameras,
+    gsd_m: float,
+    reach_px: int | None = None,
+    pictures: NDArray[np.bool_] | None = None,
 ) -> int:
-    """Observe own points in held pictures; the adjustment is begun anew with the held cameras appended.
+    """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.
 
     Args:
         gsd_m: pixel in which they are compared. reach_px: how far a point is searched there, None: as configured.
@@ -79,16 +85,16 @@ def link_to_held(
     config = active().registration
     adj = flight.adjustment
     n = len(adj.cameras)
-    joint = _joined(adj.cameras, held.cameras)
+    joint = _joined(adj.cameras, fixed.cameras)
     seen = flight.best_views(pictures)
     usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
-    leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + held.vehicle]).astype(np.int32)
+    leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + fixed.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)
     chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, config.link_cell_m)
     candidates = np.arange(n, len(joint))
 
     def gray(i: int) -> Gray:
-        return flight.pictures.gray(i) if i < n else held.gray(i - n)
+        return flight.pictures.gray(i) if i < n else fixed.gray(i - n)
 
     camera, point, uv, _ = link_legs(
         joint,
@@ -112,18 +118,18 @@ def link_to_held(
     )
     free = np.arange(len(joint)) < n
     new = Adjustment.begin(
-        joint, tracks, _padded(adj.priors, len(held.cameras), len(held.cameras.lens)), adj.points, free
+        joint, tracks, _padded(adj.priors, len(fixed.cameras), len(fixed.cameras.lens)), adj.points, free
     )
     shift = new.layout.lens_columns - adj.layout.lens_columns
     new.common[: adj.layout.lens_columns] = adj.common[: adj.layout.lens_columns]
     new.common[adj.layout.lens_columns + shift :] = adj.common[adj.layout.lens_columns :]
-    new.priors.lens[len(adj.priors.lens) :] = _lens_values(held.cameras.lens)
+    new.priors.lens[len(adj.priors.lens) :] = _lens_values(fixed.cameras.lens)
     flight.adjustment = new
     return len(camera)
 
 
-def release(flight: Flight) -> None:
-    """Take held cameras out of a flight's adjustment again (their observations, too)."""
+def remove_fixed(flight: Flight) -> None:
+    """Remove the fixed cameras and their observations from a flight's adjustment."""
     adj = flight.adjustment
     n, lenses = len(flight.frames), int(adj.cameras.lens_id[: len(flight.frames)].max()) + 1
     own = adj.tracks.camera < n
@@ -166,7 +172,7 @@ def _lens_values(lens: Array) -> Array:
 
 
 def _padded(p: Priors, cameras: int, lenses: int) -> Priors:
-    """Priors with room for held cameras; they have no group and their lenses do not move."""
+    """Priors with room for fixed cameras; they belong to no sortie and their lenses do not change."""
     return replace(
         p,
         position=np.concatenate([p.position, np.zeros((cameras, 3))]),

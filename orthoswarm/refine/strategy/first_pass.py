@@ -15,7 +15,14 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights
 from orthoswarm.refine.initial.pair_graph import Progress
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
-from orthoswarm.refine.strategy.vehicle_passes import Options, followed, look_again, matched, placed_again, read_frame
+from orthoswarm.refine.strategy.vehicle_passes import (
+    Options,
+    learned_registration,
+    read_frame,
+    refine_matched,
+    refine_tracked,
+    registered_by,
+)
 
 Array = NDArray[np.float64]
 
@@ -40,7 +47,7 @@ def first_passes(
         The states of all units that could be adjusted, in order; unit -> why not, of the others.
     """
     # Learned matching is left to one process afterwards: its network takes 400 MB.
-    task = partial(followed, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
+    task = partial(refine_tracked, epsg=grid.epsg, origin=origin, basemap=basemap, options=options, learned=False)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
@@ -54,11 +61,13 @@ def first_passes(
         watch.lap("tracks")
         lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
         flights = [flight for flight in opened if not isinstance(flight, str)]
-        place = partial(matched, origin=origin, basemap=basemap, options=options, learned=False)
+        place = partial(refine_matched, origin=origin, basemap=basemap, options=options, learned=False)
         for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
             state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
             states[k] = state
-    return _second_looks([state for state in states if state is not None], basemap, origin, run, progress), lost
+    return _learned_registrations(
+        [state for state in states if state is not None], basemap, origin, run, progress
+    ), lost
 
 
 def _sparse_flights(
@@ -76,22 +85,22 @@ def _sparse_flights(
     return [flight for unit in units for flight in _sparse_flights([unit], grid, origin, run, progress)]
 
 
-def _second_looks(
+def _learned_registrations(
     states: list[VehicleState],
     basemap: MapWindow | None,
     origin: Array,
     run: Run,
     progress: Progress | None,
 ) -> list[VehicleState]:
-    """Learned matching in this process for flights that edges did not find on the map; then registered as others."""
+    """Learned matching, in this process, of flights that correlation did not find, then registration."""
     lost = [k for k, state in enumerate(states) if state.unfound]
     found = []
     for n, k in enumerate(lost):
-        found.append(None if basemap is None else look_again(states[k], basemap, origin))
+        found.append(None if basemap is None else learned_registration(states[k], basemap, origin))
         if progress:
-            progress("second look", n + 1, len(lost))
+            progress("learned registration", n + 1, len(lost))
     items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
     out = list(states)
-    for k, state in zip(lost, run(partial(placed_again, basemap=basemap, origin=origin), items), strict=True):
+    for k, state in zip(lost, run(partial(registered_by, basemap=basemap, origin=origin), items), strict=True):
         out[k] = state
     return out

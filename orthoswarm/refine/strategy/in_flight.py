@@ -1,4 +1,4 @@
-"""The coarse map in flight: pictures of finished legs, adjusted with each other and registered on the map as one block.
+"""The coarse map in flight: pictures of complete legs are adjusted as one block and registered on the map.
 
 Tracks and adjustment without a map as on completion, then the consensus shift of its windows on the map; no tie points,
 no second pass. On a single straight leg the receiver's drift and the camera's tilt are not separable, so the drift is
@@ -26,7 +26,7 @@ from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camer
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
 from orthoswarm.refine.registration.confirmed_registration import confirmed
-from orthoswarm.refine.strategy.vehicle_passes import Options, from_flight, read_frame, relative
+from orthoswarm.refine.strategy.vehicle_passes import Options, adjust_without_map, read_frame, registered_state
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.trajectory.legs import leads_one_way
 
@@ -101,9 +101,9 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         one_way = leads_one_way(flight.records.position, flight.leg)
         if one_way:
             _hold_drift(flight)
-    surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else relative(flight)
+    surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else adjust_without_map(flight)
     _check(flight)
-    state = from_flight(flight, surface, origin, None, watch)
+    state = registered_state(flight, surface, origin, None, watch)
     found = None
     if basemap is not None:
         found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
@@ -121,7 +121,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
 
 
 def _hold_drift(flight: Flight) -> None:
-    """Hold the receiver's drift, which a single straight run cannot tell from the camera's tilt."""
+    """Tighter priors of the receiver's drift, which on a single straight run cannot be told from the camera's tilt."""
     held, priors = active().strategy, flight.adjustment.priors
     models = tuple(
         replace(
@@ -177,7 +177,7 @@ def _scatter(fit: CoarseFit) -> float:
 
 
 def _legs(state: VehicleState, fit: CoarseFit | None) -> list[Leg]:
-    """Legs most of whose windows agree on a place on the map are matched, the others carried by those.
+    """Legs most of whose strips agree on a place on the map are matched, the others are carried by them.
 
     Where no leg has so many by itself, those with any are matched. Where there is no place on a map, all failed.
     """

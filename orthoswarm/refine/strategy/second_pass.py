@@ -1,4 +1,4 @@
-"""The second pass of a vehicle: held neighbours, new tie points, sigmas, denser ground."""
+"""The second pass of a vehicle: links to fixed neighbours, new tie points, sigmas, denser ground."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -16,11 +16,11 @@ from orthoswarm.refine.bundle.covariance import (
     systematic_tie_offset,
 )
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
-from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, resettle, working_gsd
+from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, reorient_on_map, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
-from orthoswarm.refine.registration.neighbour_ties import held_cameras, link_to_held, release
+from orthoswarm.refine.registration.neighbour_ties import fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.strategy.vehicle_passes import level_sigma_deg
 from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
 
@@ -33,33 +33,33 @@ def second_pass(
     basemap: MapWindow | None,
     origin: Array,
 ) -> VehicleState:
-    """Adjust one vehicle again on the common level, tied to held neighbours and to the map; then densify its ground.
+    """Adjust one vehicle again on the common level, linked to its neighbours and tied to the map; densify its ground.
 
     Args:
-        item: the vehicle, its neighbours (held as they are), metres to add to its level.
+        item: the vehicle, its neighbours, whose cameras are fixed, and metres to add to its level.
         basemap: the map on the area's grid, or None. origin: float64 (2,) of the local frame.
     """
     state, others, correction = item
-    state = deepcopy(state)  # its neighbours are tied to the result of the first pass, in whatever order they run
+    state = deepcopy(state)  # neighbours use the state of the first pass, in whatever order the tasks run
     watch = Stopwatch()
     flight = state.flight
     state.surface = replace(state.surface, level_m=state.surface.level_m + correction)
     # Pictures are not kept between the passes; decoding a spaced subset again is enough.
     pictures = None if flight.sparse else spaced_pictures(flight, state.surface)
-    held = held_cameras(state, others)
-    if held is not None:
-        link_to_held(flight, held, working_gsd(flight), pictures=pictures)
+    fixed = fixed_cameras_near(state, others)
+    if fixed is not None:
+        link_to_fixed(flight, fixed, working_gsd(flight), pictures=pictures)
     watch.lap("links to neighbours")
     ground = None
     if state.on_map and basemap is not None:
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
-        state.surface, state.ties, state.matches = resettle(flight, ground, state.surface, state.ties, pictures)
+        state.surface, state.ties, state.matches = reorient_on_map(flight, ground, state.surface, state.ties, pictures)
     else:
         for _ in range(active().strategy.second_steps):
             flight.adjustment.step(active().bundle.track_robust_c, state.surface.height_prior(flight.adjustment.points))
     watch.lap("second adjustment")
     _own_errors(state, others, ground)
-    release(flight)
+    remove_fixed(flight)
     if not flight.sparse:
         interpolate_weak(flight, state.sigma_m)
     watch.lap("sigma")
@@ -86,7 +86,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     if not lies_on_map(state):
-        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # held neighbours add no accuracy
+        state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # neighbours off the map add no accuracy
     elif not state.on_map:
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]
         state.sigma_m = np.hypot(state.sigma_m, max(theirs, default=0.0))

@@ -24,7 +24,7 @@ from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
 from orthoswarm.refine.flight.vehicle_refinement import as_recorded, refine_vehicle, unit_states, units_of_area
 from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
-from orthoswarm.refine.registration.neighbour_registration import lay_beside
+from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
 from orthoswarm.refine.strategy.first_pass import first_passes
 from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
@@ -35,11 +35,11 @@ from orthoswarm.refine.strategy.vehicle_group import (
     neighbours_of,
     pooled_lean,
 )
-from orthoswarm.refine.strategy.vehicle_passes import Options, solo
+from orthoswarm.refine.strategy.vehicle_passes import Options, refine_alone
 from orthoswarm.refine.surface.height_levels import level_network
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
-__all__ = ["Options", "SwarmRefiner", "solo", "states_of"]
+__all__ = ["Options", "SwarmRefiner", "refine_alone", "states_of"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -67,7 +67,7 @@ class SwarmRefiner:
         others = [state for n in neighbours for state in states_of(n)]
 
         def solve(units: list[list[Frame]]) -> Solution:
-            place = partial(solo, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
+            place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
             return self._second_pass([place(unit) for unit in units], others, basemap)
 
         return refine_vehicle(frames, self.epsg, solve)
@@ -105,7 +105,7 @@ class SwarmRefiner:
         self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None
     ) -> Solution:
         """The second pass of a vehicle's units, with others held as they are."""
-        own = lay_lost_beside(own, others, self.epsg, self.origin, serial)
+        own = register_unfound(own, others, self.epsg, self.origin, serial)
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
@@ -169,7 +169,7 @@ def _unrefined(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
     return replace(as_recorded(frames[0].vehicle, placed), warnings=[warning])
 
 
-def lay_lost_beside(
+def register_unfound(
     states: list[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
 ) -> list[VehicleState]:
     """Register vehicles that were not found on the map on neighbours that were; then others on these, and so on.
@@ -183,7 +183,7 @@ def lay_lost_beside(
     """
     out = list(states)
     lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
-    task = partial(lay_beside, epsg=epsg, origin=origin)
+    task = partial(register_to_neighbours, epsg=epsg, origin=origin)
     while lost:
         anchors = [s for s in [*out, *others] if lies_on_map(s)]
         items = [(k, neighbours_of(out[k], anchors)) for k in lost]
@@ -206,7 +206,7 @@ def _second_passes(
     progress: Progress | None,
 ) -> list[VehicleState]:
     """All vehicles again, on a common level, each with its neighbours held as the first pass left them."""
-    states = lay_lost_beside(states, [], epsg, origin, run)
+    states = register_unfound(states, [], epsg, origin, run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]

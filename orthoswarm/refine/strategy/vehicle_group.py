@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
-from orthoswarm.refine.registration.block_state import VehicleState, seen_from_above
+from orthoswarm.refine.registration.block_state import VehicleState, surface_points
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import dense_cell, flying_height
@@ -73,7 +73,7 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     if given is not None:
         fit, off = fit_over_dem(given, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
-    tops = np.concatenate([seen_from_above(s) for s in states])
+    tops = np.concatenate([surface_points(s) for s in states])
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
     drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
     return drawn, _dem_warnings(given, fit is None, off, states) if given is not None else []

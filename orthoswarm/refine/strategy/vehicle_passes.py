@@ -27,9 +27,9 @@ from orthoswarm.refine.flight.relative_block import (
     weigh_records,
 )
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
-from orthoswarm.refine.registration.absolute_orientation import settle
+from orthoswarm.refine.registration.absolute_orientation import orient_on_map
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
-from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, second_look
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, learned_fit
 from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.dem_surface import LocalDem
@@ -63,20 +63,20 @@ def read_frame(frame: Frame) -> NDArray[np.uint8]:
     return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
 
 
-def solo(
+def refine_alone(
     frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
 ) -> VehicleState:
     """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
-    state = followed(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
+    state = refine_tracked(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
     if state is None:
         watch = Stopwatch()
         flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
         watch.lap("tracks")
-        state = from_flight(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, watch)
+        state = registered_state(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, watch)
     return state
 
 
-def followed(
+def refine_tracked(
     frames: Sequence[Frame],
     *,
     epsg: int,
@@ -85,11 +85,11 @@ def followed(
     options: Options,
     learned: bool = True,
 ) -> VehicleState | None:
-    """Refine one vehicle by itself, by corners tracked from picture to picture.
+    """Refine one vehicle by itself, with corners tracked from picture to picture.
 
     Args:
-        learned: where correlation of edges does not find it on the map, try learned matching in this process (else the
-            caller does, see `look_again`).
+        learned: True: where correlation does not find it on the map, try learned matching in this process; False: the
+            caller does that, see `learned_registration`.
 
     Returns:
         None where the pictures cannot be tracked or the adjustment of the tracks fails; they are then matched in pairs.
@@ -102,26 +102,26 @@ def followed(
     if flight is None:
         return None
     try:
-        surface = relative(flight, options.ground(origin))
+        surface = adjust_without_map(flight, options.ground(origin))
         config = active().strategy
         if not config.narrowest_fov_deg < field_of_view_deg(flight.adjustment, flight) < config.widest_fov_deg:
-            return None  # the recorded height that is behind such a lens cannot be right
+            return None  # a recorded height that leads to such a lens is wrong
         if len(frames) < active().flight.few_photos and distorts_strongly(flight):
-            return None  # too few corners for all parameters of such a lens; pairs of photos give more
-        return from_flight(flight, surface, origin, basemap, watch, learned)
+            return None  # too few corners for all parameters of such a lens; photos matched in pairs have more
+        return registered_state(flight, surface, origin, basemap, watch, learned)
     except AdjustmentError:
         return None
 
 
-def matched(
+def refine_matched(
     flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options, learned: bool = True
 ) -> VehicleState:
-    """Refine one vehicle whose photos were matched and adjusted together with those of others."""
+    """Refine one vehicle whose photos were matched in pairs and adjusted together with those of others."""
     surface = fit_surface(flight.adjustment, options.ground(origin))
-    return from_flight(flight, surface, origin, basemap, Stopwatch(), learned)
+    return registered_state(flight, surface, origin, basemap, Stopwatch(), learned)
 
 
-def from_flight(
+def registered_state(
     flight: Flight,
     surface: GroundModel,
     origin: Array,
@@ -129,7 +129,7 @@ def from_flight(
     watch: Stopwatch,
     learned: bool = True,
 ) -> VehicleState:
-    """Sigmas of a vehicle that is adjusted without a map, and its registration where there is a map."""
+    """The state of a vehicle that is adjusted without a map: its sigmas, and its registration where there is a map."""
     adj, c = flight.adjustment, active().bundle
     belief = surface.height_prior(adj.points)
     coarse_sigma, fov_sigma = frame_sigmas(adj, c.track_robust_c, belief, None, c.tie_robust_c, c.sigma_floor_m)
@@ -161,14 +161,14 @@ def from_flight(
         state.had_map = True
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
         if state.unfound and learned:
-            _second_look_onto_map(state, second_look(flight, basemap, origin), basemap, origin, watch)
+            _onto_map_by_learning(state, learned_fit(flight, basemap, origin), basemap, origin, watch)
     flight.pictures.drop()
     state.timings = watch.seconds
     return state
 
 
-def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
-    """Adjust a followed flight without a map and fit its ground; returns the ground.
+def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
+    """Adjust a tracked flight without a map and fit its ground; returns the ground.
 
     Args:
         flight: its adjustment is changed. surface: what is known of the ground before, None for level ground.
@@ -176,11 +176,11 @@ def relative(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
     surface = surface or GroundModel()
     begun, config = flight.adjustment.copy(), active().strategy
     found = _relative(flight, surface, config.schedule)
-    if ran_away(flight):
+    if focal_length_ran_away(flight):
         # Wrong tracks with large residuals have full weight in the first steps of the wide schedule.
         flight.adjustment = begun.copy()
         found = _relative(flight, surface, config.near_schedule)
-    if ran_away(flight):
+    if focal_length_ran_away(flight):
         flight.adjustment = begun.copy()
         p = flight.adjustment.priors
         sigma = p.lens_sigma.copy()
@@ -195,8 +195,8 @@ def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:
     return float(np.degrees(fov_rad(float(adjustment.cameras.lens[0, F]), flight.pictures.size[0])))
 
 
-def ran_away(flight: Flight) -> bool:
-    """True if the focal length is far from what the flow of the pictures shows: another minimum was found."""
+def focal_length_ran_away(flight: Flight) -> bool:
+    """Whether the focal length is far from the one by optical flow: the adjustment converged to another minimum."""
     flow = flight.calibration
     config = active().strategy
     if flow.pairs < config.flow_pairs or not flow.trusted_height or not np.isfinite(flow.spread):
@@ -259,32 +259,32 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     return surface, focal_px
 
 
-def look_again(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
-    """The coarse registration of a flight by learned matching, None where that finds nothing.
+def learned_registration(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+    """The coarse registration of a flight by learned matching; None where that finds nothing.
 
     PyTorch and the network take 400 MB of a process's memory: one process serves all flights, one after the other.
     """
     watch = Stopwatch()
-    fit = second_look(state.flight, basemap, origin)
+    fit = learned_fit(state.flight, basemap, origin)
     state.flight.pictures.drop()
     watch.lap("coarse registration")
     watch.add_to(state.timings)
     return fit
 
 
-def placed_again(
+def registered_by(
     item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
 ) -> VehicleState:
-    """A flight after `look_again`, registered where that found it and tie points confirm it."""
+    """A flight registered by the result of `learned_registration`, if tie points confirm that."""
     state, fit = item
     watch = Stopwatch()
-    _second_look_onto_map(state, fit, basemap, origin, watch)
+    _onto_map_by_learning(state, fit, basemap, origin, watch)
     state.flight.pictures.drop()
     watch.add_to(state.timings)
     return state
 
 
-def _second_look_onto_map(
+def _onto_map_by_learning(
     state: VehicleState, fit: CoarseFit | None, basemap: MapWindow | None, origin: Array, watch: Stopwatch
 ) -> None:
     """Register a flight at the place that learned matching found, if tie points confirm it."""
@@ -307,7 +307,7 @@ def _onto_map(
     watch.lap("coarse registration")
     if found is None:
         return False
-    settled = settle(flight, found.ground, found.matches, state.surface)
+    settled = orient_on_map(flight, found.ground, found.matches, state.surface)
     alone_deg, now_deg = (field_of_view_deg(a, flight) for a in (before, flight.adjustment))
     config, known_deg = active().strategy, float(np.hypot(sigma, level_sigma_deg(flight, ground_alone)))
     if abs(now_deg - alone_deg) > max(config.map_fov_sigmas * known_deg, config.map_fov_deg):

@@ -13,7 +13,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.picture_file import read_gray
-from orthoswarm.refine.registration.late_pictures import centre_sigma, lay_late, on_terrain, resected
+from orthoswarm.refine.registration.late_pictures import centre_sigma, on_terrain, register_late_pictures, resected
 from tests.kit.mosaic_scene import EAST, NORTH, hills, terrain_of
 
 EPSG = 32631
@@ -73,7 +73,7 @@ def read_of(frame):
 def test_a_late_picture_lies_as_well_as_its_neighbours_whatever_its_record_says(flight):
     late = [moved(flight[4], 4.0, -3.0), moved(flight[20], -3.0, 2.0)]
     refined = solution_of([f for k, f in enumerate(flight) if k not in (4, 20)])
-    placed, dropped = lay_late(late, refined, EPSG, lambda frame: read_gray(frame.path))
+    placed, dropped = register_late_pictures(late, refined, EPSG, lambda frame: read_gray(frame.path))
     assert not dropped
     for one, frame in zip(placed, (flight[4], flight[20]), strict=True):
         true = recorded_cameras([frame], GRID).placed[0].camera
@@ -84,8 +84,8 @@ def test_a_late_picture_lies_as_well_as_its_neighbours_whatever_its_record_says(
 
 def test_beyond_its_neighbours_a_late_picture_is_less_sure_than_among_them(flight):
     among, beyond = flight[20], flight[-1]
-    (sure,), _ = lay_late([among], solution_of([f for f in flight if f is not among]), EPSG, read_of)
-    (unsure,), _ = lay_late([beyond], solution_of(flight[:-4]), EPSG, read_of)
+    (sure,), _ = register_late_pictures([among], solution_of([f for f in flight if f is not among]), EPSG, read_of)
+    (unsure,), _ = register_late_pictures([beyond], solution_of(flight[:-4]), EPSG, read_of)
     assert not unsure.weak
     assert sure.sigma_m < 0.15 < unsure.sigma_m
     true = recorded_cameras([beyond], GRID).placed[0].camera
@@ -111,7 +111,7 @@ def test_where_the_pictures_show_nothing_it_follows_its_neighbours_corrections(f
     shifted = [replace(p, frame=moved(p.frame, 2.0, 0.0)) for p in refined.placed]  # all records are 2 m too far east
     blank = np.full((180, 240), 90, np.uint8)
     late = moved(flight[0], 2.0, 0.0)
-    (one,), _ = lay_late([late], replace(refined, placed=shifted), EPSG, lambda frame: blank)
+    (one,), _ = register_late_pictures([late], replace(refined, placed=shifted), EPSG, lambda frame: blank)
     true = recorded_cameras([flight[0]], GRID).placed[0].camera
     assert np.hypot(*(one.camera.nadir - true.nadir)) < 0.01
     assert one.weak
@@ -121,6 +121,6 @@ def test_where_the_pictures_show_nothing_it_follows_its_neighbours_corrections(f
 def test_a_picture_that_cannot_be_read_is_named(flight, tmp_path):
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no more")
     late = replace(flight[0], path=tmp_path / "broken.jpg")
-    placed, dropped = lay_late([late], solution_of(flight[1:]), EPSG, lambda frame: read_gray(frame.path))
+    placed, dropped = register_late_pictures([late], solution_of(flight[1:]), EPSG, lambda frame: read_gray(frame.path))
     assert not placed
     assert "damaged" in dropped[late.image]

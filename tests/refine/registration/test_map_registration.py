@@ -13,7 +13,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.features.patch_matching import gradient_field, match, texture_field
-from orthoswarm.refine.registration.absolute_orientation import accepted, edge_pull, mode_shift
+from orthoswarm.refine.registration.absolute_orientation import clear_matches, edge_displacement, mode_shift
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.orientation_correlation import (
@@ -271,17 +271,17 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
     loaded = LoadedMap.load(before, np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)
     chosen = np.arange(len(points))
-    found = accepted(
+    found = clear_matches(
         match_points(
             cameras, points, chosen, camera, flight.pictures.gray, loaded, 20, 10, np.zeros(len(points)), texture_field
         )
     )
     off = found.shift.mean(0)
-    left = off - edge_pull(flight, level, loaded, found, 5.0)
+    left = off - edge_displacement(flight, level, loaded, found, 5.0)
     assert np.hypot(*off) > 0.02
     assert np.hypot(*left) < 0.6 * np.hypot(*off)
     few = found.take(np.arange(10))
-    assert not edge_pull(flight, level, loaded, few, 5.0).any()  # so few tell nothing
+    assert not edge_displacement(flight, level, loaded, few, 5.0).any()  # so few tell nothing
 
 
 def test_the_lean_is_voted_among_outliers():

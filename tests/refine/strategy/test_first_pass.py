@@ -33,7 +33,7 @@ def opened(monkeypatch):
         return open_together(units, *rest)
 
     open_together = first_pass.open_sparse_flights
-    monkeypatch.setattr(vehicle_passes, "relative", singular)
+    monkeypatch.setattr(vehicle_passes, "adjust_without_map", singular)
     monkeypatch.setattr(first_pass, "open_sparse_flights", sparse)
     return asked, breaks
 

@@ -17,7 +17,13 @@ from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.strategy import vehicle_passes
-from orthoswarm.refine.strategy.vehicle_passes import Options, ran_away, read_frame, relative, solo
+from orthoswarm.refine.strategy.vehicle_passes import (
+    Options,
+    adjust_without_map,
+    focal_length_ran_away,
+    read_frame,
+    refine_alone,
+)
 
 EPSG, ORIGIN = 32631, np.array([500_000.0, 5_000_000.0])
 
@@ -43,19 +49,19 @@ def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up):
     frames, _ = made_up
     flight = opened(frames)
     vehicle_passes._relative(flight, Options().ground(ORIGIN), active().strategy.schedule)
-    assert fov_deg(flight) > 90.0 and ran_away(flight)  # two wrong tracks of ninety were enough
+    assert fov_deg(flight) > 90.0 and focal_length_ran_away(flight)  # two wrong tracks of ninety were enough
     flight = opened(frames)
-    relative(flight)
-    assert not ran_away(flight)
+    adjust_without_map(flight)
+    assert not focal_length_ran_away(flight)
     assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
 
 
 def test_without_an_answer_of_the_flow_nothing_is_called_a_runaway(made_up):
     flight = opened(made_up[0])
     flight.adjustment.cameras.lens[:, 0] *= 0.5
-    assert ran_away(flight)
+    assert focal_length_ran_away(flight)
     flight.calibration = replace(flight.calibration, pairs=2)
-    assert not ran_away(flight)
+    assert not focal_length_ran_away(flight)
 
 
 def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_up, monkeypatch):
@@ -78,7 +84,7 @@ def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_
     for how in (steps, wandering):  # set free it stays where it is, or comes to no rest: both contradict nothing
         monkeypatch.setattr(vehicle_passes, "_steps", how)
         flight = opened(frames)
-        relative(flight)
+        adjust_without_map(flight)
         assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
         assert flight.warnings == [] and flight.calibration.trusted_height
         assert doubted(flight.adjustment).all() and height_disagreement(flight.adjustment) < 0.05
@@ -86,20 +92,20 @@ def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_
 
 def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):
     frames, basemap = made_up
-    settle = vehicle_passes.settle
+    orient_on_map = vehicle_passes.orient_on_map
 
     def bent(flight, *args):
-        settled = settle(flight, *args)
+        found = orient_on_map(flight, *args)
         flight.adjustment.cameras.lens[:, 0] *= 0.7
-        return settled
+        return found
 
-    monkeypatch.setattr(vehicle_passes, "settle", bent)
-    state = solo(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    monkeypatch.setattr(vehicle_passes, "orient_on_map", bent)
+    state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
     assert not state.on_map and not len(state.matches.point)
     assert fov_deg(state.flight) == pytest.approx(70.0, abs=0.5)
     assert any("not believed" in warning for warning in state.flight.warnings)
-    monkeypatch.setattr(vehicle_passes, "settle", settle)
-    state = solo(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    monkeypatch.setattr(vehicle_passes, "orient_on_map", orient_on_map)
+    state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
     assert state.on_map and not any("not believed" in warning for warning in state.flight.warnings)
 
 

@@ -22,7 +22,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture
 def blind(monkeypatch):
-    """Edges do not find one vehicle, the second look does (here: edges again); gives the vehicles it was asked for."""
+    """Edges do not find one vehicle, learned matching does (here: edges again); gives the vehicles it was asked for."""
     by_edges, asked = vehicle_passes.coarse_fits, []
 
     def first(flight, basemap, origin):
@@ -33,25 +33,25 @@ def blind(monkeypatch):
         return next(by_edges(flight, basemap, origin))
 
     monkeypatch.setattr(vehicle_passes, "coarse_fits", first)
-    monkeypatch.setattr(vehicle_passes, "second_look", second)
+    monkeypatch.setattr(vehicle_passes, "learned_fit", second)
     return asked
 
 
 def through_pickle(function, items):
-    """Run tasks as processes would; one that asks the second look would show."""
+    """Run tasks as processes would; one that asks learned matching would show."""
     for item in items:
         f, i = pickle.loads(pickle.dumps((function, item)))
         yield pickle.loads(pickle.dumps(f(i)))
 
 
-def test_a_flight_that_only_the_second_look_finds_is_mapped_as_well(scene, blind):
+def test_a_flight_that_only_learned_matching_finds_is_mapped_as_well(scene, blind):
     vehicles, grid, basemap, truth = scene
     steps = []
     refined = refine_all(
         vehicles, basemap, grid, run=through_pickle, progress=lambda what, done, of: steps.append((what, done, of))
     )
     assert blind == [LOST]
-    assert ("second look", 1, 1) in steps
+    assert ("learned registration", 1, 1) in steps
     lost = next(s for s in refined.fine if s.vehicle == LOST)
     assert any(leg.state == "matched" for leg in lost.legs)
     assert not any("no part of this flight" in w for w in lost.warnings)
@@ -60,7 +60,7 @@ def test_a_flight_that_only_the_second_look_finds_is_mapped_as_well(scene, blind
 
 def test_a_flight_that_nothing_finds_is_told_of_once(scene, blind, monkeypatch):
     vehicles, grid, basemap, _ = scene
-    monkeypatch.setattr(vehicle_passes, "second_look", lambda *_: None)
+    monkeypatch.setattr(vehicle_passes, "learned_fit", lambda *_: None)
     refined = refine_all({LOST: vehicles[LOST]}, basemap, grid)
     assert sum("no part of this flight" in w for w in refined.fine[0].warnings) == 1
     assert {leg.state for leg in refined.fine[0].legs} == {"failed"}
