@@ -75,7 +75,7 @@ def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
         ("records = 3\n", "write it as a table"),
         ("[records]\nnothing = 1\n", "no 'nothing'"),
         ("[records]\ntheta_hat_deg = 'wide'\n", "another kind"),
-        ("[records\n", "no TOML file"),
+        ("[records\n", "not a TOML file"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_path):

@@ -104,11 +104,11 @@ def test_points_measured_on_the_orthoimage_with_the_surveys_own_error(tmp_path):
     [
         ("", "holds no points"),
         ("EPSG:32632\n", "no points below"),
-        ("nowhere at all\n1 2 3 4 5 a.jpg\n", "no coordinate system"),
+        ("nowhere at all\n1 2 3 4 5 a.jpg\n", "not a coordinate system"),
         ("EPSG:32632\n1 2 3 four 5 a.jpg\n", "line 2"),
         ("name,lat_deg\na,48\n", "no coordinates"),
         ("name,lat_deg,lon_deg,image\na,48,11,x.jpg\n", "column 'column' is missing"),
-        ("name,lat_deg,lon_deg,image,column,row\na,nan,11,x.jpg,1,1\n", "no number"),
+        ("name,lat_deg,lon_deg,image,column,row\na,nan,11,x.jpg,1,1\n", "not a number"),
         ("name,lat_deg,lon_deg,image,column,row\na,48,11,elsewhere.jpg,1,1\n", "check the names of the images"),
     ],
 )

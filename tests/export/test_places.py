@@ -139,7 +139,7 @@ def test_a_stream_of_events_reaches_a_server_also_after_it_was_gone(tmp_path, ki
 
 @pytest.mark.parametrize("text", ["239.2.3.1:6969", "http://a:1", "udp://a", "udp://a:99999", "udp://[", ""])
 def test_an_address_that_is_none_is_refused(text):
-    with pytest.raises(InputError, match="no TAK address"):
+    with pytest.raises(InputError, match="not a TAK address"):
         TakAddress.parse(text)
 
 

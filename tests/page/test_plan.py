@@ -74,7 +74,7 @@ def test_files_bring_an_area_or_say_what_is_wrong(browser):
     square = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
     good = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [square]}}
     wrong = {"type": "Polygon", "coordinates": [[[x * 1e5, y] for x, y in square]]}
-    files = [("a.geojson", json.dumps(good), 3, "ha"), ("b.kml", KML, 7, "ha"), ("c.json", "{", 7, "no valid JSON"),
+    files = [("a.geojson", json.dumps(good), 3, "ha"), ("b.kml", KML, 7, "ha"), ("c.json", "{", 7, "not valid JSON"),
              ("d.geojson", json.dumps(wrong), 7, "longitude and latitude in degrees"),
              ("e.geojson", "{}", 7, "no GeoJSON")]  # fmt: skip
 

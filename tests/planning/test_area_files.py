@@ -82,7 +82,7 @@ def test_the_same_area_comes_out_of_every_kind_of_file(tmp_path, kind):
         ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "one ZIP"),
         ("a.gpkg", b"SQLite format 3\0" + bytes(500), "damaged or incomplete"),
         ("a.zip", zipped(a__shp=b"\x00\x00\x27\x0a" + bytes(96)), "damaged or incomplete"),
-        ("a.xyz", b"\xff\xfe\x00", "no text file"),
+        ("a.xyz", b"\xff\xfe\x00", "not a text file"),
         ("../../etc/passwd", b"root", "holds neither"),
         ("a.geojson", b"", "holds neither"),
     ],

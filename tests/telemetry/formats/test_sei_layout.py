@@ -68,10 +68,10 @@ def test_a_described_message_is_read(tmp_path):
 
 
 WRONG = {
-    "no TOML": "uuid = ",
+    "not a TOML": "uuid = ",
     "32 hexadecimal": 'uuid = "12"',
     "neither a uuid": 'struct = "<d"',
-    "no format": f'uuid = "{UUID}"\nstruct = "<y"\nfields = ["lat_deg"]',
+    "not a format": f'uuid = "{UUID}"\nstruct = "<y"\nfields = ["lat_deg"]',
     "each of the 2": f'uuid = "{UUID}"\nstruct = "<dd"\nfields = ["lat_deg"]',
     "is not a field": f'uuid = "{UUID}"\nstruct = "<d"\nfields = ["lattitude"]',
 }
