@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from orthoswarm import __version__
 from orthoswarm.model.errors import OrthoSwarmError
 
-# verb -> one line of help; the module is gcs_plugin.cli.verbs.<verb>, with configure(parser) and run(args) -> int.
+# verb -> one line of help; its module in a room of gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
 VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
@@ -29,6 +29,13 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
 }
+
+_ROOMS = {
+    "maps": ("mosaic", "coverage", "inspect", "frames", "export", "evaluate"),
+    "vehicles": ("plan", "fleet", "sim", "demo", "serve"),
+    "tools": ("twin", "bench", "weights", "doctor"),
+}
+_ROOM_OF = {verb: room for room, verbs in _ROOMS.items() for verb in verbs}
 
 _NEGATIVE = re.compile(r"-[0-9.]")
 
@@ -49,10 +56,10 @@ def _overview() -> str:
 
 
 def _open_streams() -> None:
-    """Let no text fail for its way out.
+    """Make sure that printing never fails.
 
-    A stream that was closed leads nowhere; otherwise a product could get its file number, and with it what libraries
-    write there. What a console has no character for is written as an escape.
+    A closed stream is replaced by the null device; otherwise a product could get its file number, and with it what
+    libraries print. Characters that a console does not have are written as escapes.
     """
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
@@ -88,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{_ROOM_OF[verb]}.{verb}")
     parser = argparse.ArgumentParser(
         prog=f"orthoswarm {verb}",
         description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",

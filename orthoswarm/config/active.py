@@ -7,23 +7,23 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.config.bundle import BundleConfig
 from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.evaluation import EvaluationConfig
-from orthoswarm.config.features import FeaturesConfig
-from orthoswarm.config.flight import FlightConfig
-from orthoswarm.config.initial import InitialConfig
-from orthoswarm.config.late import LateConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
 from orthoswarm.config.radiometry import RadiometryConfig
 from orthoswarm.config.raster import RasterConfig
-from orthoswarm.config.records import RecordsConfig
-from orthoswarm.config.registration import RegistrationConfig
-from orthoswarm.config.strategy import StrategyConfig
-from orthoswarm.config.surface import SurfaceConfig
+from orthoswarm.config.refiner.bundle import BundleConfig
+from orthoswarm.config.refiner.features import FeaturesConfig
+from orthoswarm.config.refiner.flight import FlightConfig
+from orthoswarm.config.refiner.initial import InitialConfig
+from orthoswarm.config.refiner.late import LateConfig
+from orthoswarm.config.refiner.records import RecordsConfig
+from orthoswarm.config.refiner.registration import RegistrationConfig
+from orthoswarm.config.refiner.strategy import StrategyConfig
+from orthoswarm.config.refiner.surface import SurfaceConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]

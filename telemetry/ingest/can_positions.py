@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoswarm.config.records import RecordsConfig
+from orthoswarm.config.refiner.records import RecordsConfig
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.samples.course import EARTH_RADIUS_M
 from telemetry.samples.sample import Sample

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from orthoswarm.config.records import RecordsConfig
+from orthoswarm.config.refiner.records import RecordsConfig
 from orthoswarm.model.angles import wrap_deg
 from telemetry.formats.log.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.samples.sample import Sample

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.fleet import parse_systems
+from gcs_plugin.cli.verbs.vehicles.fleet import parse_systems
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission import mission_files

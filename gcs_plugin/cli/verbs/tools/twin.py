@@ -8,7 +8,7 @@ from typing import Any
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    from gcs_plugin.cli.verbs import twin_camera
+    from gcs_plugin.cli.verbs.tools import twin_camera
 
     parser.epilog = "example:\n  orthoswarm twin make tiny --out twin-tiny --seed 1 --noise paper"
     actions = parser.add_subparsers(dest="action", required=True, metavar="make|camera")
@@ -93,7 +93,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make the set, or follow a vehicle."""
     if args.action == "camera":
-        from gcs_plugin.cli.verbs import twin_camera
+        from gcs_plugin.cli.verbs.tools import twin_camera
 
         return twin_camera.run(args)
     import json

@@ -1,0 +1,1 @@
+"""Verbs that make, inspect, measure and export maps."""

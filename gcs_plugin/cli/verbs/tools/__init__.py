@@ -1,0 +1,1 @@
+"""Verbs for data sets with truth, benchmarks, weights and the machine."""

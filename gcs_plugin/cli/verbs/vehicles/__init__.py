@@ -1,0 +1,1 @@
+"""Verbs that plan flights, speak with vehicles, and run the daemon and simulations."""

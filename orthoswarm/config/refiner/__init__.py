@@ -1,0 +1,1 @@
+"""Thresholds of the refiner, one module a stage."""
