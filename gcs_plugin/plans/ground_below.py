@@ -14,7 +14,6 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import Plan
 from orthoswarm.planning.relief_plan import GroundBelow
-from orthoswarm.planning.sorties.ground_check import LEAST_ABOVE_GROUND_M
 from orthoswarm.raster.height_model import HeightModel
 
 _AROUND_M = 50.0
@@ -63,7 +62,7 @@ def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
     )
     if over.by_vehicle:
         how += ", by the terrain data of the vehicles: the ground station must send it to them, or their card hold it"
-    back = math.ceil(ground.way_m + LEAST_ABOVE_GROUND_M)
+    back = math.ceil(ground.way_m + active().planning.least_above_ground_m)
     return [
         f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
         f"{over.least_m:.0f} to {over.most_m:.0f} m above ground; side overlap {100 * over.side_overlap[0]:.0f} % or "

@@ -9,10 +9,12 @@ from typing import Any
 
 from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
+from orthoswarm.config.coverage import CoverageConfig
 from orthoswarm.config.evaluation import EvaluationConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
+from orthoswarm.config.planning import PlanningConfig
 from orthoswarm.config.radiometry import RadiometryConfig
 from orthoswarm.config.raster import RasterConfig
 from orthoswarm.config.refiner.bundle import BundleConfig
@@ -46,6 +48,8 @@ class Config:
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
+    planning: PlanningConfig = field(default_factory=PlanningConfig)
+    coverage: CoverageConfig = field(default_factory=CoverageConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)

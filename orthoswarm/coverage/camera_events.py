@@ -11,17 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.coverage.missing_pictures import Cause, Exposure, MissingPicture, missing_pictures
 from orthoswarm.coverage.view import View
 
 Array = NDArray[np.float64]
-_MATCH_SHARE = 0.45
-"""An event belongs to a picture within this share of the usual time between events."""
-_LEAST_MATCHED = 0.5
-"""Share of a vehicle's pictures that must have an event: else its clocks disagree, and the events say nothing."""
-_SURE = 0.95
-_BORROWED_LENS = 0.6
-"""Confidence in what a vehicle has seen of which no picture has arrived: its lens is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +72,7 @@ def missing_by_events(
             found += missing_pictures(row, files)
             continue
         without = _without_picture(own, np.array([*(v.time_s for v in timed), *(e.time_s for e in files)], float))
-        if len(own) - len(without) < _LEAST_MATCHED * len(timed):
+        if len(own) - len(without) < active().coverage.least_matched * len(timed):
             warnings.append(f"the camera events of {vehicle} are not at the times of its pictures: they are not used")
             found += missing_pictures(row, files)
             continue
@@ -87,7 +81,8 @@ def missing_by_events(
         taken = [replace(p.view, time_s=e.time_s) for p, e in zip(waiting, without, strict=True) if p is not None]
         holes = missing_pictures([*timed, *taken], files)
         found += [
-            h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=_SURE) for h in holes
+            h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=active().coverage.sure)
+            for h in holes
         ]
     for vehicle in sorted(set(by_vehicle) - set(rows)):
         found += _none_arrived(vehicle, by_vehicle[vehicle], views)
@@ -106,14 +101,14 @@ def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[V
         near = views[int(np.hypot(*(places - event.position[:2]).T).argmin())]
         place = np.array([*event.position[:2], near.position[2]])
         view = replace(near.moved_to(place, f"event {event.number}", event.time_s), vehicle=vehicle)
-        found.append(MissingPicture(view, "", Cause.NOT_ARRIVED, _BORROWED_LENS))
+        found.append(MissingPicture(view, "", Cause.NOT_ARRIVED, active().coverage.borrowed_lens))
     return found
 
 
 def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[CameraEvent]:
     """Events that no picture was taken at; each picture takes the nearest event."""
     at = np.array([e.time_s for e in events])
-    slack = _MATCH_SHARE * float(np.median(np.diff(at)))
+    slack = active().coverage.match_share * float(np.median(np.diff(at)))
     nearest = np.abs(at[None, :] - times[:, None]).argmin(1)
     taken = {int(k) for k, t in zip(nearest, times, strict=True) if abs(at[k] - t) <= slack}
     return [event for k, event in enumerate(events) if k not in taken]
@@ -128,4 +123,4 @@ def _not_arrived(event: CameraEvent, timed: Sequence[View]) -> MissingPicture | 
     before = max(0, int(np.searchsorted(times, event.time_s)) - 1)
     place = np.array([*event.position[:2], near.position[2]])
     view = near.moved_to(place, f"event {event.number}", event.time_s)
-    return MissingPicture(view, timed[before].image, Cause.NOT_ARRIVED, _SURE)
+    return MissingPicture(view, timed[before].image, Cause.NOT_ARRIVED, active().coverage.sure)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.coverage.painting import UNSEEN, paint
 from orthoswarm.coverage.view import Flaw, View
 from orthoswarm.model.bounding_box import BoundingBox
@@ -25,16 +26,14 @@ from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.footprint import least_descent, tan_limit
 
 Array = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 Geometry = Any
 Due = bool | NDArray[np.bool_]
 
-CELL_M = 1.0
-_MOST_CELLS = 60_000_000
 _ROWS_AT_ONCE = 64
-_FLATTEST = math.tan(math.radians(75.0))
 
 
 class State(IntEnum):
@@ -74,19 +73,20 @@ class Cells:
     excluded: NDArray[np.bool_]
 
     @classmethod
-    def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = CELL_M) -> "Cells":
-        """Cells of at most `cell_m` over shapely (Multi)Polygons in the grid of `epsg`.
+    def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float | None = None) -> "Cells":
+        """Cells of at most `cell_m` (None: as configured) over shapely (Multi)Polygons in the grid of `epsg`.
 
         Raises:
-            InputError: the area is empty, or would have more than 60 million cells.
+            InputError: the area is empty, or would have more than `most_cells` of the configuration.
         """
         from rasterio.features import rasterize
 
         if ground.is_empty:
             raise InputError("the area is empty; draw it as a polygon with some ground")
-        bounds = BoundingBox(*ground.bounds)
-        if bounds.width * bounds.height > _MOST_CELLS * cell_m * cell_m:
-            side = math.ceil(math.sqrt(bounds.width * bounds.height / _MOST_CELLS) * 10) / 10
+        config, bounds = active().coverage, BoundingBox(*ground.bounds)
+        cell_m = config.cell_m if cell_m is None else cell_m
+        if bounds.width * bounds.height > config.most_cells * cell_m * cell_m:
+            side = math.ceil(math.sqrt(bounds.width * bounds.height / config.most_cells) * 10) / 10
             raise InputError(f"the area has too many cells of {cell_m:g} m; use --cell {side:g} or a smaller area")
         grid = GroundGrid.around(epsg, bounds, cell_m)
 
@@ -203,7 +203,7 @@ class CoverageGrid:
         if self.demands.sigma_m is not None and sigma > self.demands.sigma_m:
             flaws |= Flaw.POSITION
         coarsest = 0.0 if self.demands.gsd_m is None else self.demands.gsd_m
-        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest])
+        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest, *_descents()])
         ground, heights, corner = self.terrain, self._heights, (0, 0)
         if view.ground is not None:
             ground, heights, corner = view.ground, _heights(view.ground, self.cells.grid, box), (box[0], box[2])
@@ -215,14 +215,14 @@ class CoverageGrid:
         """Rows and columns that hold the view's footprint on the lowest and the highest ground."""
         corners, grid, ground = _border(view.lens), self.cells.grid, view.ground or self.terrain
         rays = corners @ np.linalg.inv(view.to_camera).T
-        points = []
+        points, flattest = [], tan_limit()
         for z in (float(ground.z.min()), float(ground.z.max())):
             above = float(view.position[2]) - z
             if above <= 0.0:
                 continue
-            flat = rays[:, :2] / np.maximum(np.hypot(*rays[:, :2].T), 1e-9)[:, None] * _FLATTEST
+            flat = rays[:, :2] / np.maximum(np.hypot(*rays[:, :2].T), 1e-9)[:, None] * flattest
             down = -rays[:, 2]
-            steep = np.hypot(*rays[:, :2].T) < _FLATTEST * down
+            steep = np.hypot(*rays[:, :2].T) < flattest * down
             with np.errstate(divide="ignore", invalid="ignore"):
                 points.append(view.position[:2] + above * np.where(steep[:, None], rays[:, :2] / down[:, None], flat))
         if not points:
@@ -233,6 +233,11 @@ class CoverageGrid:
             max(0, math.floor((grid.north - north) / s)), min(grid.height, math.ceil((grid.north - south) / s)),
             max(0, math.floor((west - grid.west) / s)), min(grid.width, math.ceil((east - grid.west) / s)),
         )  # fmt: skip
+
+
+def _descents() -> tuple[float, float]:
+    """Least descent of a ray per unit of length that is not oblique, and that counts as seeing the ground at all."""
+    return math.cos(math.radians(active().coverage.oblique_deg)), least_descent()
 
 
 def _union(boxes: Sequence[Box]) -> Box:

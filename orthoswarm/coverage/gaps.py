@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Due, State
 from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
 from orthoswarm.coverage.painting import UNSEEN
@@ -18,7 +19,6 @@ Array = NDArray[np.float64]
 _CAUSES = tuple(Cause)
 _NONE = 255
 _TOLD_FIRST = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE, Flaw.OBLIQUE, Flaw.EDGE)
-SMALLEST_M2 = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def find_gaps(
     cover: CoverageGrid,
     missing: Sequence[MissingPicture] = (),
     plan: PlannedFlight | None = None,
-    smallest_m2: float = SMALLEST_M2,
+    smallest_m2: float | None = None,
     due: Due = True,
 ) -> Gaps:
     """Gaps and their causes.
@@ -97,7 +97,7 @@ def find_gaps(
 
     Args:
         cover: with all pictures. missing: of `missing_pictures`. plan: what was to be flown, None if not known.
-        smallest_m2: smaller gaps are only counted.
+        smallest_m2: smaller gaps are only counted, None: as configured.
         due: cells whose flight is over, as for `CoverageGrid.states`; no other is a gap.
     """
     state = cover.states(due)
@@ -125,7 +125,8 @@ def find_gaps(
         explained.enter(missed & below_legs(cover.cells, plan, plan.legs), Cause.NOT_FLOWN, 0.9)
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
-    return _polygons(cover, explained, vehicles, smallest_m2)
+    least_m2 = active().coverage.smallest_gap_m2 if smallest_m2 is None else smallest_m2
+    return _polygons(cover, explained, vehicles, least_m2)
 
 
 def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:

@@ -8,13 +8,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.coverage.view import View
-
-_HOLE = 1.6
-"""Steps to the next picture from which on one is missing."""
-_STRAIGHT_COS = float(np.cos(np.radians(20.0)))
-_MOST = 400
-_SLACK_S = 0.05
 
 
 class Cause(StrEnum):
@@ -95,11 +90,11 @@ def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture
     usual = float(np.median(moving))
     heading = way / np.maximum(step, 1e-9)[:, None]
     found = []
-    for i in np.flatnonzero(step > _HOLE * usual).tolist():
+    for i in np.flatnonzero(step > active().coverage.hole_steps * usual).tolist():
         near = [k for k in (i - 1, i + 1) if 0 <= k < len(step) and step[k] > 0.2]
-        if not any(float(heading[k] @ heading[i]) > _STRAIGHT_COS for k in near):
+        if not any(float(heading[k] @ heading[i]) > np.cos(np.radians(active().coverage.straight_deg)) for k in near):
             continue
-        count = min(_MOST, max(1, round(step[i] / usual) - 1))
+        count = min(active().coverage.most_missing, max(1, round(step[i] / usual) - 1))
         cause, confidence, names = _why(row[i], row[i + 1], count, lost)
         for k in range(count):
             share = (k + 1) / (count + 1)
@@ -112,7 +107,7 @@ def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture
 def _why(before: View, after: View, count: int, lost: Sequence[Exposure]) -> tuple[Cause, float, list[str]]:
     """Cause of a hole, how sure, and names of its pictures where they are known."""
     if before.time_s is not None and after.time_s is not None:
-        times = (before.time_s + _SLACK_S, after.time_s - _SLACK_S)
+        times = (before.time_s + active().coverage.slack_s, after.time_s - active().coverage.slack_s)
         within = [e for e in lost if times[0] < e.time_s < times[1]]
         files = [e.image for e in within if e.image]
         if within:

@@ -7,8 +7,6 @@ from orthoswarm.compute.jit import kernel
 UNSEEN = 255
 """Value of `best` in a cell that no picture sees."""
 _EDGE, _OBLIQUE, _COARSE = 1, 2, 64
-_COS_OBLIQUE = float(np.cos(np.radians(45.0)))
-_COS_FLATTEST = float(np.cos(np.radians(75.0)))
 
 
 @kernel
@@ -36,10 +34,10 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
         camera: float64 (3, 3), View.to_camera. position: float64 (3,).
         lens: focal length in pixels, k1, k2, k3, principal point (2), columns, rows, largest undistorted radius.
         quality: two sigma in metres, two sigma of the focal length (relative), flaws of the picture, coarsest ground
-            pixel allowed in metres (0: any).
+            pixel allowed in metres (0: any), least descent of a ray that is not oblique, and of one that sees at all.
     """
     focal, k1, k2, k3, cu, cv, columns, rows, reach = lens
-    sigma, focal_sigma, whole, coarsest = quality
+    sigma, focal_sigma, whole, coarsest, cos_oblique, cos_flattest = quality
     seen = 0
     flat = height.shape[0] == 1 and height.shape[1] == 1
     for r in range(box[0], box[1]):
@@ -61,14 +59,14 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
             if inside < 0.0:
                 continue
             descent = -up / np.sqrt(east * east + north * north + up * up)
-            if descent < _COS_FLATTEST:
+            if descent < cos_flattest:
                 continue
             flaws = int(whole)
             along = focal_sigma * np.sqrt(u * u + v * v)
             place = (sigma + 0.5 * edges[2]) * focal / depth
             if inside * inside < along * along + place * place:
                 flaws |= _EDGE
-            if descent < _COS_OBLIQUE:
+            if descent < cos_oblique:
                 flaws |= _OBLIQUE
             if coarsest > 0.0 and depth > coarsest * focal:
                 flaws |= _COARSE

@@ -5,13 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.coverage.view import Flaw
 from orthoswarm.raster.picture_quality import PictureQuality
-
-NEIGHBOURS = 15
-"""Pictures before and after, with which one is compared."""
-_BLURRED, _FAINT = 0.5, 0.25
-_FLAT_SHARE, _SATURATED_SHARE, _LEAST_CONTRAST = 0.10, 0.5, 4.0
 
 
 def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
@@ -21,6 +17,7 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     their contrast, or less than 4 grey levels, or half of the pixels saturated. Damaged: a tenth of the blocks more
     than usual is of one single value. The thresholds are ours; sharpness over a wood and over a lake differ by less.
     """
+    config = active().coverage
     flaws = [Flaw(0)] * len(qualities)
     measured = [i for i, q in enumerate(qualities) if q is not None]
     if not measured:
@@ -29,15 +26,18 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     sharp, contrast, flat, bright = np.array(rows, float).T
     usual_sharp, usual_contrast, usual_flat = (_running_median(v) for v in (sharp, contrast, flat))
     for k, i in enumerate(measured):
-        if sharp[k] < _BLURRED * usual_sharp[k]:
+        if sharp[k] < config.blurred_share * usual_sharp[k]:
             flaws[i] |= Flaw.BLURRED
-        if contrast[k] < max(_LEAST_CONTRAST, _FAINT * usual_contrast[k]) or bright[k] > _SATURATED_SHARE:
+        if (
+            contrast[k] < max(config.least_contrast, config.faint_share * usual_contrast[k])
+            or bright[k] > config.saturated_share
+        ):
             flaws[i] |= Flaw.HAZE
-        if flat[k] > usual_flat[k] + _FLAT_SHARE:
+        if flat[k] > usual_flat[k] + config.flat_share:
             flaws[i] |= Flaw.DAMAGED
     return flaws
 
 
 def _running_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    n = NEIGHBOURS
+    n = active().coverage.neighbours
     return np.array([np.median(values[max(0, i - n) : i + n + 1]) for i in range(len(values))])

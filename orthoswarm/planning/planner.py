@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
@@ -29,11 +30,6 @@ __all__ = ["METHODS", "Method", "Options", "plan_area", "plan_gaps", "plan_lines
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-
-_FAIR_ENOUGH = 1.25
-_CLEARANCE_M = 1.0
-_QUICKEST_S = 0.5
-_WORTH = 0.99  # a later candidate must be better by this: the first ones are in the method's own, tidier order
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ def plan_area(
     options = options or Options()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
-    clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
+    clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
     crew = Crew(vehicles, over.heights, foot, area.grid, router, options)
     progress("lines")
@@ -110,7 +106,7 @@ def plan_area(
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
     warnings = _warnings(slots, best, foot, options)
-    if seen < planned_coverage.COMPLETE:
+    if seen < active().planning.complete_share:
         warnings.append(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
@@ -129,7 +125,7 @@ def _best_work(
         most = max(most, candidate.stretches)
         if candidate.stretches >= crew.vehicles:
             work = crew.share(candidate.legs, method != "columns")
-            best = work if best is None or work.score < _WORTH * best.score else best
+            best = work if best is None or work.score < active().planning.better_share * best.score else best
     if best is not None:
         return best
     if not most:
@@ -167,7 +163,7 @@ def plan_gaps(
     options = options or Options()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
-    clearance = options.clearance_m or max(0.1, min(_CLEARANCE_M, 0.125 * foot.width_m))
+    clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
     progress("lines")
     found = [_gap_legs(piece, router, foot) for piece in planned_coverage.pieces(area.ground)]
@@ -241,7 +237,7 @@ def plan_lines(
             f"no stretch of the line is as long as two picture distances ({2 * foot.trigger_m:.0f} m); "
             "fly lower or draw longer lines"
         )
-    clearance = options.clearance_m or _CLEARANCE_M
+    clearance = options.clearance_m or active().planning.clearance_m
     router = Router(make_obstacles(no_fly.no_fly, clearance) if no_fly else shapely.MultiPolygon())
     if router.blocked(legs[:, 0], legs[:, 1]).any() or router.inside(legs.reshape(-1, 2)).any():
         raise InputError("a line crosses a no-fly zone; redraw the line or the zone")
@@ -262,12 +258,12 @@ def plan_lines(
 def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Options) -> list[str]:
     result = []
     every_s = foot.trigger_m / options.motion.speed_m_s
-    if every_s < _QUICKEST_S:
+    if every_s < active().planning.quickest_s:
         result.append(
             f"a picture every {every_s:.2f} s is more than most cameras take; fly slower or higher, or with less "
             "forward overlap"
         )
-    if work.balance > _FAIR_ENOUGH:
+    if work.balance > active().planning.fair_enough:
         result.append(
             f"the longest path is {work.balance:.2f} times the mean: few lines, or long ways out and home, "
             "cannot be shared more evenly"

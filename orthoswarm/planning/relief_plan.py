@@ -6,21 +6,16 @@ from typing import Literal
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import Plan
-from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.sorties.flight_heights import FlightHeights, GroundHeights, LevelHeights
-from orthoswarm.planning.sorties.ground_check import LEAST_ABOVE_GROUND_M
 
 Relief = Literal["auto", "follow", "level"]
 MakePlan = Callable[[float, Footprint, FlightHeights], Plan]
 """Plans with a footprint, the height above level ground that it belongs to, and the flights' heights."""
-
-_CLOSER = 0.93
-_ROUNDS = 4
-_BY_VEHICLE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,31 +55,32 @@ def plan_over_relief(
         by_vehicle: the vehicle keeps its height above the ground by a model of its own; the plan counts on 1 m.
 
     Raises:
-        InputError: lower than 20 m above the ground, or as `make`.
+        InputError: lower than `least_above_ground_m` above the ground, or as `make`.
     """
+    kept_above_m = active().planning.least_above_ground_m
     if not 0.0 < tolerance_m <= 0.5 * above_m:
         raise InputError(
             f"the tolerance of the height above ground is {tolerance_m:g} m; give more than 0 and at most half of "
             "--altitude"
         )
     level_m = min(0.5 * (ground.low_m + ground.high_m) + above_m, ground.low_m + above_m + tolerance_m)
-    level_fits = level_m - max(ground.high_m, ground.way_m) >= LEAST_ABOVE_GROUND_M
+    level_fits = level_m - max(ground.high_m, ground.way_m) >= kept_above_m
     flat = ground.high_m - ground.low_m <= 2.0 * tolerance_m
     if relief == "level" and not level_fits:
         raise InputError(
             f"at one height, {level_m:.0f} m above takeoff, the flight would be {level_m - ground.way_m:.0f} m above "
-            f"the highest ground, and {LEAST_ABOVE_GROUND_M:g} m must be kept; let the legs follow the ground, or give "
-            f"--altitude {np.ceil(above_m + LEAST_ABOVE_GROUND_M - level_m + ground.way_m):.0f} or more"
+            f"the highest ground, and {kept_above_m:g} m must be kept; let the legs follow the ground, or give "
+            f"--altitude {np.ceil(above_m + kept_above_m - level_m + ground.way_m):.0f} or more"
         )
     plans = []
     if relief == "follow" or (relief == "auto" and not (flat and level_fits)):
         least_m = above_m - tolerance_m
-        if least_m < LEAST_ABOVE_GROUND_M:
+        if least_m < kept_above_m:
             raise InputError(
                 f"{above_m:g} m above ground, less a tolerance of {tolerance_m:g} m, are less than the "
-                f"{LEAST_ABOVE_GROUND_M:g} m that must be kept; give a larger --altitude"
+                f"{kept_above_m:g} m that must be kept; give a larger --altitude"
             )
-        kept_m = min(tolerance_m, _BY_VEHICLE_M) if by_vehicle else tolerance_m
+        kept_m = min(tolerance_m, active().planning.by_vehicle_m) if by_vehicle else tolerance_m
         heights = GroundHeights(ground.terrain, above_m, kept_m, by_vehicle=by_vehicle)
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
@@ -96,7 +92,7 @@ def plan_over_relief(
 def _closely_enough(make: MakePlan, lens: Callable[[float], Footprint], heights: FlightHeights, least_m: float) -> Plan:
     """A plan with lines as close as the slopes ask for: across a slope pictures are narrower than over a level."""
     best: Plan | None = None
-    for closer in _CLOSER ** np.arange(_ROUNDS):
+    for closer in active().planning.closer_share ** np.arange(active().planning.closer_rounds):
         above_m = float(closer) * least_m
         plan = make(above_m, lens(above_m), heights)
         if best is None or (plan.covered_share or 1.0) > (best.covered_share or 1.0):
@@ -108,4 +104,4 @@ def _closely_enough(make: MakePlan, lens: Callable[[float], Footprint], heights:
 
 
 def _complete(plan: Plan) -> bool:
-    return plan.covered_share is None or plan.covered_share >= planned_coverage.COMPLETE
+    return plan.covered_share is None or plan.covered_share >= active().planning.complete_share

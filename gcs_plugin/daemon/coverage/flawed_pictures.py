@@ -4,7 +4,8 @@ import bisect
 from collections.abc import Iterable
 from typing import Final
 
-from orthoswarm.coverage.picture_flaws import NEIGHBOURS, picture_flaws
+from orthoswarm.config import active
+from orthoswarm.coverage.picture_flaws import picture_flaws
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
 from orthoswarm.raster.picture_quality import PictureQuality
 
@@ -40,9 +41,10 @@ class FlawedPictures:
         changed = set()
         for camera, first in self._first.items():
             row = self._cameras[camera]
-            begin = max(0, first - 2 * NEIGHBOURS)  # the median for the first one needs those before it
+            reach = active().coverage.neighbours
+            begin = max(0, first - 2 * reach)  # the median for the first one needs those before it
             found = picture_flaws([quality for *_, quality in row[begin:]])
-            for k in range(max(0, first - NEIGHBOURS), len(row)):
+            for k in range(max(0, first - reach), len(row)):
                 key = camera[0], row[k][1]
                 if self._flaws.get(key, NO_FLAW) != found[k - begin]:
                     self._flaws[key] = found[k - begin]

@@ -15,6 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, strip_legs
@@ -25,7 +26,6 @@ Array = NDArray[np.float64]
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7
 _SNAP_M, _INTO_M = 1e-4, 0.01
-_TOOTH = 0.1
 
 
 def cells(ground: Geometry) -> list[Geometry]:
@@ -114,7 +114,7 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     frame = Turned(angle_rad, (field.ground.centroid.x, field.ground.centroid.y))
     local = field.turned(frame)
     # A ragged coast has a critical point at every tooth, so cells are cut from a smoothed outline.
-    parts = cells(local.ground.simplify(_TOOTH * foot.spacing_m))
+    parts = cells(local.ground.simplify(active().planning.tooth_spacings * foot.spacing_m))
     sweeps = [
         _Sweep([frame.to_grid(np.array(line)) for line in lines])
         for lines in _by_cell(_lines(local, foot, multiple), parts)
@@ -154,10 +154,6 @@ def _by_cell(lines: list[list[Array]], parts: list[Geometry]) -> list[list[list[
     return [lines for lines in found if lines]
 
 
-_EXACT_CELLS = 8
-"""So many cells are ordered exactly: 0.02 s."""
-
-
 def order_cells(ways: Array) -> list[int]:
     """A short row through all cells: 4 * cell + way to fly it, from each cell's exit to the next one's entry.
 
@@ -170,7 +166,7 @@ def order_cells(ways: Array) -> list[int]:
     n = len(ways) // 4
     if n == 1:
         return [0]
-    if n <= _EXACT_CELLS:
+    if n <= active().planning.exact_cells:
         return _shortest_order(ways)
     first = np.arange(n) if n <= 60 else np.linspace(0, n - 1, 60).astype(int)
     row, code = _best_row(np.ascontiguousarray(ways), first)

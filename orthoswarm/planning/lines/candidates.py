@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.bcd import bcd_legs
 from orthoswarm.planning.lines.columns import column_legs
@@ -21,10 +22,6 @@ Method = Literal["columns", "bcd", "tmstc"]
 
 METHODS: tuple[str, ...] = get_args(Method)
 _TRIES: dict[str, int] = {"columns": 6, "bcd": 6, "tmstc": 8}
-_TRIES_IF_FEW = 12  # few lines are cheap to lay and hard to share
-_MANY_LEGS = 400
-_DENSER = 1.25
-_HOPELESS = 1.08  # a direction dearer than the best by this is not worth mending
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ def candidates(
         angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < 0.02 for b in quarter[:k])]
     few, least = False, np.inf
     for number, angle in enumerate(angles):
-        if number >= (_TRIES_IF_FEW if few else _TRIES[method]):
+        if number >= (active().planning.tries_if_few if few else _TRIES[method]):
             return
         legs = _lay(field, angle, foot, method, router, 1)
         if not len(legs):
@@ -69,14 +66,14 @@ def candidates(
         few = few or count < 4 * vehicles
         rough = _rough_cost(legs, turn_m)
         least = min(least, rough)
-        if not few and rough > _HOPELESS * least:
+        if not few and rough > active().planning.hopeless * least:
             continue
         yield from _finished(field, legs, count, angle, foot, method, router, reach_m)
-        if len(legs) > _MANY_LEGS:  # directions hardly differ then, and each takes its time
+        if len(legs) > active().planning.many_legs:  # directions hardly differ then, and each takes its time
             return
         if method != "tmstc" and vehicles <= len(legs) < 4 * vehicles:
             denser = _lay(field, angle, foot, method, router, vehicles)
-            if len(legs) < len(denser) <= _DENSER * len(legs):
+            if len(legs) < len(denser) <= active().planning.denser * len(legs):
                 yield from _finished(field, denser, count, angle, foot, method, router, reach_m)
 
 

@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import shortest_path
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 
 Geometry = Any
 Array = NDArray[np.float64]
-
-_HAIR_M = 0.02
-_MOST_CORNERS = 300
 
 
 def make_obstacles(no_fly: Geometry, clearance_m: float) -> Geometry:
@@ -35,7 +33,7 @@ def make_obstacles(no_fly: Geometry, clearance_m: float) -> Geometry:
         grown = no_fly.buffer(clearance_m + tolerance, join_style="mitre", mitre_limit=2.0).simplify(tolerance)
         parts = [shapely.Polygon(p.exterior) for p in shapely.get_parts(grown)]
         obstacles = shapely.union_all(parts)
-        if shapely.get_num_coordinates(obstacles) <= _MOST_CORNERS or tolerance > 50.0:
+        if shapely.get_num_coordinates(obstacles) <= active().planning.detour_most_corners or tolerance > 50.0:
             return obstacles
         tolerance *= 2.0
 
@@ -84,7 +82,7 @@ class Router:
 
     def __init__(self, obstacles: Geometry) -> None:
         self.obstacles = obstacles
-        shrunk = obstacles.buffer(-_HAIR_M, join_style="mitre")
+        shrunk = obstacles.buffer(-active().planning.detour_inside_m, join_style="mitre")
         rings = [shapely.get_coordinates(r) for p in shapely.get_parts(shrunk) for r in shapely.get_rings(p)]
         self._edges = np.concatenate([np.hstack([r[:-1], r[1:]]) for r in rings]) if rings else np.empty((0, 4))
         shapely.prepare(shrunk)

@@ -6,18 +6,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
 
 Geometry = Any
 Array = NDArray[np.float64]
-
-COMPLETE = 0.999
-_TARGET = 0.9996
-_ROUNDS = 5
-_CRUMB_M2 = 0.5
-_PLACES = 8
 
 
 def bands(legs: Array, width_m: float, reach_m: float) -> Geometry:
@@ -42,8 +37,9 @@ def missed(ground: Geometry, legs: Array, width_m: float, reach_m: float) -> Geo
     return ground.difference(shapely.union_all(bands(legs, width_m, reach_m)))
 
 
-def pieces(geometry: Geometry, least_m2: float = _CRUMB_M2) -> list[Geometry]:
-    """Polygons of at least a size in a geometry, largest first."""
+def pieces(geometry: Geometry, least_m2: float | None = None) -> list[Geometry]:
+    """Polygons of at least a size (None: as configured) in a geometry, largest first."""
+    least_m2 = active().planning.crumb_m2 if least_m2 is None else least_m2
     parts = [p for p in shapely.get_parts(shapely.get_parts(geometry)) if p.geom_type == "Polygon"]
     return sorted((p for p in parts if p.area >= least_m2), key=lambda p: -p.area)
 
@@ -59,7 +55,7 @@ def prune(field: Field, legs: Array, foot: Footprint) -> Array:
             break
         near = [n for n in tree.query(boxes[k]) if n != k and keep[n]]
         own = boxes[k].intersection(field.ground)
-        if own.difference(shapely.union_all(boxes[near])).area < _CRUMB_M2:
+        if own.difference(shapely.union_all(boxes[near])).area < active().planning.crumb_m2:
             keep[k] = False
     return legs[keep] if keep.any() else legs
 
@@ -79,11 +75,11 @@ def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: fl
     """
     hopeless: list[Geometry] = []
     ways = router.each(legs[:-1, 1], legs[1:, 0])
-    for _ in range(_ROUNDS):
+    for _ in range(active().planning.repair_rounds):
         left = missed(field.ground, legs, foot.width_m, reach_m)
-        if left.area <= (1.0 - _TARGET) * field.ground.area:
+        if left.area <= (1.0 - active().planning.target_share) * field.ground.area:
             break
-        excess, added = left.area - (1.0 - _TARGET) * field.ground.area, False
+        excess, added = left.area - (1.0 - active().planning.target_share) * field.ground.area, False
         for gap in pieces(left):
             if excess <= 0.0 or any(h.contains(gap.centroid) for h in hopeless):
                 continue
@@ -165,7 +161,7 @@ def insert(legs: Array, ways: Array, leg: Array, router: Router) -> tuple[Array,
     straight[:-1] += away[:, ::-1]
     straight[1:n] -= ways[:, None]
     best, place, turned = np.inf, 0, 0
-    for k, t in sorted(np.ndindex(n + 1, 2), key=lambda kt: float(straight[kt]))[:_PLACES]:
+    for k, t in sorted(np.ndindex(n + 1, 2), key=lambda kt: float(straight[kt]))[: active().planning.repair_places]:
         growth = float(router.distances(legs[k - 1, 1], leg[t])[0, 0]) if k > 0 else 0.0
         growth += float(router.distances(leg[1 - t], legs[k, 0])[0, 0]) if k < n else 0.0
         growth -= float(ways[k - 1]) if 0 < k < n else 0.0

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.lines.line_spacing import Footprint
 
@@ -19,8 +20,6 @@ Geometry = Any
 Array = NDArray[np.float64]
 
 MOST_LINES = 20_000
-_CRUMB_M2 = 0.05
-_STRETCH = 5.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
         float64 (2, 2) arrays, start and end.
     """
     piece = shapely.clip_by_rect(field.ground, *box)
-    bounds = shapely.bounds([p for p in shapely.get_parts(piece) if p.area > _CRUMB_M2])
+    bounds = shapely.bounds([p for p in shapely.get_parts(piece) if p.area > active().planning.line_crumb_m2])
     if not len(bounds):
         return []
     x, more = 0.5 * (box[0] + box[2]), foot.overshoot_m
@@ -187,7 +186,7 @@ def direction_cost(field: Field, angle_rad: float, spacing_m: float, turn_m: flo
 
 def stretches(lengths_m: Array, spacing_m: float) -> int:
     """Among how many vehicles legs can be shared: one takes a leg, or a stretch five spacings long of a long leg."""
-    return int(np.maximum(1, np.floor(lengths_m / (_STRETCH * spacing_m))).sum())
+    return int(np.maximum(1, np.floor(lengths_m / (active().planning.stretch_spacings * spacing_m))).sum())
 
 
 def rank_directions(field: Field, foot: Footprint, turn_m: float, vehicles: int) -> list[float]:

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.planning.lines.bricks import joins
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.spanning_tree import circumnavigate, spanning_edges
@@ -19,8 +20,6 @@ from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, str
 Geometry = Any
 Array = NDArray[np.float64]
 Loop = NDArray[np.int64]
-
-_CRUMB_SHARE = 0.02
 
 
 def tmstc_legs(field: Field, angle_rad: float, foot: Footprint) -> list[Array]:
@@ -58,7 +57,10 @@ def occupied(
     shapely.prepare(ground)
     result = np.asarray(shapely.contains_properly(ground, boxes), bool)
     edge = shapely.intersects(ground, boxes) & ~result
-    result[edge] = shapely.area(shapely.intersection(ground, boxes[edge])) > _CRUMB_SHARE * size[0] * size[1]
+    result[edge] = (
+        shapely.area(shapely.intersection(ground, boxes[edge]))
+        > active().planning.tmstc_crumb_share * size[0] * size[1]
+    )
     return result
 
 

@@ -4,11 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 
 Array = NDArray[np.float64]
-
-MOST_LEGS = 500
 
 
 @kernel
@@ -108,10 +107,10 @@ def shorten(legs: Array, router: Router, depot: Array | None = None) -> Array:
         depot: float64 (2,) where the row begins and ends; None leaves both ends open.
 
     Returns:
-        float64 (n, 2, 2). Rows of more than `MOST_LEGS` legs come back as they are.
+        float64 (n, 2, 2). Rows of more than `ordered_most_legs` legs come back as they are.
     """
     n = len(legs)
-    if n < 2 or n > MOST_LEGS:
+    if n < 2 or n > active().planning.ordered_most_legs:
         return legs
     ends = legs.reshape(-1, 2)
     if depot is not None:

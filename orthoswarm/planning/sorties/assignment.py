@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import End
@@ -23,14 +24,11 @@ from orthoswarm.planning.sorties.workload_split import Limits, Row, cut, share, 
 Array = NDArray[np.float64]
 
 MOST_VEHICLES = 250  # MAVLink system ids
-_ITEMS_A_LEG = 4
-_SPARE_ITEMS = 40
 _FARTHEST_M = 100_000.0
 _SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
 _LONGEST_RUN_IN_M = 200.0
 _LONGEST_WAIT_S = 3600.0
 _MOST_WIND = 0.8  # of the speed through the air
-_FAIR, _UNFAIR = 1.15, 1.22
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,9 @@ class Work:
     @property
     def score(self) -> float:
         """Less is better: the makespan, dearer where the work is shared unevenly."""
-        price = 2.0 * max(0.0, self.balance - _FAIR) + 6.0 * max(0.0, self.balance - _UNFAIR)
+        price = 2.0 * max(0.0, self.balance - active().planning.fair_balance) + 6.0 * max(
+            0.0, self.balance - active().planning.unfair_balance
+        )
         return self.longest_s * (1.0 + price)
 
 
@@ -162,7 +162,11 @@ class Crew:
         fixed = (climb + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
         if self._returns:
             fixed += (climb + above) / motion.descent_m_s + above / motion.climb_m_s
-        most_legs = max(1, (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)))
+        most_legs = max(
+            1,
+            (self._options.most_items - active().planning.spare_items)
+            // (active().planning.items_a_leg + (self._options.run_in_m > 0.0)),
+        )
         return Limits(self._endurances_s, fixed, apart.swap_s, most_legs)
 
     def share(self, legs: Array, reorder: bool) -> Work:
@@ -180,7 +184,7 @@ class Crew:
             if not far < _FARTHEST_M:
                 raise InputError(f"a start is {far / 1000:.0f} km from the area; check that it is given as LAT,LON")
         by_time = self._shared(legs, reorder, self._options.motion)
-        if by_time.balance <= _FAIR:
+        if by_time.balance <= active().planning.fair_balance:
             return by_time
         # Where turns take most of the time, even times are uneven paths: try even paths, too.
         by_length = self._shared(legs, reorder, replace(self._options.motion, acceleration_m_s2=math.inf))

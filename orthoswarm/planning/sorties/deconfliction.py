@@ -14,16 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
 
 Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
-
-_STEP_S = 0.5
-_GROUND_M = 2.0
-_LAYER_PRICE_S = 3.0
-_PAD = 1.5  # radius about a start within which only time keeps vehicles apart, in separation distances
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +70,20 @@ class _Track:
     pad: NDArray[np.bool_]
 
 
+def _step_s() -> float:
+    """Time step in which flights are compared, seconds."""
+    return active().planning.step_s
+
+
 def _sampled(flight: Flight, motion: Motion, pad_m: float) -> _Track:
     track = flight.track()
     times = flight.times(motion)
     if flight.wait_s > 0.0:  # it comes to where it waits, and stays there
         at = 2 + flight.last_leg_end
         track, times = np.insert(track, at, track[at], axis=0), np.insert(times, at, times[at] - flight.wait_s)
-    moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
+    moments = np.arange(0.0, times[-1] + _step_s(), _step_s())
     places = np.stack([np.interp(moments, times, track[:, axis]) for axis in range(3)], axis=1)
-    flying = np.flatnonzero(places[:, 2] > flight.home_z_m + _GROUND_M)
+    flying = np.flatnonzero(places[:, 2] > flight.home_z_m + active().planning.on_ground_m)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
     return _Track(flight.home, int(flying[0]), places, np.hypot(*(places[:, :2] - flight.home).T) < pad_m)
 
@@ -155,30 +156,30 @@ class _Sky:
         self._motion, self._apart = motion, apart
         self._tracks: list[tuple[int, _Track]] = []
         # Between samples a vehicle moves: half a step is added to the distance to keep.
-        self._reach = apart.distance_m + 0.5 * _STEP_S * motion.speed_m_s
+        self._reach = apart.distance_m + 0.5 * _step_s() * motion.speed_m_s
 
     def place(self, make: Maker, ready_s: float) -> Slot:
         """Give a flight its layers and takeoff, not before it is ready, and remember it."""
-        ready = int(np.ceil(ready_s / _STEP_S))
+        ready = int(np.ceil(ready_s / _step_s()))
         layers = self._apart.layers + 1
         pairs = sorted(((o, h) for o in range(layers) for h in range(layers)), key=lambda p: (sum(p), p))
         frozen = self._frozen()
         best: tuple[float, Slot, _Track, int] | None = None
         soonest = 0.0
         for out, home in pairs:
-            price = _LAYER_PRICE_S * (out + home)
+            price = active().planning.layer_price_s * (out + home)
             if best is not None and price + soonest >= best[0]:
                 break
             flight = make(out * self._apart.height_m, home * self._apart.height_m)
-            track = _sampled(flight, self._motion, _PAD * self._apart.distance_m)
+            track = _sampled(flight, self._motion, active().planning.pad_distances * self._apart.distance_m)
             marks = self._launches(track, ready)
             if best is None:  # whatever the layers, takeoffs at one start come one after the other
-                soonest = _first_zero(marks) * _STEP_S
+                soonest = _first_zero(marks) * _step_s()
             self._meetings(track, ready, frozen, marks)
             delay = _first_zero(marks)
-            if best is None or price + delay * _STEP_S < best[0]:
-                slot = Slot(out, home, (ready + delay) * _STEP_S, flight)
-                best = (price + delay * _STEP_S, slot, track, ready + delay)
+            if best is None or price + delay * _step_s() < best[0]:
+                slot = Slot(out, home, (ready + delay) * _step_s(), flight)
+                best = (price + delay * _step_s(), slot, track, ready + delay)
         assert best is not None
         self._tracks.append((best[3], best[2]))
         return best[1]
@@ -196,11 +197,14 @@ class _Sky:
     def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
         """Delays that takeoffs from the same start forbid, as marks; room for all others."""
         apart = self._apart
-        slack, gap = int(np.ceil(apart.slack_s / _STEP_S)), int(np.ceil(apart.launch_s / _STEP_S))
+        slack, gap = (
+            int(np.ceil(apart.slack_s / _step_s())),
+            int(np.ceil(apart.launch_s / _step_s())),
+        )
         end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
         marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
         for start, other in self._tracks:
-            if np.hypot(*(other.home - track.home)) < _PAD * apart.distance_m:
+            if np.hypot(*(other.home - track.home)) < active().planning.pad_distances * apart.distance_m:
                 _mark(marks, start - ready, gap - 1)
         return marks
 
@@ -208,15 +212,15 @@ class _Sky:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
-        limits = np.array([self._reach, apart.height_m - 0.01, np.ceil(apart.slack_s / _STEP_S)])
+        limits = np.array([self._reach, apart.height_m - 0.01, np.ceil(apart.slack_s / _step_s())])
         when = ready + track.ground + np.arange(len(track.places))
         for other in frozen:
             away = ~track.pad if other.pad else np.ones(len(when), bool)
             other.forbid(track.places[away], when[away], limits, marks)
         for start, placed in self._tracks:
-            if np.hypot(*(placed.home - track.home)) < _PAD * apart.distance_m:
+            if np.hypot(*(placed.home - track.home)) < active().planning.pad_distances * apart.distance_m:
                 landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
-                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
+                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _step_s())) - 1)
 
 
 def _mark(marks: NDArray[np.int64], delay: int, slack: int) -> None:

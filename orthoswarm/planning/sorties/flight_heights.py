@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 
 Array = NDArray[np.float64]
 
 _SAME_M = 0.01
-_FINEST_M, _COARSEST_M = 1.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,9 @@ class GroundHeights:
         length = float(np.hypot(*(end - start[:2])))
         if length < _SAME_M:
             return np.array([[*end, self.at(end, more_m)]])
-        step = float(np.clip(0.5 * self.ground.step_m, _FINEST_M, _COARSEST_M))
+        step = float(
+            np.clip(0.5 * self.ground.step_m, active().planning.profile_finest_m, active().planning.profile_coarsest_m)
+        )
         share = np.linspace(0.0, 1.0, int(np.ceil(length / step)) + 1)
         places = start[:2] + share[:, None] * (end - start[:2])
         wanted = np.asarray(self.ground.height(places), np.float64) + self.above_m + more_m

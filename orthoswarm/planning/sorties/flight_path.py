@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, length, turns
@@ -12,7 +13,6 @@ from orthoswarm.planning.sorties.flight_time import Motion, length, turns
 Array = NDArray[np.float64]
 
 _SAME_M = 0.05
-_STRAIGHT = 0.985  # cosine of ten degrees
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:
         return start
     along = (leg[1] - leg[0]) / np.hypot(*(leg[1] - leg[0]))
     way = leg[0] - before
-    comes_straight = float(way @ along) >= _STRAIGHT * float(np.hypot(*way))
+    comes_straight = float(way @ along) >= active().planning.straight_cos * float(np.hypot(*way))
     ahead = start - run_in_m * along
     if comes_straight or router.inside(ahead)[0] or router.blocked(ahead, start)[0]:
         return start

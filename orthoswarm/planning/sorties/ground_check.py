@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import OverGround
@@ -16,10 +17,6 @@ from orthoswarm.planning.sorties.flight_path import Flight
 
 Geometry = Any
 Array = NDArray[np.float64]
-
-LEAST_ABOVE_GROUND_M = 20.0
-_FINEST_M, _COARSEST_M = 1.0, 10.0
-_EDGE_ROUNDS = 12
 
 
 def leg_paths(flight: Flight) -> list[Array]:
@@ -44,7 +41,7 @@ def swaths(paths: Sequence[Array], ground: Terrain, foot: Footprint, foot_above_
 def _sampled(path: Array, ground: Terrain) -> Array:
     """A path (n, 3) with points at most half a node of the height model apart."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
-    step = float(np.clip(0.5 * ground.step_m, _FINEST_M, _COARSEST_M))
+    step = float(np.clip(0.5 * ground.step_m, active().planning.profile_finest_m, active().planning.profile_coarsest_m))
     at = np.union1d(np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1), along)
     return np.stack([np.interp(at, along, path[:, axis]) for axis in range(3)], axis=1)
 
@@ -61,7 +58,7 @@ def _half_widths(points: Array, ground: Terrain, slope: float) -> tuple[Array, A
     above = points[:, 2] - np.asarray(ground.height(points[:, :2]))
     reach = np.repeat(slope * above[None], 2, 0)
     # Damped, as ground steeper than the ray would make plain iteration swing.
-    for _ in range(_EDGE_ROUNDS):
+    for _ in range(active().planning.edge_rounds):
         places = points[None, :, :2] + (sides * reach)[..., None] * left
         height = points[None, :, 2] - np.asarray(ground.height(places))
         reach = 0.5 * (reach + slope * np.maximum(height, 0.0))
@@ -103,10 +100,11 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
             overlaps.append(1.0 - foot.spacing_m / np.maximum(width, 1e-9))
     above, overlap = np.concatenate(on_legs), np.concatenate(overlaps)
     least = float(np.concatenate(on_ways).min())
-    if least < LEAST_ABOVE_GROUND_M - 0.01:
+    least_above_m = active().planning.least_above_ground_m
+    if least < least_above_m - 0.01:
         raise InputError(
-            f"the flight would be {least:.0f} m above the highest ground below it, and {LEAST_ABOVE_GROUND_M:g} m must "
-            f"be kept; give --altitude {np.ceil(heights.above_m + LEAST_ABOVE_GROUND_M - least):.0f} or more"
+            f"the flight would be {least:.0f} m above the highest ground below it, and {least_above_m:g} m must "
+            f"be kept; give --altitude {np.ceil(heights.above_m + least_above_m - least):.0f} or more"
         )
     forward = 1.0 - foot.trigger_m / (foot.height_m * float(above.min()) / foot_above_m)
     top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)

@@ -13,14 +13,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_time import Motion, angles
 
 Array = NDArray[np.float64]
-
-_CUT_PRICE = 0.25
-_LEEWAY = 1.04  # how much longer than it must be the longest piece may get so that legs stay whole
-_PARTS = 24  # possible cuts per share
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def cut(legs: Array, router: Router, motion: Motion, shares: int, least_m: float
         step_m: longest part; by default a small fraction of a share.
     """
     length = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
-    step = max(least_m, length.sum() / shares / _PARTS if step_m is None else step_m)
+    step = max(least_m, length.sum() / shares / active().planning.cuts_per_share if step_m is None else step_m)
     count = np.maximum(1, (length / step).astype(np.int64))
     leg = np.repeat(np.arange(len(legs)), count)
     at = np.arange(len(leg)) - np.repeat(np.cumsum(count) - count, count)
@@ -96,7 +93,7 @@ class Limits:
 
 
 @kernel
-def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limits, cap, shortest):  # type: ignore[no-untyped-def]
+def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limits, cut_price, cap, shortest):  # type: ignore[no-untyped-def]
     """Cuts (vehicles + 1,) of the row, [0] is -1 where no cut keeps within the limits; and the longest piece's time.
 
     when[k]: seconds at which part k begins and ends; out[j, p] and home[j, q]: seconds from vehicle j's start to part
@@ -118,7 +115,7 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limit
             done, left = when[q - 1, 1] - when[0, 0], when[n - 1, 1] - when[q - 1, 1]
             if done > (j + 1) * (cap + longest_way) or (q < n and left > (vehicles - j - 1) * (cap + longest_way)):
                 continue
-            price = _CUT_PRICE if q < n and leg[q] == leg[q - 1] else 0.0
+            price = cut_price if q < n and leg[q] == leg[q - 1] else 0.0
             for p in range(q - 1, j - 1, -1):
                 work = when[q - 1, 1] - when[p, 0]
                 if work > cap or (shortest and work >= cost[j + 1, q]):
@@ -172,12 +169,13 @@ def _evenly(
         np.array(np.broadcast_to(np.asarray(limits.endurance_s, np.float64), len(out))),
         np.array([limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
+    cut_price, leeway = active().planning.cut_price, active().planning.leeway
     # A cap that is met keeps the search narrow, so try small ones first.
     share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
     for cap in (*(share_s * 1.3 * 1.5 ** np.arange(8)), np.inf):
-        cuts, longest = _cut_evenly(*given, cap, True)
+        cuts, longest = _cut_evenly(*given, cut_price, cap, True)
         if cuts[0] >= 0:
-            return np.asarray(_cut_evenly(*given, _LEEWAY * longest + 1e-6, False)[0])
+            return np.asarray(_cut_evenly(*given, cut_price, leeway * longest + 1e-6, False)[0])
     return None
 
 

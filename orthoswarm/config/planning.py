@@ -1,0 +1,103 @@
+"""Planning: lines over an area, their order, sorties, and heights over ground.
+
+Prices are shares of flying time or seconds; limits of what a user may ask for stand beside their error messages.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class PlanningConfig:
+    """Planning: lines over an area, their order, sorties, and heights over ground."""
+
+    # Heights over ground
+    least_above_ground_m: float = 20.0
+    """Least height of a flight over the highest ground below it, metres: trees, masts and errors of a height model
+    (chosen)."""
+    profile_finest_m: float = 1.0
+    """Least distance of the places at which the ground below a flight is read, metres (chosen for its time)."""
+    profile_coarsest_m: float = 10.0
+    """Greatest distance of them, metres (chosen: slopes of up to 45 degrees)."""
+    edge_rounds: int = 12
+    """Bisections by which the highest ground between two such places is found (chosen: to millimetres)."""
+    closer_share: float = 0.93
+    """Lines on slopes are laid for a lower flight, by this factor each round, until the ground is covered (chosen)."""
+    closer_rounds: int = 4
+    """Most such rounds (chosen for its time)."""
+    by_vehicle_m: float = 1.0
+    """How near a vehicle that follows the terrain by itself is taken to keep its height, metres (chosen)."""
+
+    # Lines
+    complete_share: float = 0.999
+    """Share of an area from which on a plan covers it (chosen)."""
+    target_share: float = 0.9996
+    """Share up to which gaps of a plan are mended (chosen: above `complete_share` for errors of the flight)."""
+    repair_rounds: int = 5
+    """Most rounds of mending (chosen for its time)."""
+    repair_places: int = 8
+    """Places in the order of the legs at which a leg that mends a gap is tried, nearest first (chosen for its time)."""
+    crumb_m2: float = 0.5
+    """Smaller gaps are none, square metres: rounding of outlines (chosen)."""
+    line_crumb_m2: float = 0.05
+    """Smaller parts of an area get no line of their own, square metres (chosen)."""
+    stretch_spacings: float = 5.0
+    """A vehicle's share of a long leg is at least so many line spacings long, or turns outweigh it (chosen)."""
+    tmstc_crumb_share: float = 0.02
+    """A cell of the spanning tree that holds a smaller share of the area is left out (chosen)."""
+    tooth_spacings: float = 0.1
+    """Outlines are simplified by so many line spacings before they are cut into cells: a ragged coast has a critical
+    point at every tooth (chosen)."""
+    exact_cells: int = 8
+    """So many cells are put in the shortest order exactly (0.02 s)."""
+    ordered_most_legs: int = 500
+    """Orders of more legs are not improved: cost grows with the square (chosen for its time)."""
+    tries_if_few: int = 12
+    """Directions that are tried where there are few lines, which are cheap to lay and hard to share (chosen)."""
+    many_legs: int = 400
+    """From so many legs on no further directions are tried: they hardly differ (chosen for its time)."""
+    denser: float = 1.25
+    """Lines are also laid closer, up to so many times their number, where that shares them better (chosen)."""
+    hopeless: float = 1.08
+    """A direction that is so many times as long as the best is not worth mending (chosen)."""
+    detour_inside_m: float = 0.02
+    """How far a detour may pass inside an obstacle, metres: its corners touch it (chosen: rounding)."""
+    detour_most_corners: int = 300
+    """Obstacles are simplified to so many corners: cost grows with their square (chosen for its time)."""
+
+    # Sorties
+    fair_balance: float = 1.15
+    """The longest sortie over the mean up to which a division is fair (chosen)."""
+    unfair_balance: float = 1.22
+    """... and from which on it is priced steeply (chosen)."""
+    fair_enough: float = 1.25
+    """From here on the plan says that it is uneven (chosen)."""
+    better_share: float = 0.99
+    """A later candidate must be better by this factor: the first ones are in the method's own, tidier order
+    (chosen)."""
+    clearance_m: float = 1.0
+    """Distance that is kept from no-fly zones where none is asked for, metres; less with a small footprint (chosen)."""
+    quickest_s: float = 0.5
+    """A warning says that cameras seldom release at shorter intervals, seconds (chosen)."""
+    straight_cos: float = 0.985
+    """Cosine of the angle up to which a vehicle comes straight into a leg and needs no run-in: 10 degrees (chosen)."""
+    items_a_leg: int = 4
+    """Mission items that a leg takes (two ends, camera on and off), to keep within an autopilot's limit."""
+    spare_items: int = 40
+    """Mission items kept for ways, takeoff and landing (chosen)."""
+    cut_price: float = 0.25
+    """Price of a cut within a leg, in the unit of what is divided, so that legs stay whole where that costs little
+    (chosen)."""
+    leeway: float = 1.04
+    """How much longer than it must be the longest share may get so that legs stay whole (chosen)."""
+    cuts_per_share: int = 24
+    """Possible cuts in a share (chosen for its time)."""
+
+    # Deconfliction
+    step_s: float = 0.5
+    """Time step in which flights are compared, seconds (chosen for its time)."""
+    on_ground_m: float = 2.0
+    """Up to this height over its takeoff a vehicle stands on the ground, metres (chosen)."""
+    layer_price_s: float = 3.0
+    """What a flight height apart from the others is worth in seconds of delay, for each layer (chosen)."""
+    pad_distances: float = 1.5
+    """Radius about a start, in separation distances, within which only time keeps vehicles apart (chosen)."""
