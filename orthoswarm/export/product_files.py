@@ -58,6 +58,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
         row["weak"] = True
     if frame.damaged:
         row["damaged"] = True
+    if frame.ambiguous:
+        row["ambiguous"] = True
     row["camera"] = _camera_row(camera, grid)
     return row
 

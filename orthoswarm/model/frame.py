@@ -48,6 +48,8 @@ class Frame:
         origin: which source gave which field, for `inspect` and the report.
         damaged: True where parts of the picture were predicted from something that was lost: it serves for its
             position only, and is drawn only where no other sees.
+        ambiguous: True where the position is that of one of several camera events of a log, and nothing tells of which;
+            the fix's sigma covers the others.
     """
 
     image: str
@@ -61,6 +63,7 @@ class Frame:
     fov_hint_rad: float | None = None
     origin: dict[str, str] = field(default_factory=dict, compare=False)
     damaged: bool = False
+    ambiguous: bool = False
 
 
 @dataclass(frozen=True, slots=True)

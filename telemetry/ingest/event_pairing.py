@@ -10,12 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from telemetry.ingest.alignment import CERTAIN
+from telemetry.ingest.motion_chains import PictureMotion
 from telemetry.ingest.sequence_match import match_sequences
 
 Array = NDArray[np.float64]
-
-CERTAIN = 0.999
-"""Probability from which on a pairing counts as decided."""
 
 
 @dataclass(slots=True)
@@ -28,6 +27,7 @@ class Pairing:
         offset_s: photo clock minus event clock, None if times were not used.
         residual_s: median distance of paired times after offset and drift.
         ambiguous: True if less than half of the pairs are decided. how: "time", "number" or "order".
+        by_pictures: whether the pictures' motion was used, too.
     """
 
     pairs: list[tuple[int, int]] = field(default_factory=list)
@@ -36,6 +36,7 @@ class Pairing:
     residual_s: float = 0.0
     ambiguous: bool = False
     how: str = "time"
+    by_pictures: bool = False
 
 
 def pair(
@@ -43,6 +44,7 @@ def pair(
     event_times: Sequence[float | None],
     photo_numbers: Sequence[int | None] = (),
     event_numbers: Sequence[int | None] = (),
+    motion: PictureMotion | None = None,
 ) -> Pairing:
     """Pair photos with events; both are in order of time (or of name).
 
@@ -51,6 +53,7 @@ def pair(
         event_times: UTC, None where unknown.
         photo_numbers: of file names.
         event_numbers: the autopilot's image counts.
+        motion: the way flown as the photos show it, for photos that the times leave open.
     """
     if not len(photo_times) or not len(event_times):
         return Pairing()
@@ -60,7 +63,9 @@ def pair(
         photos = np.array([photo_times[i] for i in timed], dtype=np.float64)
         events = np.array([event_times[j] for j in dated], dtype=np.float64)
         if np.ptp(photos) > 0.0:
-            found = by_time(photos, events)
+            if motion is not None:
+                motion = motion.subset(timed, dated)
+            found = by_time(photos, events, motion)
             if len(found.pairs) >= 0.5 * min(len(photos), len(events)):
                 found.pairs = [(timed[i], dated[j]) for i, j in found.pairs]
                 found.doubtful = {timed[i]: [dated[j] for j in at] for i, at in found.doubtful.items()}
@@ -72,15 +77,22 @@ def pair(
     return Pairing([(i, i) for i in range(count)], how="order", ambiguous=len(photo_times) != len(event_times))
 
 
-def by_time(photos: Array, events: Array) -> Pairing:
-    """Pair two sequences of times whose clocks differ by an unknown offset and drift."""
+def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -> Pairing:
+    """Pair two sequences of times whose clocks differ by an unknown offset and drift.
+
+    Args:
+        photos: (N,) by the camera's clock. events: (M,) by the vehicle's.
+        motion: what the pictures show; its photos and events are numbered as here.
+    """
     order_p, order_e = np.argsort(photos, kind="stable"), np.argsort(events, kind="stable")
-    found = match_sequences(photos[order_p], events[order_e])
+    if motion is not None:
+        motion = motion.subset(order_p.tolist(), order_e.tolist())
+    found = match_sequences(photos[order_p], events[order_e], motion)
     if found is None:
         return Pairing()
     pairs = found.pairs()
     certain = sum(probability >= CERTAIN for _, _, probability in pairs)
-    result = Pairing(offset_s=found.offset_s, ambiguous=certain < 0.5 * len(pairs))
+    result = Pairing(offset_s=found.offset_s, ambiguous=certain < 0.5 * len(pairs), by_pictures=found.by_pictures)
     for i, j, probability in pairs:
         photo, event = int(order_p[i]), int(order_e[j])
         result.pairs.append((photo, event))

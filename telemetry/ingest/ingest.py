@@ -80,7 +80,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
         for folder in found.folders:
             if folder.pictures:
-                _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result)
+                _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result, options.workers)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options, progress, result)
     _check_vehicles(result)
@@ -137,6 +137,7 @@ def _photo_folder(
     tables: Sequence[tuple[Path, str, PoseTable]],
     logs: Sequence[LogSource],
     result: Survey,
+    workers: int,
 ) -> None:
     """Make one source from a folder's photos with these tags."""
     at_root = folder.path == found.root
@@ -155,7 +156,7 @@ def _photo_folder(
         groups.setdefault(vehicle, []).append(photo)
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
-        add_logs(photos, folder.path, vehicle, logs, source.findings)
+        add_logs(photos, folder.path, vehicle, logs, source.findings, workers)
         photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         frames = frames_of(photos, vehicle, found.name, source.findings)

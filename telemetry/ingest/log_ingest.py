@@ -15,6 +15,8 @@ from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
 from telemetry.ingest.event_pairing import Pairing, pair
+from telemetry.ingest.motion_chains import PictureMotion
+from telemetry.ingest.picture_evidence import picture_motion
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
@@ -131,7 +133,12 @@ def _apart_m(a: Sample, b: Sample) -> float:
 
 
 def add_logs(
-    photos: Sequence[PhotoTags], folder: Path, vehicle: str, logs: Sequence[LogSource], findings: list[Finding]
+    photos: Sequence[PhotoTags],
+    folder: Path,
+    vehicle: str,
+    logs: Sequence[LogSource],
+    findings: list[Finding],
+    workers: int = 1,
 ) -> None:
     """Fill what photos lack from the log that fits them best.
 
@@ -141,6 +148,7 @@ def add_logs(
         vehicle: id, for messages.
         logs: all logs.
         findings: findings are appended here.
+        workers: threads that read photos if times do not tell which camera event they belong to.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):
@@ -155,6 +163,9 @@ def add_logs(
         return
     tried.sort(key=lambda row: -(row[0] + _NAME_BONUS * row[1]))
     fit, named, pairing, entry = tried[0]
+    if pairing.doubtful:
+        motion = picture_motion(photos, entry.log, entry.timeline, workers)
+        pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing
     _use_events(photos, pairing, entry, vehicle, findings)
     rivals = [other for rival, _, _, other in tried[1:] if rival > fit - _NAME_BONUS and not other.used]
     if rivals and not named:
@@ -178,12 +189,13 @@ def _is_complete(photo: PhotoTags) -> bool:
     return photo.lat_deg is not None and photo.height_m is not None and photo.camera_deg[0] is not None
 
 
-def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent]) -> Pairing:
+def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent], motion: PictureMotion | None = None) -> Pairing:
     return pair(
         [p.time_s for p in photos],
         [e.time_s for e in events],
         [number_of(p.path.name) for p in photos],
         [e.number for e in events],
+        motion,
     )
 
 
@@ -208,6 +220,7 @@ def _use_events(
             spread = max((_apart_m(pose, log.events[k].sample) for k in pairing.doubtful[i]), default=0.0)
             pose = replace(pose, sigma_m=max(spread, pose.sigma_m or 0.0) or None)
             origin += ", one of several that its time allows"
+            photo.ambiguous = True
         fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
     if far > 0.2 * len(pairing.pairs):
@@ -222,6 +235,8 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     text = f"{count} were paired with camera events of {log.path.name} {how}"
     if pairing.offset_s is not None:
         text += f"; the camera's clock is {pairing.offset_s:+.1f} s off (rest {pairing.residual_s:.2f} s)"
+    if pairing.by_pictures:
+        text += "; where times do not tell, the pictures' own motion did"
     found = [Finding("paired", text, note=True)]
     if len(used_events) < len(log.events):
         first = next((j for j in range(len(log.events)) if j in used_events), 0)
@@ -238,7 +253,7 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     elif pairing.doubtful:
         text = (
             f"{plural(len(pairing.doubtful), 'photo')} may belong to neighbouring camera events of {log.path.name} "
-            "(their times do not tell); their positions count as that uncertain"
+            "(neither their times nor the pictures tell); their positions count as that uncertain"
         )
         found.append(Finding("pairing-doubtful", text))
     if not log.has_gimbal:

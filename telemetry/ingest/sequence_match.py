@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from orthoswarm.model.robust import mad_sigma
+from telemetry.ingest.alignment import CERTAIN, SequenceMatch
+from telemetry.ingest.motion_chains import Chains, PictureMotion, chains_of, variants
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,85 +34,26 @@ _SAME_EXPOSURE_S = 0.12
 _MISSING_AT_END = 0.5
 _NEGLIGIBLE = 16.0
 """Natural logarithm of the odds beyond which a hypothesis is left out."""
-_LEAST_PROBABILITY = 0.02
 _CLOCK_DOUBT = 1e-3
 """Probability of other clocks (by more than half an interval) above which each photo's is not believed."""
+_COARSE_S = 0.5
+"""Resolution of a clock from which on pictures tell more than times do."""
+_LEAST_AGREEMENT = 0.9
 _CANDIDATES = 24
 _FIRST_JITTER_S = 0.08
 _JITTERS_S = (0.02, 0.04, 0.08, 0.16)
+_MISSING = (0.01, 0.03, 0.1, 0.35)
 _MOST_BINS = 1 << 19
 _MOST_DRIFTS = 81
 
 
-@dataclass(frozen=True, slots=True)
-class SequenceMatch:
-    """Probabilities of pairings.
-
-    Attributes:
-        events: (K,) index of each event, without repetitions.
-        first: (N,) index into `events` of column 0 of a photo's row.
-        probability: (N, B) of each photo and event.
-        offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
-        resolution_s: of the photo's clock. jitter_s: of the trigger, one sigma.
-    """
-
-    events: Indices
-    first: Indices
-    probability: Array
-    offset_s: float
-    drift: float
-    resolution_s: float
-    jitter_s: float
-
-    def pairs(self) -> list[tuple[int, int, float]]:
-        """The alignment with the most expected matches: photo, event (both increasing) and probability.
-
-        A heaviest increasing subsequence, with a Fenwick tree of prefix maxima over the events.
-        """
-        tree: list[tuple[float, int]] = [(0.0, -1)] * (len(self.events) + 2)
-        nodes: list[tuple[int, int, float, int]] = []  # photo, event, probability, node before
-        for i, row in enumerate(self.probability):
-            reached = []
-            for column in np.flatnonzero(row > _LEAST_PROBABILITY).tolist():
-                event = int(self.first[i]) + column
-                value, before = _prefix_maximum(tree, event)
-                nodes.append((i, event, float(row[column]), before))
-                reached.append((event, value + float(row[column]), len(nodes) - 1))
-            for event, value, node in reached:
-                _raise_to(tree, event + 1, (value, node))
-        pairs = []
-        node = _prefix_maximum(tree, len(self.events))[1]
-        while node >= 0:
-            i, event, probability, node = nodes[node]
-            pairs.append((i, int(self.events[event]), probability))
-        return pairs[::-1]
-
-    def alternatives(self, photo: int) -> list[int]:
-        """Events that a photo may belong to."""
-        columns = np.flatnonzero(self.probability[photo] > _LEAST_PROBABILITY)
-        return [int(self.events[self.first[photo] + column]) for column in columns]
-
-
-def _prefix_maximum(tree: list[tuple[float, int]], end: int) -> tuple[float, int]:
-    best = (0.0, -1)
-    while end > 0:
-        best = max(best, tree[end])
-        end -= end & -end
-    return best
-
-
-def _raise_to(tree: list[tuple[float, int]], at: int, entry: tuple[float, int]) -> None:
-    while at < len(tree):
-        tree[at] = max(tree[at], entry)
-        at += at & -at
-
-
-def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
+def match_sequences(photos: Array, events: Array, motion: PictureMotion | None = None) -> SequenceMatch | None:
     """Match two increasing sequences of times; None if they cannot be matched.
 
     Args:
         photos: (N,) by the camera's clock, whole seconds or finer, equal ones in order of exposure.
         events: (M,) by the vehicle's clock; one exposure recorded twice within 0.12 s counts once.
+        motion: what the pictures show, asked for where the times do not decide.
     """
     if len(photos) < 2 or len(events) < 2:
         return None
@@ -125,6 +68,16 @@ def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
     problem, candidates = _plausible(problem)
     if not candidates:
         return None
+    result = _alignment(problem, candidates, single)
+    if motion is not None and resolution >= _COARSE_S and (~_decided(result)).any():
+        chained = _chained(problem, result, motion)
+        again = None if chained is None else _alignment(chained, candidates, single)
+        result = again if again is not None and _decides_more(again, result) else result
+    return replace(result, offset_s=result.offset_s + float(photos[0]) - middle)
+
+
+def _alignment(problem: "_Problem", candidates: list[tuple[float, float]], single: Indices) -> SequenceMatch:
+    """Probabilities for events that there are; the offset is that of the problem's own origins."""
     first, probability, offset, drift, clock_doubt = _probabilities(problem, candidates)
     inside = np.clip(first, 0, len(single))
     shifted = np.zeros_like(probability)
@@ -133,16 +86,41 @@ def match_sequences(photos: Array, events: Array) -> SequenceMatch | None:
         shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
     if clock_doubt < _CLOCK_DOUBT:
         shifted = _without_coincidences(problem, inside, shifted, offset, drift)
-    offset += float(photos[0]) - middle
-    return SequenceMatch(
-        events=single,
-        first=inside,
-        probability=shifted,
-        offset_s=offset,
-        drift=drift,
-        resolution_s=resolution,
-        jitter_s=problem.jitter_s,
-    )
+    asked = problem.chains is not None
+    return SequenceMatch(single, inside, shifted, offset, drift, problem.resolution_s, problem.jitter_s, asked)
+
+
+def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
+    """(N,) whether a photo's event is certain, or that it has none."""
+    likeliest = match.probability.max(axis=1, initial=0.0)
+    return (likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN)
+
+
+def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
+    """Whether more photos are decided than before, and as many have an event: else log and pictures disagree."""
+    more = _decided(now).sum() > _decided(before).sum()
+    return bool(more and now.probability.sum() > _LEAST_AGREEMENT * before.probability.sum())
+
+
+def _chained(problem: "_Problem", match: SequenceMatch, motion: PictureMotion) -> "_Problem | None":
+    """The problem with what the pictures of the undecided photos show; None where they show nothing."""
+    offset, drift = match.offset_s, match.drift
+    unsure = ~_decided(match)
+    steps = np.full(len(unsure) - 1, np.nan)
+    wanted = unsure[1:] | unsure[:-1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
+    for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        steps[start:end] = motion.shifts_px(range(start, end + 1))
+    path = motion.path_m[match.events]
+    chains = chains_of(steps, problem.p, problem.e, path, problem.resolution_s, offset, drift)
+    if chains is None:
+        return None
+    clock = _Grid(np.array([offset]), np.array([drift]), (offset, drift), problem.resolution_s)
+    # With chains far fewer photos and events have to be missing to explain the times than without.
+    scored = [replace(problem, chains=variant, missing=0.03) for variant in variants(chains)]
+    best = max(scored, key=lambda trial: float(_forward(trial, clock).evidence[0]))
+    scored = [replace(best, missing=missing) for missing in _MISSING]
+    return max(scored, key=lambda trial: float(_forward(trial, clock).evidence[0]) - _normalisation(trial))
 
 
 def _without_coincidences(
@@ -186,8 +164,9 @@ class _Problem:
 
     Attributes:
         p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
-        resolution_s: width of a photo's interval. interval_s: time between exposures, by which matches are weighted.
-        jitter_s: one sigma. missing: odds that an exposure is missing from one of the recordings.
+        resolution_s: width of a photo's interval. interval_s: time between exposures that matches are weighed with.
+        jitter_s: one sigma. missing: odds of one exposure missing from one of the recordings.
+        chains: what the pictures show, None where they were not asked.
     """
 
     p: Array
@@ -196,9 +175,15 @@ class _Problem:
     interval_s: float
     jitter_s: float = _FIRST_JITTER_S
     missing: float = 0.1
+    chains: Chains | None = None
+
+    @property
+    def hypotheses(self) -> int:
+        """Hypotheses C about each chain of photos."""
+        return 1 if self.chains is None else len(self.chains.scales)
 
     def weights(self, i: int, first: int, width: int, offset: Array, drift: Array) -> Array:
-        """(H, width) weights of photo i matching the event `first` and those after it."""
+        """(H C, width) weight of photo i being the event `first` and those after it, by clock and hypothesis."""
         at = np.arange(first, first + width)
         inside = (at >= 0) & (at < len(self.e))
         e = self.e[np.clip(at, 0, len(self.e) - 1)]
@@ -208,7 +193,17 @@ class _Problem:
             density = (ndtr((u + 0.5 * q) / sigma) - ndtr((u - 0.5 * q) / sigma)) / q
         else:
             density = np.exp(-0.5 * (u / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
-        return np.asarray(np.where(inside, self.interval_s * density, 0.0))
+        weights = np.asarray(np.where(inside, self.interval_s * density, 0.0))
+        if self.chains is None:
+            return weights
+        factors = self.chains.factors(i, first, width, offset, drift)
+        return np.asarray((weights[:, None, :] * factors).reshape(-1, width))
+
+    def alone(self, i: int, offset: Array, drift: Array) -> Array:
+        """(H C, 1) weight of photo i having no event."""
+        if self.chains is None:
+            return np.full((len(offset), 1), self.missing)
+        return self.missing * self.chains.alone(i, offset, drift).reshape(-1, 1)
 
     def regular(self) -> "_Problem":
         """The same problem for exposures at intervals as even as these.
@@ -319,7 +314,7 @@ def _fitted(problem: _Problem, offset: float, drift: float) -> _Problem:
     best: tuple[float, _Problem] | None = None
     for jitter in _JITTERS_S:
         trial = replace(problem, jitter_s=jitter)
-        for missing in (0.01, 0.03, 0.1, 0.35):
+        for missing in _MISSING:
             trial = replace(trial, missing=missing)
             grid = _grid(trial, offset, drift, 2.0 * _FIRST_JITTER_S, 2.0 * _FIRST_JITTER_S)
             evidence = float(_forward(trial, grid).evidence.max())
@@ -335,13 +330,16 @@ def _normalisation(problem: _Problem) -> float:
     return (len(problem.p) + len(problem.e)) * float(np.log1p(problem.missing))
 
 
+_Found = tuple[Indices, Array, float, float, float]
+
+
 @dataclass(slots=True)
 class _Forward:
     """Sums over all alignments that end with a match.
 
     Attributes:
         evidence: (H,) logarithm of the sum over all alignments.
-        rows: (N, H, B) each divided by the exponential of scales (N, H); empty unless asked for.
+        rows: (N, H C, B) each divided by the exponential of scales (N, H C); empty unless asked for.
     """
 
     evidence: Array
@@ -357,7 +355,7 @@ def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bo
         F[i, j] = m[i, j] (t^(i + j) + G[i - 1, j - 1]),    G[i, j] = sum over i' <= i, j' <= j of F s^(i - i' + j - j')
     """
     first, width = grid.band(problem)
-    count, total, clocks = len(problem.p), len(problem.e), len(grid.offset)
+    count, total, clocks = len(problem.p), len(problem.e), len(grid.offset) * problem.hypotheses
     s, log_t = problem.missing, float(np.log(_MISSING_AT_END))
     columns = np.arange(width + 1)
     decay = np.tril(s ** np.maximum(columns[1:, None] - columns[None, 1:], 0).astype(np.float64)).T
@@ -370,6 +368,9 @@ def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bo
         i = count - 1 - step if backward else step
         weight = problem.weights(i, int(first[i]), width, grid.offset, grid.drift)
         lo = int(first[i])
+        chains = problem.chains
+        if chains is not None and step and (chains.ends(i) if backward else chains.starts(i)):
+            sums, scale = _over_hypotheses(sums, scale, problem.hypotheses)
         if backward:
             weight, lo = weight[:, ::-1], total - lo - width
         if before is not None and lo != before:
@@ -378,7 +379,7 @@ def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bo
         before = lo
         leads = np.exp(np.clip(log_t * (step + np.maximum(lo + columns[:-1], 0)) - scale[:, None], -700.0, 700.0))
         found = weight * (leads + sums[:, :-1])
-        sums = s * sums
+        sums = problem.alone(i, grid.offset, grid.drift) * sums
         sums[:, 1:] += found @ decay
         after = log_t * (count - 1 - step + np.maximum(total - 1 - lo - columns[:-1], 0))
         top = after.max()
@@ -389,13 +390,20 @@ def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bo
         largest = np.maximum(sums.max(axis=1), leads[:, 0])
         sums /= largest[:, None]
         scale += np.log(largest)
+    evidence = np.logaddexp.reduce(evidence.reshape(-1, problem.hypotheses), axis=1) - np.log(problem.hypotheses)
     return _Forward(evidence, rows, scales)
 
 
-def _probabilities(
-    problem: _Problem, candidates: list[tuple[float, float]]
-) -> tuple[Indices, Array, float, float, float]:
-    """First event and probabilities of each photo's band; the most likely offset and drift, and their uncertainty."""
+def _over_hypotheses(sums: Array, scale: Array, count: int) -> tuple[Array, Array]:
+    """Sums and their scales where a chain of photos ends: the mean over its hypotheses stands for all of the next."""
+    top = scale.reshape(-1, count).max(axis=1, keepdims=True)
+    shares = np.exp(scale.reshape(-1, count) - top) / count
+    mean = np.einsum("hc,hcb->hb", shares, sums.reshape(len(top), count, -1))
+    return np.repeat(mean, count, axis=0), np.repeat(top.ravel(), count)
+
+
+def _probabilities(problem: _Problem, candidates: list[tuple[float, float]]) -> _Found:
+    """First event and probabilities of each photo's band; the most likely offset and drift, and their doubt."""
     scored = []
     for offset, drift in candidates:
         grid = _grid(problem, offset, drift, 2.0 * _FIRST_JITTER_S + 0.3 * _reach_s(problem), 0.16)
@@ -428,7 +436,7 @@ def _posterior(problem: _Problem, grid: _Grid, total: float) -> Array:
     """(N, B) probability of each photo and event, summed over the clocks of a grid."""
     first, width = grid.band(problem)
     result = np.zeros((len(problem.p), width))
-    most = max(1, 4_000_000 // max(1, len(problem.p) * width))
+    most = max(1, 4_000_000 // max(1, len(problem.p) * width * problem.hypotheses))
     for start in range(0, len(grid.offset), most):
         part = replace(grid, offset=grid.offset[start : start + most], drift=grid.drift[start : start + most])
         ahead, back = _forward(problem, part, keep=True), _forward(problem, part, backward=True, keep=True)
@@ -436,6 +444,6 @@ def _posterior(problem: _Problem, grid: _Grid, total: float) -> Array:
             weight = problem.weights(i, int(first[i]), width, part.offset, part.drift)
             with np.errstate(divide="ignore", invalid="ignore"):
                 both = np.log(ahead.rows[i]) + np.log(back.rows[i]) - np.log(weight)
-                both += (ahead.scales[i] + back.scales[i] - total)[:, None]
+                both += (ahead.scales[i] + back.scales[i] - total - np.log(problem.hypotheses))[:, None]
                 result[i] += np.where(weight > 0.0, np.exp(np.minimum(both, 0.0)), 0.0).sum(axis=0)
     return result

@@ -73,6 +73,7 @@ def _frame(
         fov_hint_rad=photo.fov_hint_rad,
         origin=origin,
         damaged=photo.damaged,
+        ambiguous=photo.ambiguous,
     )
 
 

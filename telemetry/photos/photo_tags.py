@@ -47,6 +47,7 @@ class PhotoTags:
         yaw_is_stated: True if the source defines its yaw as the picture's, so that there is no choice.
         origin: field -> its source.
         damaged: True for a picture of a video that lost parts.
+        ambiguous: True where it may belong to another camera event of a log.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class PhotoTags:
     yaw_is_stated: bool = False
     origin: dict[str, str] = field(default_factory=dict)
     damaged: bool = False
+    ambiguous: bool = False
 
 
 def read_photo(path: Path) -> PhotoTags | None:

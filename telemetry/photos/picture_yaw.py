@@ -7,22 +7,19 @@ belongs to the airframe instead of the camera.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.frame import Frame
-from orthoswarm.raster.picture_file import PictureError, read_gray
 from telemetry.photos.flight_checks import track_of
+from telemetry.photos.picture_motion import PictureFile, centre_shift, features
 from telemetry.samples.course import Straight, straight_legs
 from telemetry.samples.findings import Finding, plural
 
 Array = NDArray[np.float64]
 
-_WIDTH = 480
-_LEAST_INLIERS = 25
 _PAIRS_A_LEG = 3
 _LEAST_STEP_M = 1.0
 
@@ -64,23 +61,11 @@ def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
     """Yaw of the second picture in degrees and how many matches agree; None if the two cannot be matched."""
     if np.hypot(*moved) < _LEAST_STEP_M:
         return None
-    one, two = _features(a.path), _features(b.path)
-    if one is None or two is None:
+    one, two = (features(PictureFile(f.path, f.width, f.height)) for f in (a, b))
+    matched = centre_shift(one, two) if one is not None and two is not None else None
+    if matched is None:
         return None
-    import cv2
-
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one[1], two[1], k=2)
-    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
-    if len(good) < _LEAST_INLIERS:
-        return None
-    source = np.array([one[0][m.queryIdx] for m in good])
-    target = np.array([two[0][m.trainIdx] for m in good])
-    model, inliers = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=4.0)
-    count = 0 if inliers is None else int(inliers.sum())
-    if model is None or count < _LEAST_INLIERS:
-        return None
-    centre = np.array([0.5 * (a.width - 1), 0.5 * (a.height - 1)]) * one[2]
-    shift = model[:, :2] @ centre + model[:, 2] - centre
+    shift, count = matched.pixels, matched.inliers
     if np.hypot(*shift) < 4.0:
         return None
     # In the second picture the first one's centre lies in the direction the camera came from; up is opposite to the
@@ -88,22 +73,6 @@ def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
     to_the_right_of_up = np.degrees(np.arctan2(-shift[0], shift[1]))
     course = np.degrees(np.arctan2(moved[0], moved[1]))
     return wrap_deg(float(course - to_the_right_of_up)), count
-
-
-def _features(path: Path) -> tuple[Array, NDArray[np.float32], float] | None:
-    """Positions, descriptors and scale of a picture's features at reduced size."""
-    import cv2
-
-    try:
-        gray = read_gray(path)
-    except PictureError:
-        return None
-    scale = min(1.0, _WIDTH / gray.shape[1])
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else gray
-    points, descriptors = cv2.SIFT.create(nfeatures=800).detectAndCompute(small, None)
-    if descriptors is None or len(points) < _LEAST_INLIERS:
-        return None
-    return np.array([p.pt for p in points]), descriptors, scale
 
 
 def heading_findings(frames: Sequence[Frame], vehicle: str) -> list[Finding]:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from telemetry.formats.log.flight_logs import read_log
 from telemetry.ingest.event_pairing import by_time, pair
 from telemetry.ingest.ingest import load
-from tests.telemetry.ingest.exposure_grid import exposures, scored
+from telemetry.ingest.motion_chains import PictureMotion
+from tests.telemetry.ingest.exposure_grid import exposures, flown_over, ground_of, scored
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
@@ -149,3 +150,41 @@ def test_photos_with_their_own_fields_keep_them(real_data, tmp_path):
         assert frame.fix.lat_deg == pytest.approx(event.sample.lat_deg + 1e-5, abs=1e-8)
         assert frame.origin["position"] == "EXIF GPS"
         assert frame.fix.height_m == pytest.approx(60.0, abs=0.5)
+
+
+# Interval in seconds, share missing, least share of photos with an event that has to be placed without a doubt.
+BY_PICTURES = [(0.3, 0.0, 0.7), (0.7, 0.3, 0.6), (1.0, 0.1, 0.85)]
+
+
+@pytest.mark.parametrize(("interval", "missing", "least"), BY_PICTURES)
+def test_pictures_tell_where_whole_seconds_do_not(real_data, tmp_path, interval, missing, least):
+    ground = ground_of(real_data("autzen") / "autzen_ortho_0.3m_utm10.tif")
+    rng = np.random.default_rng(4)
+    flown = exposures(rng, interval, whole=True, missing=missing, count=60)
+    by_times = scored(flown)
+    by_pictures = scored(flown, flown_over(ground, flown, rng, interval, tmp_path))
+    assert by_pictures.wrong_unmarked == 0
+    assert by_pictures.decided > by_times.decided
+    assert by_pictures.decided >= least * by_pictures.both
+
+
+def test_pictures_are_read_only_where_times_do_not_decide():
+    flown = exposures(np.random.default_rng(2), 5.0, whole=True, missing=0.0)
+    asked = []
+
+    def shifts(some):
+        asked.extend(some)
+        return np.full(len(some) - 1, np.nan)
+
+    found = by_time(flown.photos, flown.events, PictureMotion(np.arange(float(len(flown.events))), shifts))
+    assert not found.doubtful
+    assert asked == []
+
+
+def test_a_log_that_contradicts_the_pictures_does_not_decide_anything():
+    rng = np.random.default_rng(5)
+    flown = exposures(rng, 0.7, whole=True, missing=0.3, count=40)
+    motion = PictureMotion(
+        np.cumsum(rng.uniform(0.0, 8.0, len(flown.events))), lambda some: rng.uniform(1.0, 20.0, len(some) - 1)
+    )
+    assert scored(flown, motion).wrong_unmarked == 0
