@@ -93,7 +93,7 @@ def _alignment(problem: "_Problem", candidates: list[tuple[float, float]], singl
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
     """(N,) whether a photo's event is certain, or that it has none."""
     likeliest = match.probability.max(axis=1, initial=0.0)
-    return (likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN)
+    return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
