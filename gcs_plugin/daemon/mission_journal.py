@@ -1,7 +1,7 @@
-"""What the journal keeps of the vehicles' missions: sorties, completions, and the state of the completion detectors.
+"""The vehicles' missions in the journal: sorties, completions, and the states of the completion detectors.
 
-A new sortie, a completion with the refinement that it asks for, and the detector's state are written in one
-transaction before anything is done about them, so that a restart goes on where the last daemon stopped.
+A new sortie, a completion with the refinement that it requests, and the detector's state are written in one
+transaction before they are acted on, so that a restart continues where the last daemon stopped.
 """
 
 import json
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class MissionJournal:
-    """Writes what happens to vehicles' missions.
+    """Records what happens to vehicles' missions.
 
     Args:
         journal: of the workspace.
@@ -31,7 +31,7 @@ class MissionJournal:
         self._journal = journal
 
     def found(self, vehicle: "Vehicle", name: str) -> None:
-        """Enter a vehicle that was heard; one that an earlier daemon followed is followed from where that stopped."""
+        """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
         from gcs_plugin.mission.completion import CompletionDetector
 
         row = self._journal.one("SELECT state FROM vehicles WHERE id = ?", (packed(name),))
@@ -48,7 +48,7 @@ class MissionJournal:
     def note(self, event: "FleetEvent", vehicle: "Vehicle", name: str, still_flying: Sequence[str]) -> None:
         """Write a mission's event (started, complete, aborted, suspended, resumed).
 
-        A start after a flight opens a sortie; a completion asks for the refinement of its sortie.
+        A start after a flight opens a sortie; a completion requests the refinement of its sortie.
 
         Args:
             event: of the fleet. vehicle: which it is about. name: its id. still_flying: ids of the others in the air.
@@ -75,7 +75,7 @@ class MissionJournal:
         self._journal.write(change)
 
     def give_up(self, name: str) -> bool:
-        """Ask for the refinement of a silent vehicle's sortie as far as it came; False if it sent no picture."""
+        """Request the refinement of a silent vehicle's incomplete sortie; False if it sent no picture."""
         key = packed(name)
 
         def change(db: sqlite3.Connection) -> bool:

@@ -16,7 +16,7 @@ _MOST_SIGHTINGS = 24
 def places_of(
     workspace: str, finds: Iterable[Mapping[str, Any]], vehicles: Iterable[Mapping[str, Any]], now_s: float
 ) -> list[Place]:
-    """The workspace's finds, and the vehicles that said where they are.
+    """The workspace's finds, and the vehicles with a known position.
 
     Args:
         workspace: its name, which makes ids unique. finds: as ConsoleState gives them. vehicles: rows of
@@ -52,7 +52,7 @@ def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[dict[s
     """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`.
 
     Args:
-        task: what the workspace holds. lat_deg, lon_deg: WGS 84.
+        task: the workspace's export task. lat_deg, lon_deg: WGS 84.
     """
     solutions = [read_solution(path).solution for path in (*task.coarse, *task.solutions)]
     placed, level = placements(task, solutions)

@@ -1,4 +1,4 @@
-"""What the daemon is told: by flags, and by `orthoswarm.toml` in its workspace for what stays the same."""
+"""The daemon's settings: from flags, and from `orthoswarm.toml` in its workspace."""
 
 import re
 import tomllib
@@ -41,7 +41,7 @@ TEMPLATE: Final = """\
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """One vehicle that was named.
+    """One configured vehicle.
 
     Attributes:
         id: in files and on the map. system: MAVLink system id, None without a link.
@@ -58,17 +58,17 @@ class VehicleSettings:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Everything the daemon is told.
+    """The daemon's settings.
 
     Attributes:
         workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
         links: MAVLink links. basemap: the map before the disaster, or None. dem: height model of the ground, or None.
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
-        workers: processes that refine. coarse: whether legs are placed in flight.
-        lost_after_s: when a silent vehicle's sortie counts as over.
+        workers: processes that refine. coarse: True to place legs in flight.
+        lost_after_s: silence after which a vehicle's sortie counts as finished.
         silent_s: a vehicle without a new picture for so long is silent; then its legs and late pictures are placed.
         redraw_px: a joint refinement that moves pictures by less, in pixels of the layer, is not drawn.
-        vehicles: those that were named. token_file: path of the token.
+        vehicles: the configured ones. token_file: path of the token.
         tak: receivers of Cursor-on-Target events, see `tak_address`. tak_certificate: PEM file with this station's
             certificate and key for TLS. tak_authority: PEM file of the server's certificate authority.
     """
@@ -101,10 +101,10 @@ class Settings:
         return TakAddress.parse(text, self.tak_certificate, self.tak_authority)
 
     def check(self) -> "Settings":
-        """Itself.
+        """Check the values; returns itself.
 
         Raises:
-            InputError: a value that makes no sense.
+            InputError: a value is invalid.
         """
         if not 0 <= self.port <= 65535:
             raise InputError(f"port {self.port} is not a port; give 1 to 65535, or 0 for any free one")

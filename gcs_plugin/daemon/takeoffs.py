@@ -1,8 +1,8 @@
-"""The takeoffs of a plan: one command starts all its vehicles, each at the plan's time, which keeps them apart.
+"""The takeoffs of a plan: one command starts all its vehicles, each at its planned time, which separates them.
 
-A plan's vehicles share airspace: they stay apart by heights and by the times of their takeoffs (`start_s`). Nobody is
-started unless all have passed their preflight check; one that then refuses holds those that still wait on the ground.
-What waits is forgotten when the daemon ends: a start is a command, and is not repeated by itself.
+A plan's vehicles share airspace: they are separated by heights and takeoff times (`start_s`). No vehicle is
+started unless all have passed their preflight check; if one then refuses, the waiting ones stay on the ground.
+Waiting takeoffs are dropped when the daemon ends: a start is a command and is never repeated automatically.
 """
 
 import logging
@@ -27,7 +27,7 @@ class Takeoffs:
     """Starts the vehicles of one plan at a time.
 
     Args:
-        links: the vehicles. plans: of the workspace. say: told what went wrong. clock: monotonic seconds.
+        links: the vehicles. plans: of the workspace. say: called with problems. clock: monotonic seconds.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Takeoffs:
             limits: `endurance_s`, `legal_height_m`, as for `VehicleLinks.preflight`.
 
         Returns:
-            A row a vehicle, as `VehicleLinks.preflight` gives them.
+            A row per vehicle, as from `VehicleLinks.preflight`.
 
         Raises:
             InputError: there is no such plan or flight.
@@ -74,10 +74,10 @@ class Takeoffs:
         names: Mapping[str, str] | None = None,
         override: Mapping[str, Collection[str]] | None = None,
     ) -> dict[str, float]:
-        """Start a plan's vehicles; gives vehicle -> seconds from now.
+        """Start a plan's vehicles; returns vehicle -> seconds from now.
 
-        All are checked before the first takes off. One that cannot start at its time holds those that still wait on
-        the ground, and that is said.
+        All are checked before the first takes off. If one cannot start at its time, the waiting ones stay on
+        the ground, and this is reported.
 
         Args:
             plan: its id. sortie: which flight of each vehicle, from 1.
@@ -86,7 +86,7 @@ class Takeoffs:
 
         Raises:
             InputError: there is no such plan or flight.
-            OrthoSwarmError: vehicles are not heard, a preflight item is red, or takeoffs are under way; nobody was
+            OrthoSwarmError: vehicles are not heard, a preflight item is red, or takeoffs are under way; none was
                 started.
         """
         starts = self._plans.starts(plan, sortie)
@@ -111,7 +111,7 @@ class Takeoffs:
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
 
     def cancel(self, vehicle: str) -> float | None:
-        """Forget a takeoff that waits; gives in how many seconds it would have been, None if there was none."""
+        """Cancel a waiting takeoff; returns the seconds until it, None if there was none."""
         with self._condition:
             system = next((s for s, name in self._names.items() if name == vehicle), None)
             due = None if system is None else self._schedule.waiting.pop(system, None)
@@ -119,7 +119,7 @@ class Takeoffs:
         return None if due is None else max(0.0, due - self._clock())
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """Vehicle -> `in_s` of a takeoff that waits, or `failed` with the reason."""
+        """Vehicle -> `in_s` of a waiting takeoff, or `failed` with the reason."""
         now = self._clock()
         with self._condition:
             times = self._schedule.waiting.items()
@@ -127,7 +127,7 @@ class Takeoffs:
             return {v: {"failed": text} for v, text in self._failed.items()} | waiting
 
     def close(self) -> None:
-        """Forget all that wait."""
+        """Cancel all waiting takeoffs."""
         with self._condition:
             self._closed = True
             self._schedule.waiting.clear()
@@ -174,7 +174,7 @@ class Takeoffs:
                 threading.Thread(target=self._start, args=(self._names[system], system), daemon=True).start()
 
     def _start(self, vehicle: str, system: int) -> None:
-        """Start one; where that fails, those that still wait stay on the ground."""
+        """Start one vehicle; if that fails, the waiting ones stay on the ground."""
         order = Order("start", system, self._clock())
         try:
             self._links.fleet.call(lambda: self._links.fleet.order(order))
@@ -188,7 +188,7 @@ class Takeoffs:
             self._note(vehicle, system, order.outcome)
 
     def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:
-        """What the outcome of one start means for those that still wait."""
+        """Apply the outcome of one start to the waiting ones."""
         with self._condition:
             if outcome.ok:
                 said = self._schedule.started(system, self._clock())
@@ -208,7 +208,7 @@ def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:
     """The flight's number and the vehicles' names in a request.
 
     Raises:
-        InputError: they are not what they should be.
+        InputError: they are invalid.
     """
     sortie, names = body.get("sortie", 1), body.get("vehicles", {})
     if isinstance(sortie, bool) or not isinstance(sortie, int) or sortie < 1:

@@ -1,6 +1,6 @@
-"""Terrain data for vehicles that follow the ground by themselves, from the station's height model.
+"""Terrain data for vehicles that follow terrain themselves, from the station's height model.
 
-ArduPilot asks with TERRAIN_REQUEST for what it lacks around its position and its mission, and keeps it on its card:
+ArduPilot requests missing data around its position and mission by TERRAIN_REQUEST, and stores it on its card:
 blocks of 7 x 8 tiles (north, east) of 4 x 4 heights, a bit of the mask each. TERRAIN_DATA answers with a tile.
 """
 
@@ -57,7 +57,7 @@ class TerrainData:
             self._thread.join()
 
     def _requested(self, vehicle: "Vehicle", message: Any, _: float) -> None:
-        if not self._wanted.full():  # the vehicle asks again
+        if not self._wanted.full():  # the vehicle repeats its request
             self._wanted.put((vehicle.system, message.lat, message.lon, message.grid_spacing, message.mask))
 
     def _run(self) -> None:
@@ -71,7 +71,7 @@ class TerrainData:
 
 
 def terrain_answers(dem: Path, lat_e7: int, lon_e7: int, spacing_m: int, mask: int) -> list[Message]:
-    """The TERRAIN_DATA messages that answer a TERRAIN_REQUEST, without tiles of which the model has no heights.
+    """The TERRAIN_DATA messages for a TERRAIN_REQUEST, without tiles for which the model has no heights.
 
     Args:
         dem: the height model. lat_e7, lon_e7: south-west corner of the block, 1e-7 degrees.

@@ -1,4 +1,4 @@
-"""Other aircraft: what the vehicles' ADS-B receivers hear (MAVLink's ADSB_VEHICLE)."""
+"""Other aircraft, as received by the vehicles' ADS-B receivers (MAVLink's ADSB_VEHICLE)."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ _DEGE7: Final = 1e-7
 
 
 class Traffic:
-    """The aircraft that were heard lately, each once, whoever heard it; any thread.
+    """The recently received aircraft, each once, from any vehicle; any thread.
 
     Args:
         clock: monotonic seconds.
@@ -30,7 +30,7 @@ class Traffic:
         self._told: list[dict[str, Any]] = []
 
     def heard(self, _vehicle: Any, message: Any, _utc: float) -> None:
-        """Take an ADSB_VEHICLE; one without a position that can be is ignored."""
+        """Process an ADSB_VEHICLE; one without a valid position is ignored."""
         lat, lon = message.lat * _DEGE7, message.lon * _DEGE7
         if not message.flags & _COORDINATES or abs(lat) > 90.0 or abs(lon) > 180.0:
             return
@@ -49,7 +49,7 @@ class Traffic:
             self._heard[number] = self._clock() - float(message.tslc), row
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row an aircraft; what it does not say is None.
+        """A row per aircraft; unknown values are None.
 
         Keys: `id` (ICAO address), `name` (callsign), `lat_deg`, `lon_deg`, `alt_m` (above sea level or standard
         pressure, as it sends), `heading_deg`, `speed_m_s`.

@@ -1,8 +1,9 @@
-"""The vehicles on the daemon's links: their state and poses, their sorties, and what follows when one completes.
+"""The vehicles on the daemon's links: their state and poses, their sorties, and the jobs after a completion.
 
-A fleet is polled by one thread. What must survive a restart goes to the journal first, see `daemon.mission_journal`.
+A fleet is polled by one thread. State that must survive a restart is written to the journal first, see
+`mission_journal`.
 
-What the HTTP API and the page build on, all in JSON values:
+For the HTTP API and the page, all in JSON values:
 
 - `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
   `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
@@ -14,8 +15,8 @@ What the HTTP API and the page build on, all in JSON values:
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
 - `alarm` in each row of `rows()`: what is wrong with where it flies, and what to do; empty if nothing is.
-- `clock()` is the monotonic clock by which commands expire: a page that learns it from the event stream can say when
-  its command was given, so that one that was held up on the way is not executed late.
+- `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
+  its command was given, so that a delayed one is not executed late.
 """
 
 import contextlib
@@ -61,7 +62,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class _Kept:
-    """What the daemon keeps about a vehicle besides what the fleet knows."""
+    """The daemon's own data about a vehicle, besides the fleet's."""
 
     id: str
     poses: "LivePoses"
@@ -77,15 +78,15 @@ class VehicleLinks:
     Attributes:
         fleet: its vehicles and links.
         traffic: other aircraft that vehicles have heard of.
-        latest: the rows of `rows` when they were last watched, at most half a second ago.
-        cancel_takeoff: forgets a takeoff that waits; gives in how many seconds it would have been, or None.
+        latest: the rows of `rows`, at most half a second old.
+        cancel_takeoff: cancels a waiting takeoff; returns the seconds until it, or None.
         takeoffs: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
     """
 
     def __init__(
         self, settings: Settings, journal: Journal, events: Events, jobs: Jobs, poses: "Poses | None" = None
     ) -> None:
-        """Open the links; what vehicles say about where they are goes into `poses`, by their ids.
+        """Open the links; the vehicles' poses are stored in `poses`, by their ids.
 
         Raises:
             InputError: a link cannot be opened.
@@ -186,12 +187,12 @@ class VehicleLinks:
         Args:
             verb: `start`, `pause`, `resume`, `rtl` or `land`.
             vehicles: their ids; None for all on the links.
-            given_s: when it was given (`clock`); now unless said. It is not sent later than 5 s after that.
-            command_id: id of the command; a new one unless said.
+            given_s: when it was given (`clock`); default now. It is not sent later than 5 s after that.
+            command_id: id of the command; a new one by default.
             override: names of red preflight items that do not stop a start, by vehicle.
 
         Returns:
-            A row a vehicle, see the top of this module.
+            A row per vehicle, see the top of this module.
 
         Raises:
             InputError: there is no such command.
@@ -222,7 +223,7 @@ class VehicleLinks:
     def _without_command(
         self, verb: str, names: Collection[str], number: str, override: Mapping[str, Collection[str]]
     ) -> tuple[dict[str, dict[str, Any]], dict[str, int]]:
-        """The rows of vehicles to which nothing needs to be sent, and the system ids of the others."""
+        """The rows of vehicles that need no command, and the system ids of the others."""
         from gcs_plugin.fleet.commands import URGENT
 
         rows: dict[str, dict[str, Any]] = {}
@@ -265,12 +266,12 @@ class VehicleLinks:
 
         Args:
             vehicles: their ids; None for all on the links.
-            missions: the plan's mission of each, by vehicle; without it whatever a vehicle holds is flown.
-            starts: takeoff of each in seconds after the first; all at once unless said.
+            missions: the plan's mission of each, by vehicle; without it the vehicle's stored mission is flown.
+            starts: takeoff of each in seconds after the first; default all at once.
             endurance_s: flight time of a full battery. legal_height_m: height that may be flown without asking.
 
         Returns:
-            A row a vehicle, see the top of this module.
+            A row per vehicle, see the top of this module.
 
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
@@ -297,13 +298,13 @@ class VehicleLinks:
         return [check.document(systems[check.system]) for check in checks]
 
     def _read_missions(self, systems: Collection[int]) -> "dict[int, Mission]":
-        """What vehicles hold now, of those that hand it out in time."""
+        """The missions stored in vehicles, of those that answer in time."""
         from gcs_plugin.mission.items import Mission
 
         reads: dict[int, MissionDownload] = {}
 
         def begin(system: int) -> None:
-            with contextlib.suppress(OrthoSwarmError):  # lost, or busy: the check says so
+            with contextlib.suppress(OrthoSwarmError):  # lost or busy: reported by the check
                 reads[system] = self.fleet.download(system)
 
         for begun in [self.fleet.call(lambda s=system: begin(s)) for system in systems]:  # type: ignore[misc]
@@ -315,7 +316,7 @@ class VehicleLinks:
         return {s: Mission(kinds[s], tuple(read.items)) for s, read in reads.items() if read.items is not None}
 
     def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
-        """Have a dialogue with a vehicle, to its end; gives what was said at the end.
+        """Run a dialogue with a vehicle to its end; returns the final text.
 
         Raises:
             OrthoSwarmError: the vehicle refused, or did not answer.
@@ -331,10 +332,10 @@ class VehicleLinks:
         return dialogue.outcome.text
 
     def unlike(self, system: int, mission: "Mission") -> str | None:
-        """In what the mission that a vehicle holds differs from one, None if it does not.
+        """How a vehicle's stored mission differs from the given one, None if it does not.
 
         Raises:
-            OrthoSwarmError: the vehicle does not hand it out.
+            OrthoSwarmError: the vehicle does not send it.
         """
         from gcs_plugin.mission.comparison import difference
 
@@ -410,13 +411,13 @@ class VehicleLinks:
                 if self.traffic.changed():
                     self._events.publish("traffic", rows=self.traffic.rows())
                 self._give_up_silent()
-            except Exception as error:  # a vehicle's odd state must not end the watch
+            except Exception as error:  # an unexpected state of one vehicle must not end the watch
                 _log.warning("watching vehicles: %s", error)
 
     def _publish_rows(self, *, complete: bool) -> None:
-        """Publish what differs in each vehicle's row from what was published last, or all of it.
+        """Publish the differences of each vehicle's row since the last time, or complete rows.
 
-        At 96 vehicles complete rows would be most of what the stations' links carry.
+        With 96 vehicles complete rows would be most of the traffic to the pages.
         """
         self.latest = self.rows()
         for row in self.latest:
@@ -428,7 +429,7 @@ class VehicleLinks:
             self._events.publish("vehicle", **fresh | always)
 
     def _give_up_silent(self) -> None:
-        """A vehicle that has been silent for long in the middle of its mission is refined as far as it came."""
+        """Refine the incomplete sortie of a vehicle that has been silent for long during its mission."""
         for system, kept in list(self._kept.items()):
             vehicle = self.fleet.vehicles[system]
             since = kept.lost_since

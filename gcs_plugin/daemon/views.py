@@ -1,4 +1,4 @@
-"""What the daemon tells about itself: frames, vehicles, legs and layers as JSON values."""
+"""The daemon's state for the API: frames, vehicles, legs and layers as JSON values."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from orthoswarm.raster.basemap import Basemap
 def frame_rows(
     journal: Journal, vehicle: str | None = None, since: float | None = None, limit: int | None = None
 ) -> list[dict[str, Any]]:
-    """Frames in the order in which they came."""
+    """Frames in the order of arrival."""
     where, values = ["1"], list[Any]()
     if vehicle is not None:
         where.append("vehicle = ?")
@@ -51,15 +51,15 @@ def vehicle_rows(
     buses: Iterable[CanReader] = (),
     origins: Mapping[str, Mapping[str, str]] | None = None,
 ) -> list[dict[str, Any]]:
-    """All vehicles that were heard, that sent pictures, or that should.
+    """All vehicles that were heard, that sent pictures, or that are configured.
 
     Args:
         journal: of the workspace. named: with names given by the operator. sources: of pictures.
-        linked: id -> what the vehicle's link says. buses: CAN buses of vehicles.
-        origins: id -> where the vehicle's newest pose comes from.
+        linked: id -> the vehicle's state on its link. buses: CAN buses of vehicles.
+        origins: id -> sources of the vehicle's newest pose.
 
     Returns:
-        A row a vehicle; each has its `id`, and its `name` (empty if it was given none).
+        A row per vehicle, each with `id` and `name` (empty if none was given).
     """
     documents = {row["id"]: row for row in _senders(journal)}
     for name, heard in linked.items():

@@ -1,4 +1,4 @@
-"""Plans made over HTTP: a folder each in the workspace, with the same files as `orthoswarm plan` writes."""
+"""Plans made over HTTP: one folder each in the workspace, with the files of `orthoswarm plan`."""
 
 import contextlib
 import json
@@ -34,7 +34,7 @@ class Plans:
     """The plans of a workspace.
 
     Args:
-        folder: where they are. dem: height model that they follow, None for level ground.
+        folder: of all plans. dem: height model that they follow, None for level ground.
     """
 
     def __init__(self, folder: Path, dem: Path | None = None) -> None:
@@ -42,12 +42,12 @@ class Plans:
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Plan; gives the figures of `orthoswarm plan --json` with the plan's `id`.
+        """Make a plan; returns the figures of `orthoswarm plan --json` with the plan's `id`.
 
-        The work runs in a process of its own, so that neither a refinement nor a plan waits for the other.
+        The work runs in its own process, so that refinements and plans do not wait for each other.
 
         Raises:
-            InputError: the area or a value is of no use.
+            InputError: the area or a value is invalid.
         """
         values = _values(body)
         area = body.get("area")
@@ -62,14 +62,14 @@ class Plans:
     def make_gaps(
         self, gaps: Mapping[str, Any], no_fly: Mapping[str, Any] | None, values: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Plan a flight over gaps; gives its figures with the plan's `id`.
+        """Plan a flight over gaps; returns its figures with the plan's `id`.
 
         Args:
             gaps: GeoJSON as `orthoswarm coverage` writes it. no_fly: GeoJSON of zones, None if there are none.
             values: further fields of the PlanRequest.
 
         Raises:
-            InputError: there is nothing to fly, or a value is of no use.
+            InputError: there is nothing to fly, or a value is invalid.
         """
         return self._make("gaps.geojson", gaps, no_fly, values)
 
@@ -99,7 +99,7 @@ class Plans:
         """The figures of all plans, oldest first."""
         found = []
         for path in sorted(self.folder.glob("plan-*/plan.json")):
-            with contextlib.suppress(ValueError):  # not written to its end: nobody was told of it
+            with contextlib.suppress(ValueError):  # incomplete, so it was never reported
                 found.append(json.loads(path.read_text(encoding="utf-8")) | {"id": path.parent.name})
         return found
 
@@ -112,7 +112,7 @@ class Plans:
         return (self._path(name) / "all.geojson").read_bytes()
 
     def mission(self, body: Mapping[str, Any], vehicle: str, autopilot: Autopilot) -> Mission:
-        """The mission that an upload asks for: `plan` with `mission` (the vehicle's own if not said), or `text`.
+        """The mission of an upload request: `plan` with `mission` (default: the vehicle's own), or `text`.
 
         Raises:
             InputError: there is none, or the text is not a mission file.
@@ -180,7 +180,7 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
     """The request's values as fields of a PlanRequest.
 
     Raises:
-        InputError: one is missing or of no use.
+        InputError: one is missing or invalid.
     """
     count = body.get("vehicles")
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 250:
@@ -229,7 +229,7 @@ def _positions(document: Any) -> Iterator[tuple[float, float]]:
 
 
 def plan_into(request: PlanRequest) -> dict[str, Any]:
-    """Plan in a worker and write the folder of the request's area; gives the figures."""
+    """Plan in a worker and write the plan's folder; returns the figures."""
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
     plan, area = make_plan(request)

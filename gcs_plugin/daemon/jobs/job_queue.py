@@ -194,7 +194,7 @@ class Jobs:
         return None if row is None else Job.of(row)
 
     def open(self, *kinds: str) -> int:
-        """How many jobs of these kinds (any, if none is named) wait or run; coarse maps in flight do not count."""
+        """Number of waiting and running jobs of these kinds (all, if none is given), without coarse maps in flight."""
         query = f"SELECT kind FROM jobs WHERE state IN ('queued', 'running') AND NOT {_IN_FLIGHT}"
         return sum(not kinds or row["kind"] in kinds for row in self._journal.rows(query))
 
@@ -213,14 +213,14 @@ class Jobs:
                     return
             try:
                 self._do(job)
-            except Exception as error:  # its beginning cannot be written: it is still queued in the journal
+            except Exception as error:  # its start cannot be written: it is still queued in the journal
                 _log.error("job %d (%s) waits: %s", job.id, job.kind, error)
                 with self._condition:
                     self._running.pop(job.id, None)
                     self._condition.wait(_JOURNAL_AGAIN_S)
 
     def _next(self, background: bool) -> Job | None:
-        """Take the next job of the background, or the next refinement; a vehicle's jobs run one after the other."""
+        """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
         rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_IN_FLIGHT}, id")
         busy = {_lane(job) for job in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(row["kind"] == "refine" for row in rows)
@@ -251,7 +251,7 @@ class Jobs:
         try:
             outcome = self._outcome(job, progress)
             if outcome is None or not self._write_end(*outcome):
-                return  # the daemon ends; the job is queued again at the next start
+                return  # the daemon stops; the job is queued again at the next start
             ended = outcome[0]
         finally:
             with self._condition:
@@ -266,7 +266,7 @@ class Jobs:
                 _log.error("after job %d: %s", job.id, error)
 
     def _outcome(self, job: Job, progress: ReportProgress) -> tuple[Job, Change] | None:
-        """Do a job; gives the job as it ended and the change that makes it so, None if the daemon ends."""
+        """Do a job; returns the ended job and the journal change that records it, None if the daemon stops."""
         try:
             change = self._handlers[job.kind](job, progress)
             if self._stop:
@@ -274,7 +274,7 @@ class Jobs:
             ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
             return ended, _both(change, _ended(ended))
         except Exception as error:
-            if self._stop:  # its worker was taken away
+            if self._stop:  # its worker was stopped
                 return None
             if job.id in self._unwanted:
                 ended = replace(job, state="done", progress=1.0, message=self._unwanted[job.id], ended=time.time())
@@ -285,7 +285,7 @@ class Jobs:
             return ended, _ended(ended)
 
     def _write_end(self, job: Job, change: Change) -> bool:
-        """Write how a job ended, again and again while the disk is full; False if the daemon ends before that."""
+        """Write a job's end, retrying while the disk is full; False if the daemon stops before that."""
         while True:
             try:
                 self._journal.write(change)
@@ -307,7 +307,7 @@ class Jobs:
 
 
 def _failed(job: Job, error: Exception) -> Job:
-    """A job that has failed; queued again where only its worker process was lost."""
+    """A failed job; queued again if only its worker process was lost."""
     known = isinstance(error, OrthoSwarmError)
     if not known:
         _log.error("job %d (%s) failed", job.id, job.kind, exc_info=error)
@@ -320,7 +320,7 @@ def _failed(job: Job, error: Exception) -> Job:
 def new_job(kind: str, vehicle: str | None, sortie: int | None, detail: dict[str, Any]) -> Callable[
     [sqlite3.Connection], Job
 ]:  # fmt: skip
-    """The change that queues a job, unless an equal one waits already; gives the job."""
+    """The change that queues a job unless an equal one waits already; its result is the job."""
     name, text, created = (None if vehicle is None else packed(vehicle)), json.dumps(detail), time.time()
 
     def change(db: sqlite3.Connection) -> Job:
@@ -355,12 +355,12 @@ def drop_change(kind: str, vehicle: str, why: str) -> Change:
 
 
 def _lane(job: Job) -> tuple[str, str | None]:
-    """Of jobs in one lane one runs at a time."""
+    """The lane of a job: of jobs in one lane only one runs at a time."""
     return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
 
 
 def _requeue(db: sqlite3.Connection) -> None:
-    """What was under way when the daemon ended is done again, but not for ever if it is what ended the daemon."""
+    """Queue interrupted jobs again, but only a few times, in case the job itself ended the daemon."""
     db.execute(
         "UPDATE jobs SET state = 'failed', message = 'the daemon ended each time that this was tried', ended = ?"
         " WHERE state = 'running' AND attempts >= ?",

@@ -26,7 +26,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 
 
 def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable[[Any], Job]]:
-    """The changes that queue what has to be solved again once a job's sortie was refined: its neighbours, then it."""
+    """The changes that queue joint refinements after a sortie was refined: of its neighbours, then of itself."""
     others = others_near(journal, job, box, 0.0)
     own = [(str(job.vehicle), job.sortie)] if others else []
     again = [*((unpacked(row["vehicle"]), int(row["sortie"])) for row in others), *own]
@@ -38,7 +38,7 @@ class JointRefinement:
     """Does the jobs `together`.
 
     Attributes:
-        journal, publisher: what there is. workers: where the work runs; it is this one's alone while a job runs.
+        journal, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
         basemap: the map. on_published: called with layer and job when pixels have changed.
         least_px: pictures that move less, in pixels of the layer, are not drawn again.
     """
@@ -71,13 +71,13 @@ class JointRefinement:
         return lambda db: None
 
     def give_up(self) -> None:
-        """Stop what is under way; it is done later."""
+        """Stop the running job; it is done later."""
         if self._working:
             self._aside = True
             self.workers.abandon()
 
     def _solve(self, job: Job, tell: ReportProgress, target: Path) -> bool:
-        """Solve and publish; False if everything stays as it is."""
+        """Solve and publish; False if nothing changes."""
         row = solution_row(self.journal, job)
         if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
             return _note(job, "it was not refined on the map")

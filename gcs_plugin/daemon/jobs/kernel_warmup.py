@@ -1,4 +1,4 @@
-"""A tiny refinement of made-up pictures, so that a worker has its compiled kernels loaded before they matter.
+"""A tiny refinement of synthetic pictures, which loads a worker's compiled kernels before they are needed.
 
 Loading them takes some seconds in a fresh process, as long as refining a hundred pictures.
 """
@@ -29,7 +29,7 @@ _LENS: Final = Lens(240, 180, focal_px(float(np.radians(70.0)), 240))
 
 
 def refine_something() -> None:
-    """Refine and draw a vehicle beside another of the same path, over a made-up map; the result is thrown away."""
+    """Refine and draw a vehicle next to another one on the same path, over a synthetic map; the result is discarded."""
     ground = made_up_ground()
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(OrthoSwarmError):
         place = Path(folder)
@@ -49,7 +49,7 @@ def refine_something() -> None:
 
 
 def made_up_ground() -> NDArray[np.float32]:
-    """Colours of a ground with detail of all sizes, float32 (metres down, metres right, 3)."""
+    """Colours of synthetic ground with detail at all scales, float32 (metres south, metres east, 3)."""
     import cv2
 
     rng = np.random.default_rng(7)
@@ -74,7 +74,7 @@ def write_map(ground: NDArray[np.float32], path: Path) -> None:
 
 
 def made_up_flight(ground: NDArray[np.float32], folder: Path, vehicle: str) -> list[Frame]:
-    """Two legs of 14 pictures, there and back, photographed into a folder."""
+    """Two opposite legs of 14 pictures each, rendered into a folder."""
     grid = LocalGrid(_EPSG)
     frames = []
     for number in range(28):

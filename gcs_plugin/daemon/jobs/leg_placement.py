@@ -1,8 +1,8 @@
 """The coarse layer: legs are placed and drawn as they finish, in flight, at the lowest priority.
 
-A job takes all legs of the vehicle that are over by then, so jobs that come faster than they can be done melt into
-one. What it makes is thrown away without regret: the work stops at once when the vehicle completes (its refinement
-takes its place) or when a refinement needs the layer.
+A job places all finished legs of the vehicle, so jobs that arrive faster than they can be done are merged into
+one. Its result is temporary: the work stops at once when the vehicle completes (its refinement
+replaces it) or when a refinement needs the layer.
 """
 
 import json
@@ -42,7 +42,7 @@ class LegPlacement:
     """Does the jobs `coarse`.
 
     Attributes:
-        journal, store, publisher: what there is. workers: where the work runs; it is this one's alone while a job runs.
+        journal, store, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
     """
 
@@ -68,7 +68,7 @@ class LegPlacement:
                 raise Preempted from None
             if isinstance(error, WorkerStoppedError | StorageError):
                 raise
-            job.detail["note"] = str(error)  # the map in flight stays as it is; the refinement will see
+            job.detail["note"] = str(error)  # the map in flight stays as it is until the refinement
             return lambda db: None
         finally:
             self._working = None
@@ -76,7 +76,7 @@ class LegPlacement:
         return change
 
     def give_up(self, vehicle: str | None, layer: str | None = None) -> None:
-        """Stop what is under way for a vehicle (None: any), or what holds a layer."""
+        """Stop a vehicle's running job (None: any), or the one that uses a layer."""
         if self._working is None or (vehicle is not None and vehicle != self._working):
             return
         if layer is None or layer in self.publisher.drawing:
@@ -116,14 +116,14 @@ class LegPlacement:
         return self._publish(job, tell, target, solved, [*legs, *solved.legs])
 
     def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
-        """Kept sorties nearby, whose exposure is drawn already."""
+        """Drawn sorties nearby, whose exposure is fixed."""
         box = near(frames, self.publisher.area().epsg)
         mine = (packed(str(job.vehicle)), job.sortie)
         shown = self.publisher.shown("coarse").items()
         return [path for key, (path, bounds) in shown if key != mine and bounds.gap_m(box) < _REACH_M]
 
     def _is_refined(self, job: Job) -> bool:
-        """Whether a refinement has taken, or is about to take, the place of what would be made."""
+        """Whether a refinement has replaced, or is about to replace, the result."""
         key = (packed(str(job.vehicle)), job.sortie)
         for query in (
             "SELECT 1 FROM completions WHERE vehicle = ? AND sortie = ?",
@@ -138,7 +138,7 @@ class LegPlacement:
     # -- after a refinement ---------------------------------------------------------------------------------------
 
     def _after(self, job: Job, tell: ReportProgress, target: Path) -> Change:
-        """The whole sortie on the coarse layer, by what its refinement began from."""
+        """Place the complete sortie on the coarse layer, from the start values of its refinement."""
         row = self.journal.one(
             "SELECT path, detail FROM solutions WHERE vehicle = ? AND sortie = ?",
             (packed(str(job.vehicle)), job.sortie),
@@ -201,7 +201,7 @@ class LegPlacement:
 
 
 def newest_legs(frames: list[Frame], epsg: int, *, over: bool = False) -> tuple[list[Frame], int]:
-    """The pictures of the newest legs that are over, MOST at most, turns between them included; and how many legs.
+    """The pictures of the newest finished legs, at most MOST, including the turns between them; and the number of legs.
 
     Args:
         frames: of a sortie so far, in order of time. epsg: the area's grid. over: no more pictures are expected.

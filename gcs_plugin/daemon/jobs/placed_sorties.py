@@ -1,4 +1,4 @@
-"""Sorties that were placed, as the journal holds them: their frames, what is kept of them, and who lies beside whom."""
+"""Placed sorties in the journal: their frames, their solutions, and their neighbours."""
 
 import json
 import sqlite3
@@ -21,7 +21,7 @@ from orthoswarm.model.frame import Frame
 def sortie_frames(
     journal: Journal, store: PictureStore, vehicle: str, sortie: int | None
 ) -> tuple[list[Frame], dict[str, Bytes]]:
-    """A sortie's frames in order of time that were not rejected, and image -> thumbnail of those that were drawn.
+    """A sortie's frames in order of time, without rejected ones, and image -> thumbnail of the drawn ones.
 
     Raises:
         OrthoSwarmError: there are none.
@@ -39,7 +39,7 @@ def sortie_frames(
 
 
 def detail_of(solved: SortieResult, legs: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """What the journal keeps of a placed sortie, as JSON values."""
+    """The journal's details of a placed sortie, as JSON values."""
     return {
         "bounds": solved.bounds,
         "legs": [leg | {key: finite(leg[key]) for key in ("confidence", "sigma_m")} for leg in legs],
@@ -49,14 +49,14 @@ def detail_of(solved: SortieResult, legs: Iterable[dict[str, Any]]) -> dict[str,
 
 
 def solution_row(journal: Journal, job: Job) -> Any:
-    """What is kept of a job's sortie since it was refined, None if it was not."""
+    """The solution's row of a job's sortie, None if it was not refined."""
     return journal.one(
         "SELECT * FROM solutions WHERE vehicle = ? AND sortie = ?", (packed(str(job.vehicle)), job.sortie)
     )
 
 
 def others_near(journal: Journal, job: Job, box: BoundingBox, reach_m: float) -> list[Any]:
-    """Rows of the refined sorties, but a job's own, whose ground comes nearer to a box than this."""
+    """Rows of the refined sorties (except the job's own) whose ground is within a distance of a box."""
     mine = (packed(str(job.vehicle)), job.sortie)
     return [
         row
@@ -69,11 +69,11 @@ def others_near(journal: Journal, job: Job, box: BoundingBox, reach_m: float) ->
 def refined_change(
     job: Job, solved: SortieResult, rejected: dict[str, str], name: str, detail: dict[str, Any]
 ) -> Change:
-    """The change by which a refinement stands: its frames' stages, what is kept, and that its job is done.
+    """The change that records a refinement: the stages of its frames, its solution, and its job as done.
 
     Args:
-        job: whose vehicle and sortie it is. solved: with stages and sigmas of what is new.
-        rejected: image -> why it could not be drawn. name: of the solution file. detail: what stands beside it.
+        job: whose vehicle and sortie it is. solved: with stages and sigmas of the new frames.
+        rejected: image -> why it could not be drawn. name: of the solution file. detail: stored with it.
     """
     vehicle = packed(str(job.vehicle))
     dropped = {**solved.dropped, **rejected}
@@ -92,7 +92,7 @@ def refined_change(
         db.execute(
             "INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", (vehicle, job.sortie, name, json.dumps(detail))
         )
-        # The job's result stands with this, so that it is not done again if the daemon ends right now.
+        # The job's result is recorded in the same change, so that it is not repeated if the daemon ends now.
         db.execute("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", (time.time(), job.id))
 
     return change

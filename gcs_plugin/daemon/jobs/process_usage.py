@@ -1,4 +1,4 @@
-"""What the daemon's processes use."""
+"""Resource usage of the daemon's processes."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ def resident_mb() -> float:
 
 
 def used_by(pid: int) -> Usage:
-    """What another process has used so far; nothing if it is gone, or where the system does not tell (not Linux)."""
+    """Usage of another process so far; zero if it has ended, or if the system does not report it (not Linux)."""
     try:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
         ran = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()

@@ -1,7 +1,7 @@
-"""Publishing: the next generation of a refined layer is drawn beside the present one and takes its place at once.
+"""Publishing: the next generation of a refined layer is drawn separately and then replaces the present one at once.
 
-Until the last step nothing of what the map shows changes; the last step is one transaction of the journal, which names
-the layer's new generation and whatever else became true with it.
+Until the last step the map does not change; the last step is one transaction of the journal, which names
+the layer's new generation and all facts that change with it.
 """
 
 import json
@@ -48,7 +48,7 @@ class Publisher:
         *,
         trusted: bool,
     ) -> None:
-        """Remove what a killed daemon left half made, and open what it had published.
+        """Remove unfinished files of a killed daemon, and open what it had published.
 
         Args:
             trusted: False after a power cut: canvases are not synced, for speed.
@@ -70,7 +70,7 @@ class Publisher:
         self.sweep()
 
     def _opened(self, layer: str, trusted: bool) -> bool:
-        """Open what was published of a layer; False if that cannot be trusted, and is forgotten."""
+        """Open the published generation of a layer; False if it cannot be trusted and is dropped."""
         generation = self.journal.fact(layer)
         if generation is None:
             return not self.shown(layer)
@@ -85,7 +85,10 @@ class Publisher:
         return True
 
     def _forget_outdated(self) -> list[tuple[str, int]]:
-        """Forget solution files that cannot be read, and the layers that show them; gives the refined ones."""
+        """Drop solution files that cannot be read, and the layers that show them.
+
+        Returns the refined sorties among them.
+        """
         outdated = {
             table: [row for row in self._rows(table) if not is_readable(self.solutions / row["path"])]
             for table in ("solutions", "coarse")
@@ -113,20 +116,20 @@ class Publisher:
         return refined
 
     def draw_again(self, workers: WorkerPool, tell: Callable[[float, str], None]) -> Change:
-        """Draw the layers that were lost from the solution files; gives the change that says so."""
+        """Draw the lost layers from the solution files; returns the change that records it."""
         todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
         for n, (layer, (vehicle, sortie)) in enumerate(todo):
             with self.turn(layer):
                 row = self.shown(layer).get((vehicle, sortie))
                 if row is None:
-                    continue  # refined, or drawn anew, meanwhile
+                    continue  # refined, or drawn again, meanwhile
                 tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
                 whose = (unpacked(vehicle), sortie)
                 self.publish(layer, workers, whose, row[0], row[1], lambda rejected: lambda db: None)
         return fact_change("lost", [])
 
     def sweep(self) -> None:
-        """Remove canvases and solution files that nothing names."""
+        """Remove canvases and solution files that are not referenced."""
         named = {self.journal.fact(name) for name in ("realtime", *REFINED)}
         for path in self.folder.iterdir():
             if path.name not in named:
@@ -137,7 +140,7 @@ class Publisher:
                 path.unlink(missing_ok=True)
 
     def area(self) -> Area:
-        """Where the map lies.
+        """The map's area.
 
         Raises:
             OrthoSwarmError: there is no map yet.
@@ -148,7 +151,7 @@ class Publisher:
 
     @contextmanager
     def turn(self, layer: str) -> Iterator[None]:
-        """Wait for a layer, and have it for oneself."""
+        """Wait for exclusive use of a layer."""
         with self._turns[layer]:
             self.drawing.add(layer)
             try:
@@ -169,8 +172,8 @@ class Publisher:
 
         Args:
             layer: coarse or fine. workers: where the work runs. sortie: vehicle and number.
-            target: its solution file. changed: ground that it shows otherwise than before.
-            change: gives, for image -> why it could not be drawn, what else becomes true in the journal.
+            target: its solution file. changed: ground whose pixels change.
+            change: returns the journal change, given image -> why it could not be drawn.
 
         Returns:
             The layer's version before and now.
@@ -188,7 +191,7 @@ class Publisher:
                 fact(db)
 
             before = self.layers[layer].version
-            self.journal.write(both)  # here, so that the next drawing begins from it
+            self.journal.write(both)  # here, so that the next drawing starts from it
         except BaseException:
             shutil.rmtree(self.folder / name, ignore_errors=True)
             raise
@@ -196,7 +199,7 @@ class Publisher:
         return before, self.layers[layer].version
 
     def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, BoundingBox]]:
-        """(vehicle, sortie) -> solution file and bounds of what shows on a layer; refined ones hide coarse ones."""
+        """(vehicle, sortie) -> solution file and bounds of the sorties on a layer; refined ones hide coarse ones."""
         refined = {(r["vehicle"], r["sortie"]): r for r in self._rows("solutions")}
         rows = {key: row for key, row in refined.items() if json.loads(row["detail"])["layer"] == layer}
         if layer == "coarse":
@@ -204,7 +207,7 @@ class Publisher:
         return {key: (self.solutions / row["path"], _bounds(row)) for key, row in sorted(rows.items())}
 
     def retire(self, path: Path) -> None:
-        """Remove a solution file later: others may be reading it."""
+        """Remove a solution file later, as others may be reading it."""
         later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
         later.daemon = True
         later.start()

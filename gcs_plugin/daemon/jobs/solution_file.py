@@ -1,4 +1,4 @@
-"""Solution files: a placed sortie and what drawing it needs, pickled beside the journal."""
+"""Solution files: a placed sortie with the data for drawing it, pickled next to the journal."""
 
 import hashlib
 import os
@@ -37,7 +37,7 @@ class SolutionFileError(OrthoSwarmError):
 
 @dataclass(frozen=True, slots=True)
 class SolutionFile:
-    """A placed sortie with what drawing it needs, as it lies in a file beside the journal.
+    """A placed sortie with the data for drawing it, as stored in a solution file.
 
     Attributes:
         solution: its frames' cameras.
@@ -54,7 +54,7 @@ class SolutionFile:
         return self.solution.terrain or Terrain.flat(self.solution.ground_z_m)
 
     def write(self, path: Path) -> None:
-        """Write it, whole and synced or not at all.
+        """Write it completely and synced, or not at all.
 
         Raises:
             StorageError: the disk is full.
@@ -67,7 +67,7 @@ class SolutionFile:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether a solution file is of this version of the program, by its first bytes."""
+    """Whether a solution file was written by this version of the program, by its first bytes."""
     try:
         with path.open("rb") as file:
             return file.read(len(_header())) == _header()
@@ -88,7 +88,7 @@ def read_solution(path: Path) -> SolutionFile:
         with path.open("rb") as file:
             file.seek(len(_header()))
             found = pickle.load(file)
-    except Exception:  # a pickle that is torn, or whose classes have moved, can raise anything
+    except Exception:  # a damaged pickle, or one whose classes have moved, can raise anything
         raise SolutionFileError(f"{path.name} is damaged; refine its vehicle again") from None
     if not isinstance(found, SolutionFile):
         raise SolutionFileError(reason)
@@ -104,7 +104,7 @@ def _header() -> bytes:
 
 
 def thumbnail_of(data: bytes) -> Bytes:
-    """A thumbnail as the journal keeps it."""
+    """A thumbnail as stored in the journal."""
     return np.frombuffer(data, np.uint8).reshape(_THUMBNAIL)
 
 
@@ -124,7 +124,7 @@ def may_see(placed: PlacedFrame, bounds: BoundingBox) -> bool:
 
 
 def uniquely_named(placed: PlacedFrame, number: int, *, own: bool) -> PlacedFrame:
-    """A frame under a name of its own: vehicles may use the same names, the renderer tells frames apart by them."""
+    """A frame under a unique name: vehicles may use the same names, and the renderer distinguishes frames by name."""
     frame = placed.frame
     return replace(placed, frame=replace(frame, image=f"{number} {OWN if own else OTHER} {frame.image}"))
 
@@ -135,11 +135,11 @@ def gains_of(
     others: Iterable[SolutionFile],
     held: Mapping[str, Gain] | None = None,
 ) -> dict[str, Gain]:
-    """Gains of a solution's frames, even with each other and with those of others that are drawn already.
+    """Gains of a solution's frames, balanced among each other and with drawn frames of others.
 
     Args:
         solution: whose frames. thumbnails: image -> uint8 (12, 16, 3) of those that were read.
-        others: sorties nearby; they stay as they are. held: image -> gain of own frames that stay, too.
+        others: sorties nearby, unchanged. held: image -> gain of own frames that are unchanged, too.
     """
     terrain = solution.terrain or Terrain.flat(solution.ground_z_m)
     bounds = visible_ground(solution.placed, terrain)

@@ -35,9 +35,9 @@ class SortieRefinement:
     """Does the jobs `refine`.
 
     Attributes:
-        journal, store, publisher: what there is. workers: where the work runs. drawer: of the real-time layer.
+        journal, store, publisher: of the workspace. workers: compute the job. drawer: of the real-time layer.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
-        make_way: called with vehicle and layer before the work begins, and before the layer is needed.
+        make_way: called with vehicle and layer before the work starts, and before the layer is needed.
     """
 
     journal: Journal
@@ -78,13 +78,13 @@ class SortieRefinement:
         return lambda db: None
 
     def _solve(self, job: Job, tell: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
-        """Solve what has come by now in the process that is reserved.
+        """Solve the pictures that have arrived, in the reserved process.
 
         Returns:
-            The row of the solution beside which late pictures were laid (None: all were refined), the new solution's
-            file, how many pictures there are, and what became of them.
+            The row of the solution to which late pictures were registered (None: all were refined), the new solution's
+            file, the number of pictures, and their result.
         """
-        job.detail["refine_started_s"] = time.time()  # what arrives later is late
+        job.detail["refine_started_s"] = time.time()  # pictures that arrive later are late
         area = self.publisher.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
         before = self._beside(job, len(frames))
@@ -111,7 +111,7 @@ class SortieRefinement:
             tell(0.7, "drawing")
             shown = self.publisher.shown(layer).get((packed(vehicle), job.sortie or 0))
             changed = solved.changed
-            if before is None and shown is not None:  # it leaves where it was
+            if before is None and shown is not None:  # its old ground changes, too
                 changed = BoundingBox.around([changed, shown[1]])
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(
                 layer, self.workers, (vehicle, job.sortie), target, changed,
@@ -123,9 +123,9 @@ class SortieRefinement:
     # -- the parts ------------------------------------------------------------------------------------------------
 
     def _wait_quiet(self, job: Job) -> None:
-        """Pictures that were on their way when the vehicle completed still belong to its sortie.
+        """Wait for pictures that were under way when the vehicle completed; they belong to its sortie.
 
-        They are thought to be all there when none has come for longer than they came apart before.
+        They are considered complete when none has arrived for longer than the usual interval.
         """
         end = time.monotonic() + _LATE_S
         while time.monotonic() < end and not self.stopped():
@@ -140,7 +140,7 @@ class SortieRefinement:
             time.sleep(0.05)
 
     def _beside(self, job: Job, count: int) -> Any:
-        """The refinement beside which late pictures are laid; None if all are to be refined."""
+        """The refinement to which late pictures are registered; None if all are to be refined."""
         if job.detail.get("trigger") != "late":
             return None
         row = solution_row(self.journal, job)
@@ -148,7 +148,7 @@ class SortieRefinement:
         return row if refined is not None and count - refined < _AGAIN else None
 
     def _neighbours(self, job: Job, box: BoundingBox) -> list[Path]:
-        """Solutions of others whose ground comes near."""
+        """Solutions of other vehicles nearby."""
         return [self.publisher.solutions / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
 
     def _publish(

@@ -1,4 +1,4 @@
-"""Worker processes of the daemon: warm, low in priority, and gone when the daemon is gone, however it went."""
+"""Worker processes of the daemon: started in advance, of low priority, ended with the daemon in any case."""
 
 import multiprocessing
 import os
@@ -39,7 +39,7 @@ class WorkerPool:
         self._ended_cpu_s = 0.0
 
     def warm_up(self) -> None:
-        """Start the processes, once, and let them import what they will need."""
+        """Start the processes, once, and let them import the needed modules."""
         with self._lock:
             if self._started or self._closed:
                 return
@@ -48,7 +48,7 @@ class WorkerPool:
             self.submit(_import_all, 0)
 
     def warm_kernels(self) -> None:
-        """Have a process load its compiled kernels, once: the first vehicle that completes need not wait for that."""
+        """Have a process load its compiled kernels, once, so that the first completed vehicle need not wait for it."""
         with self._lock:
             if self._warm or self._closed:
                 return
@@ -75,7 +75,7 @@ class WorkerPool:
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
-        """Wait until a process is free, and keep it for what this thread runs meanwhile.
+        """Wait until a process is free, and reserve it for this thread's work.
 
         Raises:
             OrthoSwarmError: the daemon is stopping.
@@ -94,7 +94,7 @@ class WorkerPool:
         """Run a function once a process is free, and wait for it.
 
         Raises:
-            WorkerStoppedError: the process was stopped from outside. What the function raises is raised here.
+            WorkerStoppedError: the process was stopped from outside. Errors of the function are raised here.
         """
         if not getattr(self._reserved, "held", False):
             with self.reserved():
@@ -110,13 +110,13 @@ class WorkerPool:
             raise WorkerStoppedError("a worker process was stopped from outside, mostly for lack of memory") from None
 
     def usage(self) -> Usage:
-        """CPU time of all its processes so far, and the largest memory of each one that lives, added up."""
+        """CPU time of all its processes so far, and the sum of the peak memory of the live ones."""
         with self._lock:
             living = _used(self._pool)
             return Usage(self._ended_cpu_s + living.cpu_s, living.peak_rss_mb)
 
     def abandon(self) -> None:
-        """Give up what is under way, at once; the processes start anew with the next work."""
+        """Abandon running work at once; new processes start with the next work."""
         with self._lock:
             pool, self._pool = self._pool, None
             self._ended_cpu_s += _used(pool).cpu_s
@@ -124,7 +124,7 @@ class WorkerPool:
             _end(pool)
 
     def close(self) -> None:
-        """Stop at once; what was under way is given up."""
+        """Stop at once, abandoning running work."""
         with self._lock:
             pool, self._pool, self._closed = self._pool, None, True
         if pool is not None:
@@ -138,7 +138,7 @@ def _used(pool: ProcessPoolExecutor | None) -> Usage:
 
 
 def _end(pool: ProcessPoolExecutor) -> list[Any]:
-    """Terminate a pool's processes; gives them."""
+    """Terminate a pool's processes; returns them."""
     processes = list((getattr(pool, "_processes", None) or {}).values())
     for process in processes:
         process.terminate()
@@ -147,7 +147,7 @@ def _end(pool: ProcessPoolExecutor) -> list[Any]:
 
 
 def _prepare(nice: int) -> None:
-    """First thing in a worker: the daemon handles signals, and its end is this process's end, too."""
+    """Prepare a worker: signals are left to the daemon, and the process ends with the daemon."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(nice)
@@ -160,7 +160,7 @@ def _prepare(nice: int) -> None:
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
-        parent.join()  # also wakes up when it was killed
+        parent.join()  # also returns when the daemon was killed
         os._exit(1)
 
 

@@ -1,6 +1,6 @@
-"""What worker processes do for the daemon: place a vehicle's pictures, and draw the next generation of a layer.
+"""Tasks of the daemon's worker processes: placing a vehicle's pictures, and drawing the next generation of a layer.
 
-Both hand large things over as files: a solution is pickled beside the journal, a generation is a folder of tiles.
+Large results are passed as files: a solution is pickled next to the journal, a generation is a folder of tiles.
 """
 
 import time
@@ -36,13 +36,13 @@ from orthoswarm.raster.basemap import Basemap
 
 @dataclass(frozen=True, slots=True)
 class SolveTask:
-    """One vehicle's sortie, or as much of it as there is.
+    """One vehicle's sortie, or the part that has arrived.
 
     Attributes:
         frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
         thumbnails: image -> uint8 (12, 16, 3).
-        neighbours: solution files nearby, held as they are. target: where the new one goes.
-        before: in flight, what was kept of the sortie's earlier legs; for late pictures, of its refinement.
+        neighbours: solution files nearby, held fixed. target: path of the new one.
+        before: the solution file of the sortie's earlier legs (in flight) or of its refinement (for late pictures).
     """
 
     frames: list[Frame]
@@ -57,13 +57,13 @@ class SolveTask:
 
 @dataclass(frozen=True, slots=True)
 class SortieResult:
-    """What became of it.
+    """The result of a task.
 
     Attributes:
-        stages: image -> stage and sigma in metres, of what is new. dropped: image -> why.
+        stages: image -> stage and sigma in metres, of new placements. dropped: image -> why.
         legs: as JSON values with `line`, their ends in degrees. fov_deg: with its sigma. warnings: in plain words.
-        bounds: of what all its frames see. changed: of the ground that has to be drawn anew.
-        cpu_s: CPU seconds that it took; wall_s.
+        bounds: of all its frames' ground. changed: of the ground that has to be drawn again.
+        cpu_s: CPU seconds used; wall_s: duration.
     """
 
     stages: dict[str, tuple[str, float]]
@@ -103,7 +103,7 @@ def solve(task: SolveTask) -> SortieResult:
     """Refine one vehicle.
 
     Raises:
-        OrthoSwarmError: nothing can be made of its frames.
+        OrthoSwarmError: its frames cannot be refined.
     """
     watch = _Watch()
     others = [read_solution(path) for path in task.neighbours]
@@ -137,7 +137,7 @@ def register_late(task: SolveTask) -> SortieResult:
 
 
 def without_strays(solution: Solution) -> Solution:
-    """The solution without pictures that look far aside among others that look straight down, which would smear."""
+    """The solution without strongly oblique pictures among nadir ones, which would smear."""
     out = strays(solution.placed)
     if not out:
         return solution
@@ -151,10 +151,10 @@ def without_strays(solution: Solution) -> Solution:
 
 @dataclass(frozen=True, slots=True)
 class JointTask:
-    """A refined sortie, to be solved once more beside neighbours.
+    """A refined sortie, to be refined again together with neighbours.
 
     Attributes:
-        before: the solution file. neighbours: solution files nearby, held as they are. target: where the new one goes.
+        before: the solution file. neighbours: solution files nearby, held fixed. target: path of the new one.
         epsg, origin: the area's. basemap: the map.
     """
 
@@ -167,7 +167,9 @@ class JointTask:
 
 
 def refine_jointly(task: JointTask) -> tuple[SortieResult, float] | None:
-    """Solve a refined sortie again; gives how far its pictures moved (metres, 95 %), None if nothing was to be solved.
+    """Refine a sortie again.
+
+    Returns the result and its pictures' movement (metres, 95 %), None if nothing is to be solved.
 
     Its exposure stays as it is: its neighbours were drawn to agree with it.
     """
@@ -206,7 +208,7 @@ def _ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float6
 
 
 def place(task: SolveTask) -> SortieResult:
-    """Place the pictures of a vehicle's legs that are over, beside its earlier legs where they were placed.
+    """Place the pictures of a vehicle's finished legs, registered to its earlier legs if those were placed.
 
     Raises:
         OrthoSwarmError: the pictures cannot be adjusted (yet).
@@ -233,10 +235,10 @@ def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> SortieResult:
     """The coarse placement that a refined sortie began from, for the coarse layer.
 
     Args:
-        task: the refined sortie's solution file, the area's origin, where the coarse one goes.
+        task: the refined sortie's solution file, the area's origin, the path of the coarse one.
 
     Raises:
-        OrthoSwarmError: the refined one does not know any more.
+        OrthoSwarmError: the refined one does not contain it any more.
     """
     from orthoswarm.refine.strategy.in_flight import coarse_of
 
@@ -245,7 +247,7 @@ def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> SortieResult:
     fine = read_solution(source)
     solution = coarse_of(fine.solution, np.array(origin))
     there = {p.frame.image for p in solution.placed}
-    solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # laid beside the others
+    solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # registered to the others
     sortie = replace(fine, solution=solution)
     sortie.write(target)
     return watch.solved(replace(solution, legs=[]), [], sortie, visible_ground(solution.placed, sortie.terrain))
@@ -256,20 +258,20 @@ def _basemap(task: SolveTask) -> Basemap | None:
 
 
 def near(frames: Sequence[Frame], epsg: int) -> BoundingBox:
-    """Where pictures were taken, by their records."""
+    """Recorded positions of pictures."""
     ground = LocalGrid(epsg).to_grid([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
     return BoundingBox.around_points(ground)
 
 
 def _in_units(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames in the order in which legs number them: unit by unit."""
+    """Frames in the order that legs refer to: unit by unit."""
     from orthoswarm.refine.flight.solve_units import split_units
 
     return [frame for unit in split_units({frames[0].vehicle: frames}) for frame in unit]
 
 
 def _leg(leg: Leg, frames: Sequence[Frame]) -> dict[str, Any]:
-    """A leg as JSON values, with its ends by the record and the pictures at them."""
+    """A leg as JSON values, with the recorded positions of its ends and the pictures there."""
     values: dict[str, Any] = {
         "vehicle": leg.vehicle, "first": leg.first, "last": leg.last, "state": leg.state,
         "confidence": leg.confidence, "sigma_m": leg.sigma_m,
@@ -288,8 +290,8 @@ class DrawTask:
     Attributes:
         old: folder of the present generation, None for the first. new: folder of the next.
         grid: where the layer lies.
-        solutions: solution files, in the order that breaks ties; all that show on the layer near the changed ground.
-        changed: the one whose ground is drawn anew. bounds: that ground.
+        solutions: solution files near the changed ground, in the order that breaks ties.
+        changed: the one whose ground is drawn again. bounds: that ground.
     """
 
     old: Path | None
@@ -301,7 +303,7 @@ class DrawTask:
 
 
 def draw(task: DrawTask) -> dict[str, str]:
-    """Draw a sortie, and what overlaps it, into a new generation; gives image -> why it could not be drawn.
+    """Draw a sortie and those that overlap it into a new generation; returns image -> why it could not be drawn.
 
     Raises:
         OrthoSwarmError: the disk is full.

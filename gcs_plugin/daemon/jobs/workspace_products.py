@@ -1,4 +1,4 @@
-"""The workspace's products: the same files as those of a batch run, made in a worker from what the journal holds."""
+"""The workspace's products: the same files as those of a batch run, made in a worker from the journal."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -30,13 +30,13 @@ _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "or
 
 @dataclass(frozen=True, slots=True)
 class ExportTask:
-    """What to write.
+    """An export.
 
     Attributes:
         workspace: the daemon's folder. formats: some of FORMATS.
         canvases: layer -> its canvas's folder, those that there are. epsg, gsd_m: the area's.
         frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
-        coarse, solutions: solution files, those only placed in flight and those refined.
+        coarse, solutions: solution files of sorties placed in flight only, and of refined ones.
         basemap: the map, or None. fov_rad: theta-hat. facts: for the report. places: finds and vehicles.
     """
 
@@ -121,7 +121,7 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
 
 
 def _drawn_ha(canvas: Canvas) -> float:
-    """Ground that a canvas shows, hectares."""
+    """Area drawn on a canvas, hectares."""
     row0, row1, col0, col1 = canvas.drawn
     drawn = 0
     for top in range(row0, row1, canvas.tile_px):
@@ -130,7 +130,7 @@ def _drawn_ha(canvas: Canvas) -> float:
 
 
 class _WithOverviews:
-    """A canvas that another process writes: its overviews may be behind, so reduced pixels are made from full ones."""
+    """A canvas written by another process; its overviews may be outdated, so reduced pixels are computed."""
 
     def __init__(self, canvas: Canvas) -> None:
         self.grid, self._canvas = canvas.grid, canvas
@@ -161,7 +161,7 @@ def _recorded(task: ExportTask) -> "Recorded":
 def _placements(
     task: ExportTask, recorded: "Recorded", solutions: list[Solution]
 ) -> tuple[list[PlacedFrame], list[Rejection]]:
-    """Each frame as it was placed last."""
+    """The latest placement of each frame."""
     best: dict[tuple[str, str], PlacedFrame] = {}
     for p in [*recorded.placed, *(p for s in solutions for p in s.placed)]:
         best[p.frame.vehicle, p.frame.image] = p
@@ -173,7 +173,7 @@ def _placements(
 
 
 def placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
-    """Each frame as it was placed last, and the level of the ground below them, metres."""
+    """The latest placement of each frame, and the level of the ground below them, metres."""
     return _stated(_placements(task, _recorded(task), solutions)[0], solutions)
 
 
@@ -249,7 +249,7 @@ def facts_of(
     others: Sequence[Usage],
     rss_mb: float,
 ) -> dict[str, Any]:
-    """What only the daemon knows for the report: stage timings from its jobs, completions, and what it uses.
+    """The daemon's facts for the report: stage timings from its jobs, completions, and resource usage.
 
     Args:
         jobs: all, as JSON values. completions: the same.
@@ -277,7 +277,7 @@ def facts_of(
 
 
 def _summed(name: str, kind: str, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The stage of all jobs of a kind that placed pictures, if there were any."""
+    """The summed timing of all jobs of a kind that placed pictures, if there were any."""
     details = [j["detail"] for j in jobs if j["kind"] == kind and "frames" in j["detail"]]
     if not details:
         return []

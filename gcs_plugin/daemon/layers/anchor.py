@@ -1,4 +1,4 @@
-"""What says where the map lies, and how far pictures lie from it."""
+"""The place where the map should lie, and the distance of pictures from it."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ _METRES_A_DEGREE = 111_195.0  # of a great circle of the mean Earth, 6,371,008.8
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A place on Earth that pictures are to lie at.
+    """The place where pictures are expected.
 
     Attributes:
         name: for messages: "the basemap". bounds: south, west, north, east in degrees.
@@ -29,7 +29,7 @@ class Anchor:
         return cls(name, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
 
     def distance_m(self, lat_deg: float, lon_deg: float) -> float:
-        """Metres from a position to the nearest one within the bounds, to a hundredth; 0 inside."""
+        """Distance of a position from the bounds in metres, to a hundredth; 0 inside."""
         south, west, north, east = self.bounds
         middle = 0.5 * (west + east)
         lon_deg = middle + (lon_deg - middle + 180.0) % 360.0 - 180.0

@@ -1,9 +1,9 @@
-"""Frames that wait to be drawn, bounded in number, in the order in which they matter.
+"""The queue of frames to be drawn, bounded in number, in order of their use for the map.
 
-A map pixel takes the picture with the nearest nadir point, so a frame wins the fewer pixels the nearer its nadir lies
+A map pixel shows the picture with the nearest nadir point, so a frame gains fewer pixels the nearer its nadir lies
 to one that is drawn already: its share of the map is its cell of the Voronoi diagram of all nadirs. That distance, in
 steps of a twentieth of a footprint, is a frame's level; the highest level goes first, within a level the oldest. When
-more wait than memory is meant for, those of the lowest level are let go of: they stay in the journal, undrawn.
+more wait than the memory bound allows, those of the lowest level are dropped: they stay in the journal, undrawn.
 """
 
 import math
@@ -30,10 +30,10 @@ class Pending:
 
 
 class DrawQueue:
-    """The queue; whoever uses it sees to it that one thread does at a time.
+    """The queue; it is not thread-safe.
 
     Args:
-        most: how many it holds.
+        most: capacity.
     """
 
     def __init__(self, most: int) -> None:
@@ -48,7 +48,7 @@ class DrawQueue:
         return self._count
 
     def put(self, pending: Pending) -> Pending | None:
-        """Add a frame; gives the one that has to leave for it (itself, if it matters least), None if there is room."""
+        """Add a frame; returns the one dropped for it (possibly itself), None if there is room."""
         level = self._level(pending.frame)
         left: Pending | None = None
         if self._count >= self.most:
@@ -62,13 +62,13 @@ class DrawQueue:
         return left
 
     def take(self) -> Pending | None:
-        """The frame that is to be drawn next; it counts as drawn from now on. None if there is none."""
+        """The frame to be drawn next, counted as drawn from now on; None if there is none."""
         for level in range(LEVELS - 1, -1, -1):
             queue = self._queues[level]
             while queue:
                 pending = queue.popleft()
                 now = self._level(pending.frame)
-                if now < level:  # others were drawn nearby meanwhile
+                if now < level:  # others nearby were drawn meanwhile
                     self._queues[now].append(pending)
                     continue
                 self._count -= 1
@@ -81,7 +81,7 @@ class DrawQueue:
         return {pending.seq for queue in self._queues for pending in queue}
 
     def forget_drawn(self) -> None:
-        """The map is drawn anew: nothing is on it."""
+        """Forget what was drawn, as the map is drawn again."""
         self._drawn.clear()
 
     def _cell(self, frame: Frame) -> tuple[int, int]:

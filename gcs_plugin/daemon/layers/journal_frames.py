@@ -1,4 +1,4 @@
-"""Frames as the journal keeps them."""
+"""Frames from the journal."""
 
 import json
 import sqlite3

@@ -1,7 +1,8 @@
-"""The map's layers: canvases that grow with the area, and generations of them that take each other's place at once.
+"""The map's layers: canvases that grow with the area, and generations of them that replace each other at once.
 
 A layer that is drawn in real time changes tile by tile. A refined layer is replaced as a whole: its next generation is
-made beside it, sharing the files of unchanged tiles, and becomes the layer when the journal says so. So a reader sees
+made separately, sharing the files of unchanged tiles, and becomes the layer by a change of the journal. So a reader
+sees
 all of a vehicle's old pixels or all of its new ones, and a crash leaves the one or the other.
 """
 
@@ -35,11 +36,11 @@ _ORIGIN_STEP_M: Final = 16.0
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Where the map lies.
+    """The map's area.
 
     Attributes:
         epsg: the area's grid. gsd_m: ground pixel of all layers.
-        origin: (2,) about which refinement reckons; the same for all vehicles.
+        origin: (2,) of the refinement's local frame; the same for all vehicles.
         bounds: west, south, east, north that the layers can hold, on multiples of a tile's side.
     """
 
@@ -50,14 +51,14 @@ class Area:
 
     @classmethod
     def around(cls, epsg: int, east: float, north: float, gsd_m: float) -> "Area":
-        """A generous area around a first picture; ground that nobody sees costs nearly nothing."""
+        """A generous area around the first picture; empty ground costs almost nothing."""
         gsd = _round_gsd(gsd_m)
         half = float(np.clip(_HALF_PX * gsd, *_HALF_M))
         origin = (round(east / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, round(north / _ORIGIN_STEP_M) * _ORIGIN_STEP_M)
         return cls(epsg, gsd, origin, _on_tiles(BoundingBox(east, north, east, north).grown(half), gsd))
 
     def grown(self, bounds: BoundingBox) -> "Area":
-        """The area with room for bounds, and as much again beyond, as they were not expected.
+        """The area extended to the bounds and as much again beyond them.
 
         Raises:
             OrthoSwarmError: that would be too large for one map.
@@ -109,7 +110,7 @@ def _on_tiles(bounds: BoundingBox, gsd_m: float) -> BoundingBox:
 
 
 class Layer:
-    """One layer: at most one canvas at a time, which readers hold while they read.
+    """One layer: at most one canvas at a time, which stays open while it is read.
 
     Attributes:
         name: realtime, coarse or fine.
@@ -144,7 +145,7 @@ class Layer:
                     self._let_go()
 
     def replace(self, canvas: Canvas | None, *, remove: bool = True) -> None:
-        """Put another canvas in the present one's place; that is closed, and removed, when its last reader is done."""
+        """Replace the canvas; the old one is closed and removed when its last reader is done."""
         with self._lock:
             if self._canvas is not None:
                 self._retired[id(self._canvas)] = (self._canvas, remove)
@@ -178,7 +179,7 @@ def new_name(layer: str) -> str:
 
 
 def successor(old: Canvas | None, path: Path, grid: GroundGrid, plane: Plane, *, share: bool) -> Canvas:
-    """A canvas in a new folder with what the old one shows, on a grid that holds the old one's.
+    """A canvas in a new folder with the old one's content, on a grid that contains the old one's.
 
     Args:
         old: the present canvas, or None to begin empty.
@@ -210,7 +211,7 @@ def successor(old: Canvas | None, path: Path, grid: GroundGrid, plane: Plane, *,
 
 
 def _copy_canvas(old: Path, new: Path, *, share: bool) -> None:
-    """All of a canvas but its overviews, which are made again as they are needed; its header goes last."""
+    """Copy a canvas without its overviews, which are made again when needed; its header is copied last."""
     for folder, _, names in os.walk(old / "tiles"):
         target = new / Path(folder).relative_to(old)
         target.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""Where the map lies: begun by the first picture, grown as pictures come, moved if it was begun at a wrong place.
+"""The map's location: set by the first picture, extended as pictures arrive, moved if the first was at a wrong place.
 
-The basemap says where the map lies, without one the newest plan, without that most of the pictures.
+The basemap determines the location, else the newest plan, else the majority of the pictures.
 """
 
 import json
@@ -38,7 +38,7 @@ class MapSite:
     """The map's area and the canvas of the real-time layer, used by the drawing thread.
 
     Attributes:
-        area: where the map lies, None before the first frame. grid: its grid. mosaic: draws on its canvas.
+        area: the map's area, None before the first frame. grid: its grid. mosaic: draws on its canvas.
     """
 
     def __init__(
@@ -53,13 +53,13 @@ class MapSite:
         anchor: Callable[[], Anchor | None],
         draw_again: Callable[[], None],
     ) -> None:
-        """Take up where the last daemon stopped.
+        """Continue where the last daemon stopped.
 
         Args:
             journal: of the workspace. layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
             on_area: called when the area changes. anchor: gives where the map is to lie, None to go by the pictures.
-            draw_again: has all frames drawn that the journal says are not.
+            draw_again: draws all frames that the journal lists as not drawn.
         """
         self._journal, self._layer, self._folder = journal, layer, folder
         self._gsd_m, self._fov_rad, self._on_area, self._anchor = gsd_m, fov_rad, on_area, anchor
@@ -74,10 +74,10 @@ class MapSite:
             self._open(journal.fact("realtime"))
 
     def place(self, frame: Frame, drawn: int) -> tuple[Camera, float] | str:
-        """The frame's camera and sigma, metres, with room for it on the layer; or why it cannot be drawn.
+        """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn.
 
         Args:
-            frame: with a recorded pose. drawn: how many frames were drawn since the start.
+            frame: with a recorded pose. drawn: number of frames drawn since the start.
         """
         if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
             return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
@@ -110,7 +110,7 @@ class MapSite:
     def _is_far(self, frame: Frame) -> str | None:
         """Why a frame lies too far away for the map, None if it does not; the map may move to it.
 
-        A map that was begun elsewhere (by pictures with a wrong position) is begun again, as long as nothing was
+        A map started elsewhere (by pictures with a wrong position) is started again, as long as nothing was
         solved on it, and all frames are drawn again.
         """
         fix, anchor = frame.fix, self._anchor()
@@ -132,7 +132,7 @@ class MapSite:
         )
 
     def _is_majority(self, frame: Frame) -> bool:
-        """Whether more of the frames lie around this one, too far from the map, than on the map."""
+        """Whether more frames lie around this one, too far from the map, than on the map."""
         if self._far is None:
             rows = self._journal.rows("SELECT pose FROM frames WHERE stage = 'rejected'")
             poses = [pose for row in rows if is_position(pose := json.loads(row["pose"]))]
@@ -148,7 +148,7 @@ class MapSite:
         return self._journal.one(query) is not None
 
     def _move_away(self) -> None:
-        """Leave the place where the map lies: the next frame begins it, and all are drawn again."""
+        """Drop the map's location: the next frame sets it, and all frames are drawn again."""
         _log.warning("the map was begun at a wrong position; it is begun again where most pictures lie")
 
         def change(db: sqlite3.Connection) -> None:
@@ -161,7 +161,7 @@ class MapSite:
         self._layer.replace(None)
 
     def _is_other_scale(self, camera: Camera) -> bool:
-        """Whether the map's scale was taken from pictures during the climb."""
+        """Whether the map's ground pixel was derived from pictures during the climb."""
         assert self.area is not None
         height = float(camera.position[2])
         solved = self._journal.one("SELECT 1 FROM solutions LIMIT 1") is not None
@@ -174,14 +174,14 @@ class MapSite:
         self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
 
     def _with_room(self, camera: Camera) -> str | None:
-        """Make sure that the layer holds what a camera sees; why not, if that cannot be."""
+        """Extend the layer to a camera's footprint; returns the reason if that is impossible."""
         assert self.area is not None
         east, north, height = (float(v) for v in camera.position)
         far = _SEEN_HEIGHTS * abs(height)
         if self.area.bounds.contains(BoundingBox(east, north, east, north).grown(far)):
             return None  # the usual case, without a look at the footprint
         if rejection(camera, 0.0, self.area.gsd_m) is not None:
-            return None  # the mosaic will say so
+            return None  # the mosaic reports that
         box = footprint_boxes([camera], 0.0, 0.0)[0]
         bounds = BoundingBox(*(float(v) for v in box))
         if not np.isfinite(box).all() or self.area.bounds.contains(bounds):

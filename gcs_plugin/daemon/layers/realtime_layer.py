@@ -1,8 +1,8 @@
-"""The real-time layer: one thread that draws every frame of the journal that is not drawn yet, the most telling first.
+"""The real-time layer: one thread draws all undrawn frames of the journal, the most useful first.
 
-The journal is the queue, so nothing waits in memory without bound and nothing is forgotten by a crash. While the thread
-keeps up, frames are drawn as they come. Under overload those that would win the fewest pixels are put off (`waiting`):
-they are on the disk, count for the refinement, and are drawn when there is time; how many they are is told.
+The journal is the queue, so memory is bounded and nothing is lost in a crash. While the thread
+keeps up, frames are drawn in order of arrival. Under overload those that would gain the fewest pixels are put off
+(`draw_queue`): they are stored, are used by the refinement, and are drawn later; their number is published.
 """
 
 import logging
@@ -50,8 +50,8 @@ class Drawer:
 
     Attributes:
         drawn: frames drawn since the start. late: drawn later than a second after they came.
-        put_off: frames that wait longer than a second, because they would show least of all that wait.
-        latencies: seconds from arrival to the map, of the last thousand.
+        put_off: frames that wait longer than a second, because they would show least of the waiting ones.
+        latencies: seconds from arrival to the map, of the last thousand frames.
     """
 
     def __init__(
@@ -73,20 +73,21 @@ class Drawer:
         look_s: float = _LOOK_S,
         read: Callable[[Path], Bytes] = read_rgba,
     ) -> None:
-        """Take up where the last daemon stopped; `start` begins to draw.
+        """Continue where the last daemon stopped; `start` begins to draw.
 
         Args:
-            journal: what there is.
-            store: where the pictures are.
+            journal: of the workspace.
+            store: of the pictures.
             layer: to draw on.
             folder: of all layers' canvases.
-            events: told of frames and layer versions.
+            events: receives frames and layer versions.
             gsd_m: ground pixel; from the first pictures if None.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
             on_area: called in the drawing thread when the area changes.
-            anchor: gives where the map is to lie, None to go by the pictures.
-            on_rejected: called with each frame that cannot be on the map, why, and whether that is for its place.
-            on_drawn: called with each frame that is on the map as recorded, and what its pixels say (None: too small).
+            anchor: returns where the map should lie, None to use the pictures.
+            on_rejected: called with each frame that cannot be on the map, the reason, and whether its position is the
+            reason.
+            on_drawn: called with each frame drawn as recorded, and its picture quality (None: too small).
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
@@ -114,7 +115,7 @@ class Drawer:
     # -- from outside ---------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to draw, in a thread."""
+        """Start drawing, in a thread."""
         self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
         self._thread.start()
 
@@ -127,7 +128,7 @@ class Drawer:
             self._thread.join()
 
     def add(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
-        """Hand in a frame that is in the journal."""
+        """Add a frame that is in the journal."""
         with self._condition:
             if seq not in self._waiting:
                 self._put(Pending(seq, arrived, sortie, frame))
@@ -135,16 +136,16 @@ class Drawer:
 
     @property
     def area(self) -> Area | None:
-        """Where the map lies, None before the first frame."""
+        """The map's area, None before the first frame."""
         return self._site.area
 
     @property
     def backlog(self) -> int:
-        """Frames that wait in memory; up to a bound, beyond which the journal knows."""
+        """Number of frames that wait in memory, up to a bound; the others are in the journal."""
         return len(self._queue)
 
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until nothing is left to draw; returns whether that is so."""
+        """Wait until nothing is left to draw; False after the time-out."""
         end = time.monotonic() + timeout_s
         with self._condition:
             while len(self._queue) or self._waiting or self._more or self._looking:
@@ -155,7 +156,7 @@ class Drawer:
         return True
 
     def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
-        """Wait until a sortie's frames are drawn, whatever else waits; returns whether that is so."""
+        """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
         query = "SELECT 1 FROM frames WHERE drawn = 0 AND vehicle = ? AND sortie IS ? LIMIT 1"
         while self._journal.one(query, (packed(vehicle), sortie)) is not None:
@@ -195,7 +196,7 @@ class Drawer:
             self._condition.wait(1.0)
 
     def _tell_overload(self) -> None:
-        """Say how many frames are put off, when that has changed; the journal knows."""
+        """Publish the number of frames put off (from the journal) when it has changed."""
         now = time.monotonic()
         if now - self._looked < self._look_s or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
             return
@@ -210,7 +211,7 @@ class Drawer:
 
     @property
     def overload(self) -> str:
-        """What there is to say about frames that are put off; empty if there are none."""
+        """A sentence about frames that are put off; empty if there are none."""
         if not self.put_off:
             return ""
         return (

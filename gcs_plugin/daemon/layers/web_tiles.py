@@ -49,7 +49,7 @@ class TileAddress:
 
     @property
     def pixel_m(self) -> float:
-        """Size of its pixels in web mercator metres (larger than on the ground, but at the equator)."""
+        """Size of its pixels in web mercator metres (larger than on the ground except at the equator)."""
         return 2 * _HALF_WORLD_M / (SIDE << self.z)
 
 
@@ -157,7 +157,7 @@ def encode(tile: Bytes | None, suffix: str) -> bytes:
 
 
 class TileServer:
-    """Encoded tiles with their ETags; recent ones are kept.
+    """Encoded tiles with their ETags; recent ones are cached.
 
     Args:
         layers: by name.
@@ -172,7 +172,7 @@ class TileServer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What can be asked for."""
+        """Names of the layers."""
         return (*self.layers, "best", "basemap")
 
     def etag(self, name: str, tile: TileAddress) -> str:
@@ -186,7 +186,7 @@ class TileServer:
     def tile(self, name: str, tile: TileAddress, suffix: str) -> tuple[bytes, str]:
         """Encoded bytes and their ETag.
 
-        The ETag is taken first: what is drawn while the tile is read gets another one at the next request.
+        The ETag is determined first: changes while the tile is read get another one at the next request.
         """
         etag = self.etag(name, tile)
         key = (etag, suffix)

@@ -1,1 +1,1 @@
-"""What the daemon keeps: journal, picture files, the workspace's lock; and the event bus that tells of changes."""
+"""The daemon's storage: journal, picture files, the workspace's lock; and the event bus for changes."""

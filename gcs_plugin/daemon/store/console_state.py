@@ -1,4 +1,4 @@
-"""What the operator works on, the same for every page: the plan with its settings, and uniquely_named finds."""
+"""The operator's work, shared by all pages: the plan with its settings, and marked finds."""
 
 import threading
 import time
@@ -15,14 +15,14 @@ _MOST_NOTE: Final = 10_000
 
 
 class OutdatedError(OrthoSwarmError):
-    """Another page has changed the plan meanwhile."""
+    """The plan was changed by another page meanwhile."""
 
 
 class ConsoleState:
-    """The plan and the finds, kept in the journal.
+    """The plan and the finds, stored in the journal.
 
     Args:
-        journal: where they are kept. publish: called with an event's kind and fields when they change.
+        journal: stores them. publish: called with an event's kind and fields when they change.
     """
 
     def __init__(self, journal: Journal, publish: Callable[..., None]) -> None:
@@ -35,14 +35,14 @@ class ConsoleState:
         return {"version": 0, **dict.fromkeys(_PLAN_FIELDS), **found}
 
     def put_plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Replace the plan; gives it with its new version.
+        """Replace the plan; returns it with its new version.
 
         Args:
-            body: the fields of `plan`; `version` is the one that was changed, left out to replace any.
+            body: the fields of `plan`; `version` is the version that was edited; without it any version is replaced.
 
         Raises:
-            InputError: a field is not what it should be.
-            OutdatedError: the plan has another version by now.
+            InputError: a field is invalid.
+            OutdatedError: the plan has another version now.
         """
         for key in ("area", "settings", "vehicles"):
             if not isinstance(body.get(key), dict | None):
@@ -63,10 +63,10 @@ class ConsoleState:
         return list((self._journal.fact("finds") or {"rows": []})["rows"])
 
     def add_find(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Mark a find; gives it with its id.
+        """Add a find; returns it with its id.
 
         Raises:
-            InputError: a field is not what it should be, or there are too many.
+            InputError: a field is invalid, or there are too many finds.
         """
         row = {
             "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
@@ -85,7 +85,7 @@ class ConsoleState:
         return row
 
     def delete_find(self, number: int) -> bool:
-        """Delete a find; False if there is no such."""
+        """Delete a find; False if it does not exist."""
         with self._lock:
             found = self._journal.fact("finds") or {"next": 1, "rows": []}
             rows = [row for row in found["rows"] if row["id"] != number]

@@ -1,4 +1,4 @@
-"""News from the daemon to whoever listens: from any thread, without waiting for slow listeners."""
+"""Events from the daemon to listeners: published from any thread, without waiting for slow listeners."""
 
 import asyncio
 import contextlib
@@ -10,7 +10,10 @@ _KEPT: Final = 2000
 
 
 class Subscription:
-    """One listener's queue: when it falls far behind, the oldest news go and it is told to look at everything anew."""
+    """One listener's queue.
+
+    If it falls far behind, the oldest events are dropped and it is told to reload everything.
+    """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._bell = loop, asyncio.Event()
@@ -18,15 +21,15 @@ class Subscription:
         self._missed = False
 
     def put(self, event: dict[str, Any]) -> None:
-        """Hand in news; any thread."""
+        """Add an event; any thread."""
         if len(self._waiting) == _KEPT:
             self._missed = True
         self._waiting.append(event)
-        with contextlib.suppress(RuntimeError):  # the loop has ended
+        with contextlib.suppress(RuntimeError):  # the event loop has ended
             self._loop.call_soon_threadsafe(self._bell.set)
 
     async def get(self) -> list[dict[str, Any]]:
-        """All news since the last call; waits for some."""
+        """All events since the last call; waits for at least one."""
         while not self._waiting:
             self._bell.clear()
             if not self._waiting:
@@ -42,27 +45,27 @@ class Subscription:
 
 
 class Events:
-    """Hands news to all listeners."""
+    """Passes events to all listeners."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._listeners: set[Subscription] = set()
 
     def publish(self, kind: str, /, **fields: Any) -> None:
-        """ReportProgress all listeners; any thread."""
+        """Pass an event to all listeners; any thread."""
         with self._lock:
             listeners = list(self._listeners)
         for listener in listeners:
             listener.put({"type": kind, **fields})
 
     def subscribe(self) -> Subscription:
-        """Begin to listen, in the running loop."""
+        """Start listening, in the running event loop."""
         subscription = Subscription(asyncio.get_running_loop())
         with self._lock:
             self._listeners.add(subscription)
         return subscription
 
     def unsubscribe(self, subscription: Subscription) -> None:
-        """Listen no more."""
+        """Stop listening."""
         with self._lock:
             self._listeners.discard(subscription)

@@ -1,8 +1,8 @@
-"""The daemon's memory: SQLite with a write-ahead log, written by one thread that commits many changes at once.
+"""The daemon's journal: SQLite with a write-ahead log, written by one thread that commits many changes at once.
 
-What `write` has returned from (or its future resolved) is on the disk: a commit is followed by fsync, and one fsync
-serves all changes that waited meanwhile. Texts from outside (names of vehicles and pictures) are kept as JSON in
-ASCII, so that any characters, NUL and lone surrogates included, come back as they came.
+When `write` returns (or its future resolves), the change is on the disk: a commit is followed by fsync, and one fsync
+serves all changes that waited meanwhile. Texts from outside (names of vehicles and pictures) are stored as JSON in
+ASCII, so that all characters, NUL and lone surrogates included, are preserved.
 """
 
 import contextlib
@@ -64,23 +64,23 @@ def packed(text: str) -> str:
 
 
 def unpacked(text: str) -> str:
-    """The text that `packed` took."""
+    """The text that was `packed`."""
     return str(json.loads(text))
 
 
 def _write_error(error: Exception) -> StorageError:
-    """Why a commit failed, as our own error."""
+    """The reason of a failed commit, as our own error."""
     if isinstance(error, sqlite3.Error) and getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
         return DiskFullError("the disk is full, the journal cannot be written; free some space")
     return StorageError(f"the journal cannot be written ({error}); check the workspace's disk")
 
 
 class Journal:
-    """Everything that must survive a crash, but for pictures and map tiles.
+    """Everything that must survive a crash, except pictures and map tiles.
 
     Attributes:
         path: the database file; made if absent.
-        commits: how many commits there were.
+        commits: number of commits.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,7 +105,7 @@ class Journal:
         self._thread.start()
 
     def close(self) -> None:
-        """Write what is waiting and let go of the file."""
+        """Write the waiting changes and close the file."""
         self._work.put(None)
         self._thread.join()
         with self._guard:
@@ -118,7 +118,7 @@ class Journal:
     # -- writing --------------------------------------------------------------------------------------------------
 
     def submit(self, change: Callable[[sqlite3.Connection], Result]) -> "Future[Result]":
-        """Have a change made; the future's result is the change's, once it is safe on the disk.
+        """Queue a change; the future has the change's result once it is safe on the disk.
 
         A change that raises is undone by itself; others of its batch stay. A full disk fails the whole batch.
         """
@@ -127,7 +127,7 @@ class Journal:
         return future
 
     def write(self, change: Callable[[sqlite3.Connection], Result]) -> Result:
-        """Make a change and wait until it is safe."""
+        """Make a change and wait until it is safe on the disk."""
         return self.submit(change).result()
 
     def _run(self) -> None:
@@ -163,7 +163,7 @@ class Journal:
                 self._writer.execute("RELEASE change")
             self._writer.execute("COMMIT")
             self.commits += 1
-        except Exception as error:  # the disk is full or gone: nothing of this batch has happened
+        except Exception as error:  # the disk is full or missing: nothing of this batch was written
             with contextlib.suppress(sqlite3.Error):
                 self._writer.execute("ROLLBACK")
             reason = _write_error(error)
@@ -204,17 +204,17 @@ class Journal:
     # -- small facts ----------------------------------------------------------------------------------------------
 
     def fact(self, key: str) -> Any:
-        """A remembered JSON value, None if there is none."""
+        """A stored JSON value, None if there is none."""
         row = self.one("SELECT value FROM meta WHERE key = ?", (key,))
         return None if row is None else json.loads(row["value"])
 
     def remember(self, key: str, value: Any) -> None:
-        """Remember a JSON value."""
+        """Store a JSON value."""
         self.write(fact_change(key, value))
 
 
 def fact_change(key: str, value: Any) -> Change:
-    """The change that remembers a JSON value, to be made together with others."""
+    """The change that stores a JSON value, to be combined with others."""
     text = json.dumps(value)
 
     def change(db: sqlite3.Connection) -> None:
@@ -235,7 +235,10 @@ def add_frame(
     size: tuple[int, int],
     pose: Mapping[str, Any],
 ) -> Callable[[sqlite3.Connection], tuple[int, bool]]:
-    """The change that enters a frame into the vehicle's present sortie; gives its number and whether it is new."""
+    """The change that adds a frame to the vehicle's present sortie.
+
+    Its result is the frame's number and whether it is new.
+    """
     name, arrived = packed(vehicle), time.time()
     row = (key, name, packed(image), time_s, arrived, path, size[0], size[1], json.dumps(pose), name)
 
@@ -255,11 +258,11 @@ def add_frame(
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """What became of a frame in real time.
+    """The result of drawing a frame in real time.
 
     Attributes:
         seq: its number. reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
-        thumbnail: bytes of uint8 (12, 16, 3), by which gains are evened out; None for a picture that was not read.
+        thumbnail: bytes of uint8 (12, 16, 3), for balancing gains; None for a picture that was not read.
         quality: its sharpness and damage, None for a picture that was not read or is too small.
     """
 
@@ -281,13 +284,13 @@ SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sorti
 
 
 def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0) -> int:
-    """How many frames of a sortie its last refinement, other than a job's, has not seen; 0 while it is flown."""
+    """Number of frames of a sortie that its last refinement (other than the job's) did not use; 0 while it is flown."""
     row = journal.rows(_LATE, {"vehicle": packed(vehicle), "sortie": sortie, "job": job})[0]
     return int(row["late"])
 
 
 def frames_drawn(results: Iterable[Drawn]) -> Change:
-    """The change that notes frames as drawn in real time; those that were refined meanwhile stay so."""
+    """The change that records frames as drawn in real time; frames refined meanwhile are left unchanged."""
     done = list(results)
     rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
     thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]

@@ -1,4 +1,4 @@
-"""Pictures on disk: a file each, named by a hash of vehicle and picture, whole and synced before anybody is told."""
+"""Pictures on disk: one file each, named by a hash of vehicle and picture; stored completely and synced."""
 
 import contextlib
 import hashlib
@@ -17,7 +17,7 @@ _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several 
 
 def frame_key(vehicle: str, image: str) -> bytes:
     """The 32 bytes that stand for a picture of a vehicle; equal only for equal names."""
-    text = json.dumps([vehicle, image])  # ASCII whatever the names hold, and no two pairs alike
+    text = json.dumps([vehicle, image])  # ASCII for all names, and unique for each pair
     return hashlib.sha256(text.encode()).digest()
 
 
@@ -47,14 +47,14 @@ class PictureStore:
             folder.mkdir(parents=True, exist_ok=True)
             for number in range(256):
                 (folder / f"{number:02x}").mkdir(exist_ok=True)
-                for part in (folder / f"{number:02x}").glob("*.part"):  # of a daemon that was killed
+                for part in (folder / f"{number:02x}").glob("*.part"):  # left by a killed daemon
                     part.unlink()
             _sync_folder(folder)
         except OSError as error:
             raise disk_error(error, folder) from None
 
     def path(self, name: str) -> Path:
-        """The file of a name that `put` has given."""
+        """The file of a name returned by `put`."""
         return self.folder / name
 
     def put(self, key: bytes, suffix: str, data: bytes) -> str:
@@ -86,7 +86,7 @@ class PictureStore:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a folder's new names last through a power cut, where the system can."""
+    """Sync a folder's new names against power cuts, where the system supports it."""
     if os.name == "nt":
         return
     descriptor = os.open(folder, os.O_RDONLY)

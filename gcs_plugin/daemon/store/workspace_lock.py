@@ -1,4 +1,4 @@
-"""The ground the daemon stands on: its workspace's lock, the disk's room, this start of the machine, the basemap."""
+"""Checks at the daemon's start: the workspace's lock, disk space, power cuts, the basemap."""
 
 import contextlib
 import json
@@ -21,9 +21,9 @@ _log = logging.getLogger(__name__)
 
 
 def take_over(workspace: Path) -> Workspace:
-    """The workspace's lock; one that a dying daemon still holds is waited for.
+    """Take the workspace's lock, waiting for a daemon that is just ending.
 
-    The folder becomes its owner's alone: it holds the token, pictures, and positions.
+    The folder becomes accessible to its owner only, as it contains the token, pictures, and positions.
 
     Raises:
         InputError: another daemon holds it.
@@ -32,7 +32,7 @@ def take_over(workspace: Path) -> Workspace:
     while True:
         try:
             lock = Workspace(workspace)
-            with contextlib.suppress(OSError):  # another's folder, or a file system without rights
+            with contextlib.suppress(OSError):  # another user's folder, or a file system without permissions
                 workspace.chmod(0o700)
             return lock
         except InputError:
@@ -42,7 +42,7 @@ def take_over(workspace: Path) -> Workspace:
 
 
 def require_space(workspace: Path, size: int) -> None:
-    """Refuse what would fill the disk, while there is room to say so.
+    """Refuse to fill the disk, while there is still room for the journal.
 
     Raises:
         StorageError: there is too little room.
@@ -56,9 +56,9 @@ def require_space(workspace: Path, size: int) -> None:
 
 
 def distrust_after_power_cut(journal: Journal) -> bool:
-    """After the machine went down without the daemon, draw the real-time layer again: its last pixels may be lost.
+    """After a power cut, have the real-time layer drawn again, as its last pixels may be lost.
 
-    Pictures and journal are synced before they are acknowledged, kept sorties before they are published; canvases are
+    Pictures and journal are synced before they are acknowledged, solution files before they are published; canvases are
     not, for speed.
 
     Returns:
@@ -81,7 +81,7 @@ def distrust_after_power_cut(journal: Journal) -> bool:
 
 
 def _boot_id() -> str:
-    """What tells this start of the machine from the next."""
+    """Identifies this boot of the machine."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -89,7 +89,7 @@ def _boot_id() -> str:
 
 
 def open_basemap(path: Path) -> Basemap | None:
-    """The basemap on the grid of its own middle, to be shown before there is an area; None where that is not known.
+    """The basemap on the UTM grid of its own centre, for display before there is an area; None if that is unknown.
 
     Raises:
         InputError: it cannot be read, or lies nowhere.
@@ -110,5 +110,5 @@ def open_basemap(path: Path) -> Basemap | None:
     except RasterioError as error:
         raise InputError(f"the basemap {path.name} cannot be read ({error}); check the file") from None
     basemap = Basemap.open(path, utm_epsg(0.5 * (south + north), 0.5 * (west + east)))
-    basemap.require_readable(basemap.bounds)  # now, and not when the first vehicle completes
+    basemap.require_readable(basemap.bounds)  # check it now, not when the first vehicle completes
     return basemap
