@@ -143,6 +143,7 @@ class Daemon:
             area=lambda: self.drawer.area,
             vehicles=self.vehicles,
             facts=self._facts,
+            cells=lambda: self.coverage.png,
         )
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,

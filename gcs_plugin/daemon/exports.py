@@ -29,6 +29,7 @@ class Exports:
         settings: of the daemon. journal, store, layers, console: the workspace's.
         workers: write the files. area: returns the map's area, None before the first picture.
         vehicles: returns the rows of /api/vehicles. facts: returns the daemon's facts for the report.
+        cells: returns the picture of the coverage's cells (PNG), empty without an area.
     """
 
     def __init__(
@@ -42,10 +43,11 @@ class Exports:
         area: Callable[[], Area | None],
         vehicles: Callable[[], list[dict[str, Any]]],
         facts: Callable[[], dict[str, Any]],
+        cells: Callable[[], bytes],
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
         self._layers, self._console, self._workers = layers, console, workers
-        self._area, self._vehicles, self._facts = area, vehicles, facts
+        self._area, self._vehicles, self._facts, self._cells = area, vehicles, facts, cells
 
     def write(self, job: Job, tell: Callable[[float, str], None]) -> Change:
         """The handler of an `export` job.
@@ -65,7 +67,8 @@ class Exports:
                 find | {"pictures": [row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])]}
                 for find in self._console.finds()
             ]
-            task = replace(task, facts=self._facts(), places=tuple(self._places(shown)))
+            places = tuple(self._places(shown))
+            task = replace(task, facts=self._facts(), places=places, cells=self._cells())
             job.detail["files"] = self._workers.run(write_products, task)
         return lambda db: None
 

@@ -1,5 +1,6 @@
 """report.html: the state of the map in words, its pictures, and the numbers behind them."""
 
+import base64
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -65,6 +66,7 @@ def write_page(
     placed: Sequence[PlacedFrame],
     rejected: Sequence[Rejection],
     basemap: Basemap | None,
+    cells: bytes = b"",
 ) -> dict[str, float | int] | None:
     """Write report.html beside the products.
 
@@ -74,6 +76,7 @@ def write_page(
         placed: the frames as last placed.
         rejected: the pictures that were left out.
         basemap: the map, if there is one.
+        cells: picture of the cells of the coverage (PNG), empty without one.
 
     Returns:
         How far blocks of the orthoimage lie from the map: `median` and `p95` in metres, `blocks` that were found. The
@@ -94,6 +97,7 @@ def write_page(
         "version": __version__,
         "name": out.resolve().name,
         "rejected": rejected,
+        "cells": f"data:image/png;base64,{base64.b64encode(cells).decode('ascii')}" if cells else "",
     }
     shifts = None
     if best is not None:

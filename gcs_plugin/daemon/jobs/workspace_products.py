@@ -38,6 +38,7 @@ class ExportTask:
         frames: all frames with their stages. reasons: (vehicle, image) -> why it was left out, and stages likewise.
         coarse, solutions: solution files of sorties placed in flight only, and of refined ones.
         basemap: the map, or None. fov_rad: theta-hat. facts: for the report. places: finds and vehicles.
+        cells: picture of the coverage's cells (PNG), empty without an area.
     """
 
     workspace: Path
@@ -53,6 +54,7 @@ class ExportTask:
     fov_rad: float | None
     facts: dict[str, Any] = field(default_factory=dict)
     places: tuple[Place, ...] = ()
+    cells: bytes = b""
 
 
 def write_products(task: ExportTask) -> dict[str, str]:
@@ -81,7 +83,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
-    report["against_map_m"] = write_page(out, report, placed, rejected, basemap)
+    report["against_map_m"] = write_page(out, report, placed, rejected, basemap, task.cells)
     write_json(out / "report.json", report)
     place_files.write_geojson(task.places, out / place_files.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}

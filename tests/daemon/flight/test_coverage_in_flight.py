@@ -1,6 +1,8 @@
 """The coverage of the planned area while pictures come: shares, gaps with causes, and what survives a restart."""
 
+import base64
 import io
+import re
 from pathlib import Path
 
 import cv2
@@ -104,11 +106,24 @@ def test_flown_legs_are_seen_and_others_planned_and_a_hole_is_told_with_its_caus
         cells = Image.open(io.BytesIO(served.get("/api/coverage/cells.png").content))
         counts = np.bincount(np.asarray(cells).ravel(), minlength=6)
         assert counts[2] / counts[1:5].sum() == pytest.approx(done["seen_share"], abs=1e-3)
+        _is_in_the_report(served, tmp_path / "w", done)
     with serving(tmp_path / "w") as served:
         again = _told(served, len(first) + len(second))
         assert [again[k] for k in ("seen_share", "poor_share", "missed_share")] == pytest.approx(
             [done[k] for k in ("seen_share", "poor_share", "missed_share")]
         )
+
+
+def _is_in_the_report(served: Served, workspace: Path, coverage: dict) -> None:
+    """report.html shows the cells as a picture, and the shares."""
+    job = served.command("/api/export", {"formats": ["cog"]}).json()
+    served.until("/api/jobs", lambda rows: any(r["id"] == job["id"] and r["state"] == "done" for r in rows))
+    page = (workspace / "report.html").read_text()
+    found = re.search(r'class="cells" src="data:image/png;base64,([^"]+)"', page)
+    assert found is not None and f"{100 * coverage['seen_share']:.2f} %" in page
+    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(found[1]))))
+    cells = Image.open(io.BytesIO(served.get("/api/coverage/cells.png").content))
+    assert np.array_equal(shown, np.asarray(cells))
 
 
 def test_a_blurred_picture_is_seen_poorly(served: Served) -> None:
