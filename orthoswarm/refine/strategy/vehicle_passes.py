@@ -174,19 +174,15 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
         flight: its adjustment is changed. surface: what is known of the ground before, None for level ground.
     """
     surface = surface or GroundModel()
-    begun, config = flight.adjustment.copy(), active().strategy
-    found = _relative(flight, surface, config.schedule)
-    if focal_length_ran_away(flight):
-        # Wrong tracks with large residuals have full weight in the first steps of the wide schedule.
-        flight.adjustment = begun.copy()
-        found = _relative(flight, surface, config.near_schedule)
-    if focal_length_ran_away(flight):
-        flight.adjustment = begun.copy()
+    begun = flight.adjustment.copy()
+    found = _relative(flight, surface)
+    if focal_length_ran_away(flight):  # begin again with the focal length by optical flow as its prior
+        flight.adjustment = begun
         p = flight.adjustment.priors
         sigma = p.lens_sigma.copy()
         sigma[:, 0] = flight.calibration.focal_sigma
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
-        found = _relative(flight, surface, config.near_schedule)
+        found = _relative(flight, surface)
     return _without_wrong_heights(flight, found)
 
 
@@ -205,8 +201,8 @@ def focal_length_ran_away(flight: Flight) -> bool:
     return away > max(config.runaway_share, config.runaway_sigmas * flow.focal_sigma)
 
 
-def _relative(flight: Flight, surface: GroundModel, schedule: Sequence[float]) -> GroundModel:
-    config, schedule = active().strategy, list(schedule)
+def _relative(flight: Flight, surface: GroundModel) -> GroundModel:
+    config, schedule = active().strategy, list(active().strategy.schedule)
     wide = config.first_ground_sigma_m, config.first_ground_robust_c
     narrow = config.ground_sigma_m, config.ground_robust_c
     for k, c in enumerate(schedule):
