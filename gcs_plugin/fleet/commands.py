@@ -1,4 +1,4 @@
-"""What a person tells vehicles to do, as a value: one id, one expiry, one outcome, the same for every console."""
+"""The operator's commands to vehicles as values with an id, an expiry and an outcome, for every console."""
 
 import itertools
 import os
@@ -19,7 +19,7 @@ _numbers = itertools.count(1)
 
 
 def new_id() -> str:
-    """An id that no other command of this or another station has."""
+    """A unique command id."""
     return f"{os.getpid():x}-{os.urandom(3).hex()}-{next(_numbers)}"
 
 
@@ -32,8 +32,8 @@ class CommandResult:
         vehicle: its name: v1, or as the operator calls it.
         command: `start`, `pause`, `resume`, `rtl`, `land`, or `upload`.
         outcome: DONE: the vehicle acknowledged it. REFUSED: it or the station said no. NOT_SENT: nothing left the
-            station. UNKNOWN: it was sent and not answered.
-        reason: one sentence; where it was not done it says why, and what to do.
+            station. UNKNOWN: it was sent but not answered.
+        reason: one sentence; if not done, the reason and what to do.
     """
 
     id: str
@@ -58,7 +58,7 @@ class Order:
         verb: what to do. system: the vehicle.
         given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND_S after that.
         id: of the command.
-        exchange: the dialogue with the vehicle, None where it did not come to one.
+        exchange: the dialogue with the vehicle, None if none was started.
     """
 
     verb: Verb
@@ -70,7 +70,7 @@ class Order:
 
     @property
     def expires_s(self) -> float:
-        """When it may no longer be sent."""
+        """Time after which it may not be sent."""
         return self.given_s + COMMAND_S
 
     @property

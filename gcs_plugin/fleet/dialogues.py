@@ -1,4 +1,4 @@
-"""The dialogues with vehicles that are under way: they are driven here, and what they show is remembered."""
+"""Runs the active dialogues with vehicles and records their results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ class Dialogues:
 
     @property
     def deadline(self) -> float:
-        """When the next of them wants to be driven."""
+        """The earliest deadline of all dialogues."""
         return min((job.deadline for job in self.jobs), default=NEVER)
 
     def begin(self, job: "Exchange") -> None:
@@ -49,25 +49,25 @@ class Dialogues:
         self._reap()
 
     def busy(self, system: int) -> bool:
-        """True while one with this vehicle is under way."""
+        """True while a dialogue with this vehicle is active."""
         return any(job.vehicle.system == system for job in self.jobs)
 
     def make_way(self, system: int) -> None:
-        """End a command under way for one that comes after it (an upload may go on)."""
+        """End an active command for a newer one (an upload may continue)."""
         for job in self.jobs:
             if job.vehicle.system == system and not isinstance(job, (MissionUpload, MissionDownload)):
                 job.cancel("another command came in between")
         self._reap()
 
     def tick(self, now: float) -> None:
-        """Let time pass."""
+        """Process the passing of time."""
         for job in list(self.jobs):
             if now >= job.deadline:
                 self._drive(job, job.tick(now))
         self._reap()
 
     def feed(self, vehicle: "Vehicle", message: "Message", now: float) -> None:
-        """Hand a message of a vehicle's autopilot to the dialogues with it."""
+        """Pass a message of a vehicle's autopilot to its dialogues."""
         if not self.jobs:
             return
         for job in list(self.jobs):
@@ -76,7 +76,7 @@ class Dialogues:
         self._reap()
 
     def rebooted(self, vehicle: "Vehicle", now: float) -> None:
-        """A vehicle has started anew."""
+        """A vehicle has rebooted."""
         for job in list(self.jobs):
             if job.vehicle == vehicle.address and job.outcome is None:
                 self._drive(job, job.rebooted(now))
@@ -84,12 +84,12 @@ class Dialogues:
     def send(
         self, system: int, messages: "Sequence[Message]", *, everywhere: bool = False, expires: float = NEVER
     ) -> bool:
-        """Send to a vehicle; whether a link took it.
+        """Send to a vehicle; returns whether a link accepted it.
 
         Args:
             system: the vehicle. messages: what to send.
-            everywhere: on every way on which it was heard lately, not only on the best.
-            expires: when a message that still waits for its line is thrown away.
+            everywhere: on every route on which it was heard recently, not only on the best.
+            expires: time after which a waiting message is dropped.
         """
         vehicle = self._vehicles.get(system)
         if vehicle is None or not messages:
@@ -101,9 +101,9 @@ class Dialogues:
         return taken
 
     def _drive(self, job: "Exchange", messages: "Sequence[Message]") -> None:
-        """Send what a dialogue wants sent, and let it know what a link took.
+        """Send a dialogue's messages, and report to it which ones a link accepted.
 
-        A command that is repeated, and any to a vehicle that is lost or has several claimants, goes on every way.
+        Repeated commands, and commands to a vehicle that is lost or has several claimants, are sent on every route.
         """
         for message in messages:
             vehicle = self._vehicles[job.vehicle.system]
@@ -114,7 +114,7 @@ class Dialogues:
                 job.took()
 
     def _reap(self) -> None:
-        """Take out the dialogues that have ended, and remember what they have shown."""
+        """Remove finished dialogues and record their results."""
         for job in self.jobs:
             self._note_mission(job)
             self._explain(job)
@@ -122,7 +122,7 @@ class Dialogues:
             self.jobs = [job for job in self.jobs if job.outcome is None]
 
     def _explain(self, job: "Exchange") -> None:
-        """A vehicle that signs does not hear a station without its key."""
+        """Explain a silence: a signing vehicle ignores a station without its key."""
         outcome, vehicle = job.outcome, self._vehicles.get(job.vehicle.system)
         if outcome is None or outcome.verdict is not Verdict.UNKNOWN or vehicle is None:
             return

@@ -1,7 +1,7 @@
-"""The vehicles on the links: finding, losing, routing by system id, streams, dialogues, the completion of missions.
+"""The vehicles on the links: discovery, loss, routing by system id, streams, dialogues, completion of missions.
 
-One thread polls it (`poll`, or `run` until `stop` is set); other threads hand in work with `call`. Nothing that a
-vehicle could act on is sent unless somebody asked for it: the fleet by itself sends its heartbeat, which announces a
+One thread polls it (`poll`, or `run` until `stop` is set); other threads submit work with `call`. Nothing that a
+vehicle could act on is sent without a request: the fleet by itself sends its heartbeat, which announces a
 ground station, and asks for streams.
 """
 
@@ -35,7 +35,7 @@ Dialogue = TypeVar("Dialogue", bound=Exchange)
 
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
-_SURE_S: Final = 2.5  # older news of a vehicle are not believed against a command that ends its flight
+_SURE_S: Final = 2.5  # an older state of a vehicle does not override a command that ends its flight
 
 
 class Fleet:
@@ -45,7 +45,7 @@ class Fleet:
         vehicles: by system id, lost ones included.
         own: our address.
         hub: the links. signed: whether it has a key.
-        separation: watches how near vehicles in the air come.
+        separation: watches the distances of vehicles in the air.
     """
 
     def __init__(
@@ -64,12 +64,13 @@ class Fleet:
 
         Args:
             links: links or their addresses (`links.parse_link`).
-            own: our address; another one than that of a ground station beside us.
-            rates: what vehicles are asked to send; 10 Hz of position and attitude unless said.
-            key: signing key; with it only signed packets are believed.
+            own: our address; different from that of another ground station.
+            rates: message rates to request; by default 10 Hz of position and attitude.
+            key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            remembered: what `memory` said before a restart of this program, so that no completion is missed or doubled.
-            clock: seconds that never go back.
+            remembered: result of `memory` before a restart of this program, so that no completion is missed or
+            repeated.
+            clock: monotonic seconds.
             wall: UTC epoch seconds.
 
         Raises:
@@ -136,7 +137,7 @@ class Fleet:
 
         A command is sent only while it is fresh (COMMAND_S after it was given). Pause, RTL and land are never held
         back for doubts about identity or link: with several claimants of one system id they go to all of them, and
-        to a lost vehicle on every way on which it was heard.
+        to a lost vehicle on every route on which it was heard.
         """
         now = self._clock()
         if now > order.expires_s:
@@ -152,7 +153,7 @@ class Fleet:
         return order
 
     def send(self, system: int, messages: Sequence[Message]) -> None:
-        """Send messages that no answer is waited for; in the polling thread. An unknown vehicle gets none."""
+        """Send messages without waiting for answers; in the polling thread. Nothing is sent to an unknown vehicle."""
         self._dialogues.send(system, messages)
 
     def vehicle(self, system: int) -> Vehicle:
@@ -193,27 +194,27 @@ class Fleet:
         return self.begin(MissionDownload(self._free(system).address, self.own))
 
     def start(self, system: int) -> Exchange:
-        """Let a vehicle fly its mission from the beginning: check, mode, arm, MISSION_START."""
+        """Start a vehicle's mission from the beginning: check, mode, arm, MISSION_START."""
         return self._now("start", system)
 
     def pause(self, system: int) -> Exchange:
-        """Let a vehicle stay where it is."""
+        """Make a vehicle hold its position."""
         return self._now("pause", system)
 
     def resume(self, system: int) -> Exchange:
-        """Let a vehicle go on with its mission."""
+        """Make a vehicle continue its mission."""
         return self._now("resume", system)
 
     def rtl(self, system: int) -> Exchange:
-        """Let a vehicle fly home and land."""
+        """Make a vehicle fly home and land."""
         return self._now("rtl", system)
 
     def land(self, system: int) -> Exchange:
-        """Let a vehicle land where it is."""
+        """Make a vehicle land at its position."""
         return self._now("land", system)
 
     def memory(self) -> dict[int, dict[str, Any]]:
-        """Where each vehicle's mission stands, as JSON values by system id; for `remembered` after a restart."""
+        """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
         return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
 
     def busy(self, system: int) -> bool:
@@ -233,7 +234,7 @@ class Fleet:
         return vehicle
 
     def _now(self, verb: Verb, system: int) -> Exchange:
-        """A command that is given at this moment.
+        """A command given now.
 
         Raises:
             OrthoSwarmError: it cannot be given.
@@ -243,7 +244,7 @@ class Fleet:
         return self.begin(exchange)
 
     def _dialogue(self, verb: Verb, system: int) -> Exchange:
-        """What a command comes to, not begun yet.
+        """The dialogue for a command, not started yet.
 
         Raises:
             OrthoSwarmError: it cannot be given.
@@ -273,7 +274,7 @@ class Fleet:
     # --- the loop ---
 
     def poll(self, timeout_s: float = 0.1) -> None:
-        """Wait at most so long for input, handle all there is, and do what time asks for."""
+        """Wait for input until the time-out, process all of it, and do what is due."""
         self.hub.poll(min(timeout_s, min(self._tick_at, self._dialogues.deadline) - self._clock()))
         now = self._clock()
         self._dialogues.tick(now)
@@ -282,7 +283,7 @@ class Fleet:
             self._reception.tick(now)
 
     def run(self, stop: threading.Event) -> None:
-        """Poll until `stop` is set. Input is taken in small batches, which saves most of the waking up."""
+        """Poll until `stop` is set. Input is read in small batches, which avoids most wake-ups."""
         self._thread = threading.get_ident()
         while not stop.is_set():
             self.poll(0.5)
@@ -291,7 +292,7 @@ class Fleet:
         self._thread = None
 
     def run_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
-        """Poll until something is so, or for so long; returns whether it is."""
+        """Poll until a condition holds or the time-out; returns whether it holds."""
         end = self._clock() + timeout_s
         while not done():
             left = end - self._clock()
@@ -301,13 +302,13 @@ class Fleet:
         return True
 
     def call(self, work: Callable[[], Result]) -> "Future[Result]":
-        """Have the polling thread do something; from any thread."""
+        """Run a function in the polling thread; from any thread."""
         future: Future[Result] = Future()
 
         def do() -> None:
             try:
                 future.set_result(work())
-            except BaseException as error:  # handed to whoever asked
+            except BaseException as error:  # passed to the caller
                 future.set_exception(error)
 
         if self._thread == threading.get_ident():

@@ -1,4 +1,4 @@
-"""What a vehicle is doing, in one word, from its mode, speed, height and mission together, for both autopilots."""
+"""The flight state of a vehicle in one word, from its mode, speed, height and mission, for both autopilots."""
 
 import enum
 import math
@@ -24,7 +24,7 @@ _TIMED: Final = frozenset({DELAY, LOITER_UNLIM, int(dialect.MAV_CMD_NAV_LOITER_T
 
 
 class Word(enum.Enum):
-    """What a vehicle is doing. FLYING: in the air without a mission; HOLDING: in the air after its mission's end."""
+    """Flight states. FLYING: in the air without a mission; HOLDING: in the air after its mission's end."""
 
     ON_GROUND = "on ground"
     TAKING_OFF = "taking off"
@@ -40,11 +40,11 @@ class Word(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class FlightState:
-    """What a vehicle is doing.
+    """The flight state of a vehicle.
 
     Attributes:
-        word: in a word.
-        item: the mission item that it is at, counted from 1. items: of so many; 0 where neither is known.
+        word: the state.
+        item: the current mission item, from 1. items: their number; both 0 if unknown.
     """
 
     word: Word
@@ -63,7 +63,7 @@ class FlightState:
 
 
 class Observed(Protocol):
-    """What has to be known of a vehicle; see vehicle_state.Vehicle."""
+    """The needed state of a vehicle; see vehicle_state.Vehicle."""
 
     autopilot: Autopilot
     modes: Modes
@@ -89,11 +89,11 @@ class Observed(Protocol):
 
     @property
     def still_s(self) -> float:
-        """How long it has stood still."""
+        """For how long it has been stationary, seconds."""
 
 
 def flight_state(vehicle: Observed) -> FlightState:
-    """What a vehicle is doing, as far as its messages tell."""
+    """The flight state of a vehicle, as far as its messages show."""
     items = vehicle.mission_total
     first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
     return FlightState(_word(vehicle), min(vehicle.mission_seq + first, items), items)

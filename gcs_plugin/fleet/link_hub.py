@@ -1,4 +1,4 @@
-"""All links together: packets in with where they came from, messages out to there; signing, log, heartbeats.
+"""All links together: packets in with their senders, messages out; signing, log, heartbeats.
 
 A hub knows links, not vehicles: `gcs_plugin.fleet` does. It is polled by one thread.
 """
@@ -27,7 +27,7 @@ _BEAT_S: Final = 1.0
 
 @dataclass(slots=True, eq=False)
 class Side:
-    """One link and what is remembered about it."""
+    """One link and its state."""
 
     link: Link
     packer: Any
@@ -64,9 +64,9 @@ class Hub:
             links: links or their addresses.
             own: our address.
             sink: called with the link's side, the peer, the packet, the clock's time and UTC seconds of its arrival.
-            key: signing key; with it only signed packets are believed.
+            key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            clock: seconds that never go back.
+            clock: monotonic seconds.
             wall: UTC epoch seconds.
         """
         self.own, self._sink, self._clock, self._wall = own, sink, clock, wall
@@ -93,12 +93,12 @@ class Hub:
 
     @property
     def rejected(self) -> int:
-        """Packets that were not believed for want of a good signature."""
+        """Number of packets rejected for their signature."""
         return sum(side.signing.rejected for side in self.sides if side.signing)
 
     @property
     def deadline(self) -> float:
-        """When it wants to be polled at the latest."""
+        """Latest time for the next poll."""
         return self._beat_at
 
     def close(self) -> None:
@@ -112,7 +112,7 @@ class Hub:
         self._ear.close()
 
     def poll(self, timeout_s: float) -> None:
-        """Wait at most so long for input and hand all there is to the sink; send heartbeats."""
+        """Wait for input until the time-out and pass all of it to the sink; send heartbeats."""
         wait = max(0.0, min(timeout_s, self._beat_at - self._clock()))
         polled = [side for side in self.sides if side.link.polled is not None]
         for key, events in self._selector.select(min(wait, 0.01) if polled else wait):
@@ -131,16 +131,16 @@ class Hub:
             self._beat(now)
 
     def post(self, work: Callable[[], None]) -> None:
-        """Have the polling thread do something soon; from any thread."""
+        """Run a function soon in the polling thread; from any thread."""
         self._work.put(work)
         with contextlib.suppress(BlockingIOError):  # full: the polling thread has been woken often enough
             self._bell.send(b"!")
 
     def send(self, side: Side, peer: Peer, message: Message, expires: float = NEVER) -> bool:
-        """Send a message to a peer; one that still waits when it expires (monotonic seconds) is thrown away.
+        """Send a message to a peer; one still waiting at `expires` (monotonic seconds) is dropped.
 
         Returns:
-            Whether the link took it.
+            Whether the link accepted it.
         """
         packer, utc = side.packer, self._wall()
         if side.signing is not None:
@@ -163,7 +163,7 @@ class Hub:
             peers[peer] = now
             for packet in framer.feed(data):
                 if packet.system == own.system and packet.component == own.component:
-                    continue  # our own words, sent back by a router
+                    continue  # our own packets, sent back by a router
                 if signing is not None and not signing.accept(packet, utc):
                     continue
                 if self._tlog is not None:
@@ -190,7 +190,7 @@ class Hub:
 
 
 def _make_links(links: Iterable[Link | str]) -> list[Link]:
-    """Links of their addresses; all are closed again if one of them is wrong."""
+    """Make links from addresses; all are closed again if one is wrong."""
     made: list[Link] = []
     try:
         for link in links:

@@ -1,4 +1,4 @@
-"""The messages that a vehicle is asked to send, and asked again when they stop.
+"""Requests messages of a vehicle, again if they stop.
 
 Each message is asked for by MAV_CMD_SET_MESSAGE_INTERVAL: ArduPilot sends nothing without it, PX4 sends 50 Hz of
 everything. Acknowledgements do not say which message they are about, so one is asked for at a time.
@@ -19,18 +19,18 @@ _BACKOFF_S: Final = (3.0, 60.0)
 
 GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
-# What each says of its filter.
+# Each autopilot's message about its filter.
 _ARDUPILOT_ONLY: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _PX4_ONLY: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """What is asked for, message id to Hz.
+    """Requested rates, message id -> Hz.
 
     Attributes:
-        wanted: asked for until it comes.
-        optional: asked for once; vehicles without a gimbal do not have its attitude.
+        wanted: requested until received.
+        optional: requested once; vehicles without a gimbal do not have its attitude.
     """
 
     wanted: dict[int, float]
@@ -57,7 +57,7 @@ def default_rates(pose_hz: float = 10.0) -> Rates:
             int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): 1.0,
             int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 1.0,
             int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS): pose_hz,
-            # A rangefinder that states its limits; a height from a coarse terrain map is worse than none.
+            # Only from a rangefinder that states its limits: a height from a coarse terrain map is worse than none.
             int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
             int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
             _ARDUPILOT_ONLY: 1.0,
@@ -100,11 +100,11 @@ class Streams:
 
     @property
     def started(self) -> bool:
-        """True once everything has been asked for."""
+        """True once everything has been requested."""
         return bool(self._streams)
 
     def start(self, now: float) -> list[Message]:
-        """Ask for everything (again: after a reboot, or when a vehicle is found again)."""
+        """Request everything (again after a reboot, or when a vehicle is found again)."""
         wanted = {**self.rates.wanted, **self.rates.optional}
         self._streams = {
             kind: _Stream(hz, kind in self.rates.optional, again_at=now + _BACKOFF_S[0]) for kind, hz in wanted.items()
@@ -121,7 +121,7 @@ class Streams:
             stream.last = now
 
     def acknowledged(self, message: Message, now: float) -> list[Message]:
-        """Take a COMMAND_ACK."""
+        """Process a COMMAND_ACK."""
         if message.command != _COMMAND or self._asking is None or message.target_system not in (0, self.own.system):
             return []
         if message.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
@@ -129,7 +129,7 @@ class Streams:
         return self._next(now)
 
     def tick(self, now: float) -> list[Message]:
-        """Repeat a question, and look from time to time whether everything comes as asked."""
+        """Repeat a request, and check from time to time that all messages arrive at their rates."""
         if now < self.deadline or not self._streams:
             return []
         if self._asking is not None:
@@ -138,7 +138,7 @@ class Streams:
         return self._next(now)
 
     def ask_clock(self) -> Message:
-        """A question for the vehicle's clock, once a second, for a link beside the one that is used."""
+        """A request for the vehicle's clock, once a second, for a link besides the one in use."""
         kind, to = float(dialect.MAVLINK_MSG_ID_SYSTEM_TIME), self.vehicle
         return dialect.MAVLink_command_long_message(to.system, to.component, _COMMAND, 0, kind, 1e6, 0, 0, 0, 0, 0)
 
@@ -166,7 +166,7 @@ class Streams:
         ]
 
     def _look(self, now: float) -> None:
-        """Queue what has stopped, or comes at another rate than asked (another ground station has changed it)."""
+        """Queue requests for messages that have stopped or whose rate another ground station has changed."""
         whole_window = now - self._window >= _WINDOW_S
         for kind, stream in self._streams.items():
             if stream.optional or now < stream.again_at:

@@ -1,7 +1,7 @@
 """The check before a start, as data: for each vehicle a list of items, each ok, warning or red, with a reason.
 
 Red items stop a start unless each is overridden by its name. What an autopilot itself checks before it arms (its
-pre-arm checks, its filter) is asked for here, so that nobody takes off while another one cannot.
+pre-arm checks, its filter) is included here, so that no vehicle takes off while another one cannot.
 """
 
 import enum
@@ -35,7 +35,7 @@ _UNKNOWN_SATELLITES: Final = 255
 
 
 class Level(enum.Enum):
-    """How an item stands."""
+    """The result of an item."""
 
     OK = "ok"
     WARNING = "warning"
@@ -48,8 +48,8 @@ class Item:
 
     Attributes:
         name: one of ITEMS.
-        level: how it stands.
-        reason: in words, what was found.
+        level: its result.
+        reason: the finding in words.
     """
 
     name: str
@@ -92,14 +92,14 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a start is to be checked against.
+    """What a vehicle is checked against.
 
     Attributes:
         mission: the plan's mission of this vehicle, None to fly what it holds.
-        stored: what was read from the vehicle just now, None to believe what is known.
+        stored: the mission just read from the vehicle, None to use the known one.
         endurance_s: flight time of a full battery.
         legal_height_m: height above takeoff that may be flown without asking.
-        near: what the separation check found about this vehicle, empty if all is well.
+        near: finding of the separation check about this vehicle, empty if none.
     """
 
     mission: "Mission | None" = None
@@ -113,7 +113,7 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     """Check one vehicle before its start.
 
     Args:
-        vehicle: as the fleet knows it. wanted: what it is to fly. now: the fleet's clock.
+        vehicle: its state in the fleet. wanted: what it is to fly. now: the fleet's clock.
     """
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
@@ -139,9 +139,9 @@ def preflight_all(
 
     Args:
         vehicles: by system id, as the fleet knows them.
-        missions: the plan's; whatever a vehicle holds is flown where there is none.
+        missions: the plan's; a vehicle without one flies its stored mission.
         stored: what was read from the vehicles just now.
-        starts: takeoffs in seconds after the first; 0 where none is said.
+        starts: takeoffs in seconds after the first; default 0.
         now: the fleet's clock.
         endurance_s, legal_height_m: see Wanted.
         name: name of a vehicle by its system id.
@@ -161,9 +161,9 @@ def preflight_all(
 def near_text(
     missions: "Mapping[int, Mission]", starts: Mapping[int, float], name: Callable[[int], str] = number_name
 ) -> dict[int, str]:
-    """For vehicles whose missions come too near each other with these starts: whom they meet, when, how near.
+    """For vehicles whose missions come too close with these starts: the other vehicle, the time, the distance.
 
-    Missions of one plan with the plan's own starts keep apart by construction and need no check.
+    Missions of one plan with the plan's own starts are separated by construction and need no check.
     """
     found: dict[int, list[str]] = {}
     for one, other, at, metres in Airspace.of(missions).conflicts({s: starts.get(s, 0.0) for s in missions}):

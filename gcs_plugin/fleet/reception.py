@@ -1,4 +1,4 @@
-"""What comes from vehicles: finding, losing and telling them apart, their messages, restarts and routes.
+"""Reception of packets from vehicles: discovery, loss, identity, messages, restarts and routes.
 
 `Fleet` owns one of these and polls it; it sends nothing by itself but requests for streams, for a clock, and for the
 reasons why a vehicle would not arm.
@@ -31,9 +31,9 @@ _HEARTBEAT, _ACK, _TEXT = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["COMMAND_ACK"], 
 _DETECTED: Final = frozenset(MESSAGE_IDS[name] for name in RELEVANT)
 _REQUESTS: Final = frozenset({MESSAGE_IDS["MISSION_REQUEST"], MESSAGE_IDS["MISSION_REQUEST_INT"]})
 _BOOT_CLOCKS: Final = frozenset({MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["SYSTEM_TIME"]})
-# What a late packet of these says is out of date.
+# Late packets of these are out of date.
 _STATES: Final = frozenset({_HEARTBEAT, MESSAGE_IDS["MISSION_CURRENT"], MESSAGE_IDS["EXTENDED_SYS_STATE"]})
-# State that comes again by itself: on a second link it may be late, so it is taken from the one in use.
+# State that is sent periodically: on a second link it may be late, so only the link in use counts.
 _REPEATED: Final = frozenset({
     *_STATES, MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["ATTITUDE"], MESSAGE_IDS["SYS_STATUS"],
     MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["EKF_STATUS_REPORT"], MESSAGE_IDS["ESTIMATOR_STATUS"],
@@ -46,13 +46,13 @@ _PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_
 
 
 class Reception:
-    """Takes packets apart and keeps the vehicles' states.
+    """Decodes packets and updates the vehicles' states.
 
     Args:
-        vehicles: by system id; vehicles that are found are put in.
+        vehicles: by system id; found vehicles are added.
         hub: the links. dialogues: those under way. own: our address.
-        rates: what vehicles are asked to send.
-        remembered: what detectors knew before a restart of this program, by system id.
+        rates: message rates to request.
+        remembered: states of detectors before a restart of this program, by system id.
         event: called with each event. wall: UTC epoch seconds.
 
     Attributes:
@@ -74,10 +74,10 @@ class Reception:
         self.taps: list[Callable[[Packet, float], None]] = []
 
     def packet(self, side: Side, peer: Peer, packet: Packet, now: float, utc: float) -> None:
-        """Take a packet.
+        """Process a packet.
 
         Args:
-            side: the link it came on. peer: who sent it there. packet: itself.
+            side: its link. peer: its sender there. packet: the packet.
             now: monotonic seconds. utc: UTC epoch seconds.
         """
         for listener in self.taps:
@@ -108,9 +108,9 @@ class Reception:
             handler(vehicle, packet.message, utc)
 
     def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> tuple[bool, int]:
-        """Follow a sender's packet counter: whether others have overtaken a packet (or it is a copy), and what is lost.
+        """Track a sender's packet counter: whether a packet was overtaken (or is a copy), and the number lost.
 
-        Gives True for an overtaken one, and how many packets were lost just before this one.
+        Returns True for an overtaken one, and the number of packets lost just before this one.
         """
         counter = (peer, packet.system, packet.component)
         last, lost = self._counters.get(counter), 0
@@ -125,7 +125,7 @@ class Reception:
         return False, lost
 
     def _route(self, vehicle: Vehicle, side: Side, peer: Peer, now: float) -> Route:
-        """The way on which a packet has come; streams run on the way in use."""
+        """The route of a packet; streams use the active route."""
         route, taken_over = vehicle.routes.heard(side, peer, now)
         if taken_over:
             self._taken_over(vehicle, now)
@@ -160,9 +160,9 @@ class Reception:
         self._dialogues.feed(vehicle, message, now)
 
     def _joined(self, system: int, message: Message) -> list[str]:
-        """The texts that end with a message: a long one comes in several of 50 characters, with one number.
+        """The texts completed by a message: a long text is sent in several parts of 50 characters with a common number.
 
-        One whose last part was lost is given as far as it is known when the next text comes.
+        If the last part was lost, the known parts are returned when the next text arrives.
         """
         number, text = int(message.id), str(message.text)
         begun, parts = self._parts.pop(system, (number, []))
@@ -175,7 +175,7 @@ class Reception:
         return [text.strip("\x00\t ") for text in texts]
 
     def _text(self, vehicle: Vehicle, route: Route, text: str, severity: int, now: float) -> None:
-        """Pass a text on once, though it comes on two links."""
+        """Pass a text on once, even if it arrives on two links."""
         last = self._said.get((vehicle.system, text))
         self._said[vehicle.system, text] = now, route
         if last is not None and last[1] is not route and now - last[0] < _SAME_TEXT_S:
@@ -225,7 +225,7 @@ class Reception:
         self._publish(FleetEvent(kind, vehicle.system, self._wall(), words, pair, severity))
 
     def tick(self, now: float) -> None:
-        """Look for what has not come, and for who is too near another."""
+        """Check for missing messages, and for vehicles that are too close."""
         self._watch_separation(now)
         for vehicle in self._vehicles.values():
             if vehicle.lost:
@@ -239,7 +239,7 @@ class Reception:
                 self._compare_routes(vehicle, now)
 
     def _ask_why(self, vehicle: Vehicle, now: float) -> None:
-        """A vehicle that would refuse to arm, and has not said why, is asked for the reasons."""
+        """Request the reasons from a vehicle that would refuse to arm and has not stated why."""
         if vehicle.prearm_ok is not False or vehicle.armed or now < vehicle.ask_why_at or vehicle.prearm_texts(now):
             return
         vehicle.ask_why_at = now + _ASK_WHY_S
@@ -255,7 +255,7 @@ class Reception:
             self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
-        """Is it one vehicle on two links, or several vehicles with one system id? Their clocks tell."""
+        """Decide by the clocks whether one vehicle is on two links, or several vehicles share a system id."""
         before = vehicle.claimants
         if vehicle.routes.compare(now):
             self._taken_over(vehicle, now)

@@ -1,7 +1,7 @@
-"""The ways on which one vehicle is heard: the better one carries commands, another takes over when it falls silent.
+"""The routes to one vehicle: the best one carries commands, another takes over when it falls silent.
 
 One vehicle on two links (radio and LTE) is normal. Two vehicles with one system id are not: their own clocks, which
-start at their boots, tell them apart.
+start at their boots, distinguish them.
 """
 
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ _PACE_S: Final = 2.0
 
 @dataclass(slots=True)
 class BootClock:
-    """Watches a vehicle's own clock, which only a restart (or a second vehicle with the same id) sets back."""
+    """Watches a vehicle's own clock, which only goes back at a restart (or with a second vehicle of the same id)."""
 
     last_s: float = -1.0
     _low: int = 0
@@ -32,7 +32,7 @@ class BootClock:
     _restarted: float = -1e9
 
     def feed(self, time_boot_s: float, now: float) -> str:
-        """Take a time since boot; returns "", "rebooted", or "mixed" where two clocks take turns.
+        """Process a time since boot; returns "", "rebooted", or "mixed" if two clocks alternate.
 
         Single packets from the past are late copies: a restart shows in three in a row.
         """
@@ -50,12 +50,12 @@ class BootClock:
 
 @dataclass(slots=True)
 class Route:
-    """A way on which a vehicle is heard.
+    """A route on which a vehicle is heard.
 
     Attributes:
         side: the link; peer: the sender on it.
-        heard: when something came last (the fleet's clock).
-        loss: share of packets that were lost lately, from the sender's counter.
+        heard: time of the last packet (the fleet's clock).
+        loss: share of packets lost recently, from the sender's counter.
         boot: the vehicle's start on that clock, from its own counter; None before the first position.
         boot_at: when that was computed; asked_at: when its clock was asked for.
         clock: watches the counter.
@@ -72,7 +72,7 @@ class Route:
     _mark: tuple[float, float] | None = None
 
     def pace(self, time_boot_s: float, now: float) -> float | None:
-        """Seconds of the vehicle's clock in one of ours over the last few; None while that is not known."""
+        """Seconds of the vehicle's clock in one of ours over the last few; None while unknown."""
         if self._mark is None or time_boot_s < self._mark[1] or now - self._mark[0] > 2.0 * _PACE_S:
             self._mark = now, time_boot_s
             return None
@@ -85,14 +85,14 @@ class Route:
 
     @property
     def address(self) -> str:
-        """The link and, where several speak on it, who."""
+        """The link and, if it has several senders, the peer."""
         name = self.side.link.name
         if isinstance(self.peer, tuple) and len(self.peer) >= 2:
             return f"{name} from {self.peer[0]}:{self.peer[1]}"
         return f"{name} number {self.peer}" if isinstance(self.peer, int) else name
 
     def counted(self, lost: int) -> None:
-        """A packet has come, after so many that were lost."""
+        """Count a packet and the number lost before it."""
         for _ in range(min(lost, 20)):
             self.loss += _SMOOTHING * (1.0 - self.loss)
         self.loss -= _SMOOTHING * self.loss
@@ -100,12 +100,12 @@ class Route:
 
 @dataclass(slots=True)
 class Routes:
-    """All ways to one vehicle.
+    """All routes to one vehicle.
 
     Attributes:
         known: by link and peer.
         best: the one that carries commands, None before the first packet.
-        claimants: addresses of those who use the vehicle's system id, where they are several; empty otherwise.
+        claimants: addresses of the vehicles that share the system id; empty for a single one.
     """
 
     known: "dict[tuple[Side, Peer], Route]" = field(default_factory=dict)
@@ -114,7 +114,7 @@ class Routes:
     _claimed_until: float = -1.0
 
     def heard(self, side: "Side", peer: "Peer", now: float) -> tuple[Route, bool]:
-        """The way on which a packet has come, and whether another one has taken over with it."""
+        """The route of a packet, and whether the best route has changed with it."""
         route = self.known.get((side, peer))
         if route is None:
             route = self.known[side, peer] = Route(side, peer, now)
@@ -126,15 +126,15 @@ class Routes:
         return route, False
 
     def stale(self, route: Route, now: float) -> bool:
-        """True for a way beside the one in use: what it says of the vehicle's state may be late."""
+        """True for a route that is not the active one: its state of the vehicle may be late."""
         return route is not self.best and self.best is not None and now - self.best.heard < 1.0
 
     def fresh(self, now: float, within_s: float = FRESH_S) -> list[Route]:
-        """The ways on which something came lately."""
+        """The routes with recent packets."""
         return [route for route in self.known.values() if now - route.heard < within_s]
 
     def towards(self, now: float, *, everywhere: bool) -> list[Route]:
-        """Where to send: the best way, or every way on which the vehicle was heard lately."""
+        """Routes for sending: the best one, or every one on which the vehicle was heard recently."""
         if self.best is None:
             return []
         if not everywhere:
@@ -142,11 +142,11 @@ class Routes:
         return self.fresh(now, _KNOWN_S) or [self.best]
 
     def mixed(self, now: float) -> None:
-        """Two clocks take turns on one way: several vehicles behind one link."""
+        """Two clocks alternate on one route: several vehicles behind one link."""
         self._claimed_until = now + _VERDICT_S
 
     def compare(self, now: float) -> bool:
-        """Look whether one or several vehicles speak, and which way is best; True if another way has taken over."""
+        """Check whether one or several vehicles send, and which route is best; True if the best route has changed."""
         fresh = self.fresh(now)
         boots = [route.boot for route in fresh if route.boot is not None and now - route.boot_at < _CLOCK_S]
         if boots and max(boots) - min(boots) > _BOOT_GAP_S:
@@ -163,7 +163,7 @@ class Routes:
         return True
 
     def unasked(self, now: float) -> list[Route]:
-        """Ways beside the best whose clock should be asked for."""
+        """Routes besides the best whose clock should be requested."""
         routes = [
             route
             for route in self.fresh(now)

@@ -1,4 +1,4 @@
-"""Vehicles in the air that come nearer than they should: an alarm with a proposal."""
+"""Alarms about vehicles in the air that come too close, with a proposal."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -42,7 +42,7 @@ def number_name(system: int) -> str:
 
 @dataclass(slots=True)
 class SeparationWatch:
-    """Compares the places of vehicles in the air.
+    """Compares the positions of vehicles in the air.
 
     Attributes:
         distance_m: horizontally, or height_m: vertically, they keep at least so far apart.
@@ -54,7 +54,7 @@ class SeparationWatch:
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
 
     def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
-        """Compare all pairs; gives the alarms that are new, and the pairs whose alarm is over."""
+        """Compare all pairs; returns new alarms, and the pairs whose alarm is over."""
         flying = [v for v in vehicles if v.flying and v.lat_deg is not None and now - v.heard < _FRESH_S]
         found: dict[tuple[int, int], Near] = {}
         if len(flying) > 1:
@@ -75,7 +75,7 @@ class SeparationWatch:
         return new, ended
 
     def text(self, system: int, name: Callable[[int], str] = number_name) -> str:
-        """The alarm of a vehicle in words, empty if there is none; `name` gives the names of vehicles."""
+        """The alarm of a vehicle in words, empty if there is none; `name` returns the names of vehicles."""
         for near in self.alarms.values():
             if system in near.pair:
                 return near_text(near, self, name)
@@ -105,7 +105,7 @@ def apart_text(pair: tuple[int, int], name: Callable[[int], str] = number_name) 
 
 
 def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
-    """Who goes on, and who should be paused: the faster of the two is the one that comes near."""
+    """Which vehicle should be paused: the faster of the two, as it approaches the other."""
     fast, slow = sorted((one, other), key=lambda v: -math.hypot(*v.velocity_m_s[:2]))
     return slow.system, fast.system
 

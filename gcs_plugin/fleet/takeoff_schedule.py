@@ -1,4 +1,4 @@
-"""Who takes off when: a plan's times, and what follows where a vehicle cannot keep its own.
+"""Takeoff times of a plan, and their changes if a vehicle cannot keep its own.
 
 Vehicles of one plan share airspace and keep apart by their times. One that does not take off holds those that still
 wait on the ground; one that took off late moves them to the next times that keep every pair apart by the plan's own
@@ -21,8 +21,8 @@ class TakeoffSchedule:
     """Takeoffs under way.
 
     Attributes:
-        waiting: when each that waits is to start, on the clock of whoever drives it.
-        flown: when each that flies was started.
+        waiting: start time of each waiting vehicle, on the caller's clock.
+        flown: start time of each flying vehicle.
         airspace: their missions; None where they are not known, then times are only kept, not moved.
     """
 
@@ -39,7 +39,7 @@ class TakeoffSchedule:
         return cls(waiting, airspace, {}, dict(waiting), {})
 
     def due(self, now: float) -> list[int]:
-        """Those whose time has come, and before whom nobody's start is still undecided; they wait no longer."""
+        """Vehicles that are due, with no earlier start undecided; they are no longer waiting."""
         ready = sorted((s for s, at in self.waiting.items() if at <= now), key=lambda s: self.waiting[s])
         begun: list[int] = []
         for system in ready:
@@ -54,7 +54,7 @@ class TakeoffSchedule:
         return min(self.waiting.values(), default=None)
 
     def started(self, system: int, now: float) -> list[str]:
-        """One flies its mission; gives what that changes for others, in words."""
+        """A vehicle flies its mission; returns the changes for others, in words."""
         self._undecided.pop(system, None)
         planned = self._planned.get(system, now)
         late = now - planned
@@ -77,7 +77,7 @@ class TakeoffSchedule:
         return said
 
     def failed(self, system: int) -> list[int]:
-        """One did not take off; gives those that waited and now stay on the ground."""
+        """A vehicle did not take off; returns the waiting ones, which now stay on the ground."""
         self._undecided.pop(system, None)
         held = sorted(self.waiting)
         self.waiting.clear()

@@ -1,4 +1,4 @@
-"""Are a message's values possible? If not it never leaves the fleet: no map is to see a latitude of 95 degrees."""
+"""Range checks of messages: impossible values (a latitude of 95 degrees) never leave the fleet."""
 
 import math
 from collections.abc import Callable

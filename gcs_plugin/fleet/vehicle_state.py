@@ -1,4 +1,4 @@
-"""What is known about one vehicle: its state from its messages."""
+"""The state of one vehicle, from its messages."""
 
 import math
 from collections import deque
@@ -48,10 +48,10 @@ class Vehicle:
         time_boot_s: its own clock at the last position.
         mission: what it holds, where that was read or written in this session.
         photos: pictures that it has reported.
-        received: packets; missed: packets that its counters say were lost on the way.
-        impossible: messages with values out of their range, which were thrown away.
-        ekf_ok: whether its filter has an absolute position; None where it does not say.
-        prearm_ok: whether its own checks before arming have passed; None where it does not say.
+        received: packets; missed: packets lost according to its counters.
+        impossible: number of messages with values out of range, which were dropped.
+        ekf_ok: whether its filter has an absolute position; None if not reported.
+        prearm_ok: whether its pre-arm checks have passed; None if not reported.
         home: latitude and longitude of its home in degrees, None before it is set.
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
@@ -125,7 +125,7 @@ class Vehicle:
 
     @property
     def in_air(self) -> bool:
-        """True if it says so."""
+        """True if it reports so."""
         return self.landed not in ("", "on ground")
 
     @property
@@ -158,14 +158,14 @@ class Vehicle:
         return Pilot(self.address, self.streams.own, self.autopilot, self.modes)
 
     def says(self, text: str, now: float) -> None:
-        """Take a text of its autopilot."""
+        """Process a text of its autopilot."""
         self.texts.append(text)
         if text.startswith(("PreArm", "Arm:", "Preflight")):
             self._prearm.pop(text, None)
             self._prearm[text] = now
 
     def update(self, message: Message) -> None:
-        """Take a message of its autopilot or camera."""
+        """Process a message of its autopilot or camera."""
         handler = _HANDLERS.get(message.get_msgId())
         if handler is not None:
             handler(self, message)

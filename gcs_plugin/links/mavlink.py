@@ -1,4 +1,4 @@
-"""The one door to pymavlink: MAVLink 2 is chosen before anything of it is imported.
+"""The only import of pymavlink: MAVLink 2 is selected before it is loaded.
 
 Without MAVLINK20 in the environment pymavlink's `mavutil` speaks MAVLink 1 and knows no message above id 255
 (CAMERA_IMAGE_CAPTURED, for one). Modules of this package take `dialect` from here and never import pymavlink on their

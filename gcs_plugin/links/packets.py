@@ -1,7 +1,7 @@
 """Bytes to MAVLink packets: finds whole packets in what a link delivers, checks them, and decodes on demand.
 
-pymavlink decodes every byte that it is given. A ground station for a hundred vehicles passes most packets on (to the
-log, to a counter) without looking inside, so finding, checking and decoding are apart here. The checksum is
+pymavlink decodes every byte. A ground station for a hundred vehicles only passes most packets on (to the
+log, to a counter), so finding, checking and decoding are separate here. The checksum is
 CRC-16/MCRF4XX, which is CRC-16/CCITT on mirrored bits, and that one is in the standard library in C.
 """
 
@@ -30,10 +30,10 @@ def checksum(data: bytes) -> int:
 
 @dataclass(slots=True)
 class Packet:
-    """One whole packet with a correct checksum.
+    """One complete packet with a correct checksum.
 
     Attributes:
-        raw: its bytes as they came, signature included.
+        raw: its bytes as received, signature included.
         system: system id of the sender; component: its component id.
         seq: the sender's packet counter, 0 to 255.
         kind: message id.
@@ -58,7 +58,7 @@ class Packet:
 
 
 def _make(packet: Packet, kind: Any, size: int, order: Any) -> Message:
-    """Decode a message of plain numbers: what pymavlink does in twice the time, because it checks once more."""
+    """Decode a message of plain numbers, twice as fast as pymavlink, which repeats the checks."""
     raw = packet.raw
     start = 10 if raw[0] == V2_MARKER else 6
     payload = raw[start : start + min(size, raw[1])]
@@ -84,11 +84,11 @@ _MAKERS: Final = _makers()
 
 @dataclass(slots=True)
 class Framer:
-    """Splits a stream into packets; feed it whatever arrives, in pieces of any size.
+    """Splits a stream, received in pieces of any size, into packets.
 
     Attributes:
         dropped_bytes: bytes that belonged to no valid packet.
-        bad_checksums: packets that were thrown away because their checksum was wrong.
+        bad_checksums: packets dropped for a wrong checksum.
         unknown: packets of message ids that the dialect does not have.
     """
 
@@ -98,7 +98,7 @@ class Framer:
     _rest: bytes = b""
 
     def feed(self, data: bytes) -> list[Packet]:
-        """All packets that are complete now; what is left over waits for the next call."""
+        """All complete packets; remaining bytes wait for the next call."""
         if not self._rest and len(data) > 2 and data[0] == V2_MARKER and len(data) == data[1] + 12 and not data[2]:
             packet = self._check(data)  # a datagram with one packet, the usual case
             return [] if packet is None else [packet]

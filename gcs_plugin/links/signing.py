@@ -1,4 +1,4 @@
-"""MAVLink 2 message signing: the key, what goes out signed, and what may come in.
+"""MAVLink 2 message signing: the key, signing of outgoing packets, checking of incoming ones.
 
 A packet carries a link id, a time in units of 10 microseconds since 2015 and the first six bytes of SHA-256 over key
 and packet (https://mavlink.io/en/guide/message_signing.html). The key comes from a file or the environment and is never
@@ -33,12 +33,12 @@ def signing_time(utc_s: float) -> int:
 
 @dataclass(slots=True)
 class Signing:
-    """Signs what goes out on a link and judges what comes in.
+    """Signs outgoing packets of a link and checks incoming ones.
 
     Attributes:
         key: 32 bytes.
-        link_id: tells the streams of one sender apart.
-        rejected: packets that were thrown away because their signature is missing, wrong or old.
+        link_id: distinguishes the streams of one sender.
+        rejected: packets dropped because their signature is missing, wrong or old.
     """
 
     key: bytes = field(repr=False)

@@ -1,7 +1,7 @@
-"""Links to vehicles: UDP, TCP and serial, without waiting, several at once, many vehicles behind one of them.
+"""Links to vehicles: UDP, TCP and serial, non-blocking, several at once, with many vehicles on one link.
 
 A link delivers bytes with the peer that they came from, and sends bytes to a peer: with UDP a peer is an address, with
-TCP a connection, with a serial line there is one. What comes back when is the business of whoever polls the selector.
+TCP a connection, with a serial line there is one. The owner of the selector decides when to read.
 """
 
 import abc
@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from orthoswarm.model.errors import InputError
 
-# Who sent something: an address, a connection, the other end of a line. Hashable, and of no meaning to anybody else.
+# A sender: an address, a connection, the other end of a line. Hashable, otherwise opaque.
 Peer = Any
 
 NEVER: Final = float("inf")
@@ -35,7 +35,7 @@ EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:192.168.1.7:14550, tcp:127.0.0.1:
 
 @dataclass(slots=True)
 class _Pending:
-    """Packets that wait for a line. One that has expired is left out, unless its first bytes are gone already."""
+    """Packets waiting to be sent. An expired one is dropped unless it was partly sent."""
 
     _packets: deque[tuple[bytes, float]] = field(default_factory=deque)
     _begun: int = 0
@@ -50,7 +50,7 @@ class _Pending:
         self._size += len(data)
 
     def bytes(self) -> bytes:
-        """What is to go out now."""
+        """The bytes to send now."""
         now, begun = time.monotonic(), self._begun
         first = [self._packets[0]] if begun else []
         rest = self._packets if not begun else list(self._packets)[1:]
@@ -59,7 +59,7 @@ class _Pending:
         return b"".join(data for data, _ in self._packets)[begun:]
 
     def sent(self, count: int) -> None:
-        """So many bytes have gone out."""
+        """Remove the bytes that were sent."""
         self._size -= count
         count += self._begun
         while self._packets and count >= len(self._packets[0][0]):
@@ -88,19 +88,19 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
-        """Begin; what the link waits for is registered with `data=self`."""
+        """Open the link; its file objects are registered with `data=self`."""
 
     @abc.abstractmethod
     def receive(self, source: Any, events: int, now: float) -> Iterator[tuple[Peer, bytes]]:
-        """Everything that has arrived on a file object of the link: peer and bytes."""
+        """All input on a file object of the link: peer and bytes."""
 
     @abc.abstractmethod
     def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
-        """Send to a peer, or drop it where that would mean waiting.
+        """Send to a peer, or drop the packet if that would block.
 
         Args:
             peer: to whom. data: one packet.
-            expires: monotonic seconds after which it is thrown away if it still waits for the line.
+            expires: monotonic seconds after which it is dropped if still waiting.
 
         Returns:
             False where it was dropped at once.
@@ -108,10 +108,10 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Let go of everything."""
+        """Close everything."""
 
     def tick(self, now: float) -> None:
-        """Do what time asks for, such as connecting again; most links need nothing."""
+        """Do what is due, such as connecting again; most links need nothing."""
         del now
 
     def greet(self) -> list[Peer]:
@@ -120,7 +120,7 @@ class Link(abc.ABC):
 
     @property
     def polled(self) -> Any:
-        """A source that cannot be waited for and must be read from time to time, None if there is none."""
+        """A source that cannot be selected on and must be polled, None if there is none."""
         return None
 
 
@@ -188,7 +188,7 @@ class UdpLink(Link):
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """One TCP connection and what still has to go out on it."""
+    """One TCP connection and its output queue."""
 
     socket: socket.socket
     connected: bool
@@ -196,7 +196,7 @@ class _Stream:
 
 
 class TcpLink(Link):
-    """TCP: connects to a server and does so again whenever it is lost, or serves any number of connections."""
+    """TCP: connects to a server, again after every loss, or serves any number of connections."""
 
     def __init__(self, name: str, host: str, port: int, *, serves: bool = False) -> None:
         super().__init__(name)
@@ -437,7 +437,7 @@ _BAUD: Final = 57600
 
 @dataclass(frozen=True, slots=True)
 class LinkAddress:
-    """Where a link goes, however it was written.
+    """The parsed address of a link.
 
     Attributes:
         kind: `udpin`, `udpout`, `tcpin`, `tcpout` or `serial`.

@@ -1,4 +1,4 @@
-"""Missions: what they consist of, how they get into a vehicle and back, and when a vehicle has flown one.
+"""Missions: items, upload, download, commands, and detection of completion.
 
-Everything here is free of sockets and clocks: messages and the time go in, messages come out.
+Nothing here uses sockets or clocks: messages and the time are passed in, messages are returned.
 """

@@ -1,4 +1,4 @@
-"""Is the mission in the vehicle the one that was sent? Compares what makes a difference in flight.
+"""Compares the mission stored in a vehicle with the one sent, in all that matters in flight.
 
 Autopilots do not store items byte by byte: ArduPilot keeps altitudes in centimetres, the first parameter of many
 commands as a whole number, no frame for commands without a place, and no second to fourth parameter of a waypoint;
@@ -26,7 +26,7 @@ from gcs_plugin.mission.items import (
     MissionItem,
 )
 
-# Which of param1 to param4 (0 to 3) decide how a command is flown; for other commands all of them are compared.
+# Which of param1 to param4 (0 to 3) affect a command's execution; for other commands all are compared.
 _DECISIVE: dict[int, tuple[int, ...]] = {
     WAYPOINT: (0,), TAKEOFF: (), RTL: (), LAND: (), VTOL_LAND: (), LOITER_UNLIM: (),
     DELAY: (0, 1, 2, 3), JUMP: (0, 1), CHANGE_SPEED: (0, 1), TRIGGER_DISTANCE: (0,),
@@ -49,7 +49,7 @@ class Difference:
 
 
 def difference(mission: Mission, stored: Sequence[MissionItem]) -> Difference | None:
-    """The first difference between a mission and what a vehicle has stored, None if it will fly the mission."""
+    """The first relevant difference between a mission and the one stored in a vehicle, None if there is none."""
     if len(stored) != len(mission):
         return Difference(None, f"{len(stored)} items are stored, not {len(mission)}")
     start = 1 if mission.autopilot is Autopilot.ARDUPILOT else 0

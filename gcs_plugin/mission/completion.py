@@ -1,14 +1,14 @@
-"""When a vehicle has flown its mission: a state machine over the messages of one autopilot.
+"""Detects when a vehicle has flown its mission: a state machine over the messages of one autopilot.
 
 What ArduCopter 4.7 and PX4 send at the end of a mission differs with its last item (docs/vehicles.md has the table of
 what was measured). The rules here follow from it:
 
 - `mission_state` 5 (complete) counts only after state 3 (active) was seen, armed, since the last upload or start:
   the flag survives a clear and a new upload.
-- ArduCopter never says 5 for a mission that ends with LAND: there the disarming while LAND is current says it.
+- ArduCopter never sends 5 for a mission that ends with LAND: there, disarming while LAND is current counts.
 - State 3 while disarmed is ArduCopter standing in AUTO after a flight, not a flight.
 - Leaving the mission (state 2 or 4) suspends it; disarming a suspended mission ends it without completing it.
-- Firmware without `mission_state` is judged by its mode and by MISSION_ITEM_REACHED of the last NAV item.
+- For firmware without `mission_state`, its mode and MISSION_ITEM_REACHED of the last NAV item are used.
 
 The clock plays no part, so a simulation at any speed and a log read afterwards give the same events.
 """
@@ -23,7 +23,7 @@ from gcs_plugin.mission.items import Ending, Mission, ending_of, final_nav
 
 
 class Phase(enum.Enum):
-    """Where the mission stands."""
+    """The state of the mission."""
 
     IDLE = "idle"
     ACTIVE = "active"
@@ -42,7 +42,7 @@ class MissionEvent(enum.Enum):
     ABORTED = "aborted"
 
 
-# The message types that the detector looks at; others may be fed and change nothing.
+# The message types that the detector uses; others are ignored.
 RELEVANT: Final = frozenset({
     "HEARTBEAT", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
     "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT",
@@ -52,20 +52,20 @@ _ACTIVE, _COMPLETE, _PAUSED = 3, 5, 4
 _ON_GROUND, _IN_AIR, _TAKEOFF, _LANDING = 1, 2, 3, 4
 _ARDUCOPTER_AUTO = 3
 _PX4_AUTO_MISSION = (4 << 16) | (4 << 24)
-# How many MISSION_CURRENT still saying "active" after disarming are waited for before the flight counts as aborted:
+# Number of MISSION_CURRENT with "active" after disarming before the flight counts as aborted:
 # the heartbeat and the 10 Hz stream cross each other on the way.
 _PATIENCE = 3
 
 
 @dataclasses.dataclass(slots=True)
 class CompletionDetector:
-    """Follows one vehicle's mission; feed it every message of the vehicle's autopilot in order of arrival.
+    """Tracks one vehicle's mission; feed it every message of the vehicle's autopilot in order of arrival.
 
     Attributes:
         autopilot: the vehicle's dialect.
-        phase: where the mission stands.
-        seq: the current item as the vehicle last said, None before.
-        total: number of items that it says it has, without ArduPilot's home; None where it does not say.
+        phase: state of the mission.
+        seq: the current item as last reported, None before.
+        total: reported number of items, without ArduPilot's home; None if not reported.
         armed: None before the first heartbeat.
     """
 
@@ -94,7 +94,7 @@ class CompletionDetector:
     _learned_count: int = 0
 
     def uploaded(self, mission: Mission | None) -> None:
-        """A new mission lies in the vehicle (None: it is not known which). What was seen before no longer counts."""
+        """A new mission was stored in the vehicle (None: unknown); earlier states no longer count."""
         self._commands = None if mission is None else [item.command for item in mission.items]
         self._learned.clear()
         self._learned_count = 0
@@ -103,17 +103,17 @@ class CompletionDetector:
         self._restart(hot=bool(self.armed))
 
     def knows_mission(self, mission: Mission) -> None:
-        """Tell what lies in the vehicle, without anything having changed there."""
+        """Set the mission stored in the vehicle, which has not changed."""
         self._commands = [item.command for item in mission.items]
         self.total, self._new_total = len(mission) - self._first_seq, None
 
     @property
     def knows(self) -> bool:
-        """True while it is known what lies in the vehicle."""
+        """True while the stored mission is known."""
         return self._commands is not None
 
     def rebooted(self) -> list[MissionEvent]:
-        """The vehicle has started anew: a mission that was under way has ended without completing."""
+        """The vehicle has rebooted: a running mission has ended without completing."""
         under_way = self.phase in (Phase.ACTIVE, Phase.SUSPENDED)
         self._restart(hot=False)
         self.armed, self.seq, self._landed = None, None, None
@@ -123,7 +123,7 @@ class CompletionDetector:
         return [MissionEvent.ABORTED]
 
     def feed(self, message: Message) -> list[MissionEvent]:
-        """Take one message; returns what it means for the mission, mostly nothing."""
+        """Process one message; returns the mission's event, mostly None."""
         match message.get_type():
             case "HEARTBEAT":
                 return self._heartbeat(message) if is_autopilot(message) else []
@@ -160,7 +160,7 @@ class CompletionDetector:
         return Ending.UNKNOWN if self._commands is None else ending_of(self._commands, self._first_seq)
 
     def state(self) -> dict[str, Any]:
-        """Everything it knows as JSON values, so that a restarted program can go on where it stopped."""
+        """Its state as JSON values, so that a restarted program can continue."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         values["autopilot"], values["phase"] = self.autopilot.value, self.phase.value
         values["_learned"] = [[seq, command] for seq, command in self._learned.items()]
@@ -217,7 +217,7 @@ class CompletionDetector:
             self._airborne = self._landing_seen = self._crashed = False
         if self.armed and self._dropped:
             self._armed_since_drop += 1
-            if self._armed_since_drop >= 2:  # it goes on flying: somebody set the mission back, it has not landed
+            if self._armed_since_drop >= 2:  # still flying: the mission was reset, it has not landed
                 self._dropped = False
         if not self.armed and was is not False:
             events += self._disarmed()
@@ -250,7 +250,7 @@ class CompletionDetector:
         return [] if self._has_state else self._judge(_ACTIVE if self._mission_mode else _PAUSED)
 
     def _judge(self, state: int) -> list[MissionEvent]:
-        """What a mission state means in the present phase."""
+        """Interpret a mission state in the present phase."""
         if state == _COMPLETE:
             final = self.final_seq
             proven = self.phase is Phase.SUSPENDED and final is not None and self._reached >= final
@@ -282,7 +282,7 @@ class CompletionDetector:
         return [MissionEvent.STARTED]
 
     def _still_waiting(self, state: int) -> list[MissionEvent]:
-        """Disarmed while active: the vehicle's next words say whether that was the end or a crash."""
+        """Disarmed while active: the vehicle's next messages show whether that was the end or a crash."""
         if state != _ACTIVE:
             return self._abort()
         landed = self._landing_seen or self._landed is None
@@ -314,15 +314,15 @@ class CompletionDetector:
     # --- what is in the vehicle ---
 
     def _follow_total(self, total: int) -> None:
-        """Notice that somebody else has put another mission into the vehicle (its number of items has changed)."""
+        """Detect that another station has stored another mission (its number of items has changed)."""
         known = self.total is not None and total == self.total
         if self.autopilot is Autopilot.PX4 and self._commands is not None:
-            known |= len(self._commands) - total in (0, 1)  # versions differ in what they count
+            known |= len(self._commands) - total in (0, 1)  # firmware versions count differently
         if not 0 < total < 0xFFFF or known:
             self._new_total = None
         elif self.total is None:
             self.total = total
-        elif total != self._new_total:  # once may be a late packet
+        elif total != self._new_total:  # a single one may be a late packet
             self._new_total = total
         else:
             self._commands = None
@@ -330,7 +330,7 @@ class CompletionDetector:
             self._restart(hot=bool(self.armed))
 
     def _learn(self, message: Message) -> None:
-        """Take the commands from a download by any ground station, where nobody has told them."""
+        """Learn the commands from a download by any ground station, if they are unknown."""
         if message.mission_type != dialect.MAV_MISSION_TYPE_MISSION or self._commands is not None:
             return
         self._learned[int(message.seq)] = int(message.command)

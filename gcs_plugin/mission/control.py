@@ -34,9 +34,9 @@ class Command(Exchange):
         command: MAV_CMD.
         params: parameters 1 to 7, missing ones 0.
         verb: what it does, for messages: "arm".
-        insist_s: how long a refusal is answered by asking again.
-        patience_s: silence after which it gives up, where it does not expire before.
-        reasons: what the vehicle said meanwhile, in its own words.
+        insist_s: how long the command is repeated after refusals.
+        patience_s: silence after which it gives up, if it does not expire before.
+        reasons: the vehicle's texts meanwhile.
     """
 
     command: int = field(kw_only=True)
@@ -58,7 +58,7 @@ class Command(Exchange):
         return self._send(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Take COMMAND_ACK, and remember texts that may say why not."""
+        """Process COMMAND_ACK, and store texts that may contain the reason of a refusal."""
         kind = message.get_type()
         if self.outcome is not None:
             return []
@@ -88,7 +88,7 @@ class Command(Exchange):
             self._expired(now)
             return []
         if now > self.expires:
-            self.deadline = self.expires + _ANSWER_S  # the last one may still be answered
+            self.deadline = self.expires + _ANSWER_S  # the last attempt may still be answered
             return []
         return self._send(now)
 
@@ -125,25 +125,25 @@ class Command(Exchange):
 
 @dataclass(slots=True)
 class Confirm(Exchange):
-    """Waits until the vehicle's messages show that something is so; sends nothing."""
+    """Waits until the vehicle's messages confirm a condition; sends nothing."""
 
     shown: Callable[[Message], bool] = field(kw_only=True)
     what: str = field(kw_only=True)
     patience_s: float = field(default=15.0, kw_only=True)
 
     def start(self, now: float) -> list[Message]:
-        """Begin to wait."""
+        """Start waiting."""
         self.deadline = now + self.patience_s
         return []
 
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Look at a message."""
+        """Check a message."""
         if self.outcome is None and self.shown(message):
             self._end(True, f"vehicle {self.vehicle.system} {self.what}")
         return []
 
     def tick(self, now: float) -> list[Message]:
-        """Give up in the end."""
+        """Give up after the time-out."""
         if self.outcome is None and now >= self.deadline:
             text = f"vehicle {self.vehicle.system} accepted, but nothing shows that it {self.what}; look at it"
             self._end(False, text, Verdict.UNKNOWN)
@@ -155,7 +155,7 @@ class CheckMission(Exchange):
     """Reads the mission and says whether the vehicle can start it from the ground.
 
     Attributes:
-        mission: what the vehicle holds, once it is read.
+        mission: the stored mission, once it is read.
     """
 
     autopilot: Autopilot = field(kw_only=True)
@@ -207,7 +207,7 @@ def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: boo
 
 @dataclass(slots=True)
 class _Several(Exchange):
-    """Dialogues one after the other; what the end of one means is the business of whoever inherits.
+    """Dialogues one after the other; subclasses decide what the end of one means.
 
     Attributes:
         steps: the dialogues.
@@ -248,7 +248,7 @@ class _Several(Exchange):
         return messages
 
     def took(self) -> None:
-        """A link has taken a message of the present one."""
+        """A link has accepted a message of the present dialogue."""
         self.delivered += 1
         self.steps[self._at].took()
 
@@ -262,7 +262,7 @@ class _Several(Exchange):
 
     @abc.abstractmethod
     def _ended(self, outcome: Outcome, last: bool) -> bool:
-        """One has ended: end the whole and say True, or say False to go on with the next."""
+        """A step has ended: end all and return True, or return False to continue with the next."""
 
 
 @dataclass(slots=True)
@@ -270,8 +270,8 @@ class InOrder(_Several):
     """Steps one after the other; the first that fails ends it.
 
     Attributes:
-        done: what to say at the end.
-        carried: from this step on the vehicle is at it already, so that the steps get time of their own.
+        done: text at the end.
+        carried: from this step on the vehicle is already executing the command, so later steps may take their own time.
     """
 
     done: str = field(kw_only=True)
@@ -290,10 +290,10 @@ class InOrder(_Several):
 
 @dataclass(slots=True)
 class OrUndo(_Several):
-    """A step, and what undoes the one before it where the vehicle refuses this one; the refusal is the outcome.
+    """A step, and a dialogue that undoes the previous one if the vehicle refuses this step; the refusal is the outcome.
 
     Attributes:
-        undone: what to add when that was done; left: when it was not.
+        undone: text added if undoing succeeded; left: if it failed.
     """
 
     undone: str = field(kw_only=True)
@@ -315,7 +315,7 @@ class OrUndo(_Several):
 
 @dataclass(slots=True)
 class Either(_Several):
-    """A way of doing something, and another one where the vehicle refuses the first or does not answer to it."""
+    """A dialogue, and an alternative if the vehicle refuses the first or does not answer."""
 
     _unsure: str = field(default="", init=False)
 
@@ -357,7 +357,8 @@ class Pilot:
         """Fly the mission from its beginning: check it, then mode, arm, MISSION_START, and wait until it flies.
 
         Args:
-            in_air: whether it flies. armed: whether its motors run; if not, they stop again when the start is refused.
+            in_air: whether it flies. armed: whether it is armed; if not, it is disarmed again when the start is
+            refused.
             check: whether its mission has to be read first.
         """
         steps: list[Exchange] = []
@@ -381,14 +382,14 @@ class Pilot:
         return InOrder(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)
 
     def pause(self) -> Exchange:
-        """Stay where it is. ArduPilot's own pause works on the way between waypoints only, BRAKE everywhere."""
+        """Hold position. ArduPilot's own pause works between waypoints only, BRAKE everywhere."""
         ways: list[Exchange] = [self.set_mode(self.modes.hold)]
         if self.autopilot is Autopilot.ARDUPILOT:
             ways.insert(0, self._pause_continue(0.0, "pause"))
         return Either(self.vehicle, self.own, steps=ways)
 
     def resume(self, *, in_mission_mode: bool) -> Exchange:
-        """Go on with the mission from where it was."""
+        """Continue the mission where it was left."""
         if self.autopilot is Autopilot.ARDUPILOT and in_mission_mode:
             return self._pause_continue(1.0, "resume")
         return self.set_mode(self.modes.mission)

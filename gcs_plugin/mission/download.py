@@ -21,7 +21,7 @@ class MissionDownload(Exchange):
 
     Attributes:
         patience_s: silence after which it gives up.
-        items: what the vehicle holds, None until all of it is here.
+        items: the stored mission, None until it is complete.
     """
 
     patience_s: float = 30.0
@@ -37,27 +37,27 @@ class MissionDownload(Exchange):
     _refused: int = field(default=ACCEPTED, init=False)
 
     def start(self, now: float) -> list[Message]:
-        """Ask for the list."""
+        """Request the list."""
         self._heard_at = now
         self._trip.longest_s = 2.0 / max(1.0, self.pace)
         self._trip.wait_s = min(self._trip.wait_s, self._trip.longest_s)
         return self._restart(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Take MISSION_COUNT, items and refusals."""
+        """Process MISSION_COUNT, items and refusals."""
         kind = self._mission_kind(message)
         if kind == "MISSION_COUNT":
             return self._counted(int(message.count), now)
         if kind in ("MISSION_ITEM_INT", "MISSION_ITEM"):
             return self._received(message, now)
         if kind == "MISSION_ACK" and message.type != ACCEPTED:
-            # Busy with an upload, or it has forgotten that we are reading: begin again a little later.
+            # Busy with an upload, or it has dropped our download: start again a little later.
             self._refused, self._asks_list = int(message.type), True
             self.deadline = now + (_BUSY_S if message.type == DENIED else _BUSY_S / max(1.0, self.pace))
         return []
 
     def tick(self, now: float) -> list[Message]:
-        """Ask again for what did not come."""
+        """Repeat unanswered requests."""
         if self.outcome is not None or now < self.deadline:
             return []
         if now - self._heard_at > self.patience_s:
@@ -74,12 +74,12 @@ class MissionDownload(Exchange):
         return self._ask(now, again=True)
 
     def rebooted(self, now: float) -> list[Message]:
-        """Begin again: the vehicle no longer knows that we are reading."""
+        """Start again: the vehicle has dropped the download."""
         return self._restart(now)
 
     @property
     def progress(self) -> float:
-        """Share of the items that are here."""
+        """Share of the items received."""
         if self.outcome is not None:
             return 1.0
         return len(self._got) / self._count if self._count else 0.0

@@ -1,7 +1,8 @@
 """A dialogue with one vehicle as a state machine: messages and the time go in, messages come out.
 
-Whoever drives an exchange (the fleet, a test with a clock of its own) calls `start` once, `feed` for each message of
-the vehicle's autopilot, and `tick` at `deadline` at the latest, sends what comes back, and stops when `outcome` is set.
+The caller (the fleet, or a test with its own clock) calls `start` once, `feed` for each message of
+the vehicle's autopilot, and `tick` at `deadline` at the latest, sends the returned messages, and stops when `outcome`
+is set.
 Times are seconds of any clock that does not go backwards. Nothing here waits, so one thread serves a hundred vehicles.
 """
 
@@ -31,9 +32,9 @@ GROUND_STATION: Final = Address(255, 190)
 
 
 class Verdict(enum.Enum):
-    """What became of a command.
+    """The outcome of a command.
 
-    DONE: the vehicle acknowledged it. REFUSED: the vehicle or the station said no, and why. NOT_SENT: nothing left the
+    DONE: the vehicle acknowledged it. REFUSED: the vehicle or the station refused it. NOT_SENT: nothing left the
     station. UNKNOWN: it was sent and not answered, so that the vehicle may or may not obey.
     """
 
@@ -48,12 +49,12 @@ class Outcome:
     """How an exchange ended.
 
     Attributes:
-        ok: True if what was asked for is true in the vehicle now.
+        ok: True if the vehicle has done it.
         text: one sentence for the user.
         item: sequence number of the mission item that a vehicle refused, None if it is about something else.
         field: the field of that item, empty if none.
         code: the vehicle's MAV_MISSION_RESULT, None without a refusal.
-        failure: what kind of failure it is, where it is one.
+        failure: kind of failure, None without one.
     """
 
     ok: bool
@@ -74,13 +75,13 @@ class Exchange(abc.ABC):
     """The common part of all dialogues.
 
     Attributes:
-        vehicle: who is talked to.
-        own: who we are; replies to others are not ours.
+        vehicle: its address.
+        own: our address; replies to others are ignored.
         outcome: None until it has ended.
         deadline: when `tick` wants to be called next.
-        expires: after this time nothing that begins the command may be sent.
+        expires: after this time nothing that starts the command may be sent.
         pace: seconds of the vehicle's clock in one of ours (a simulation may run fast); its time-outs are its own.
-        delivered: messages that a link took; counted by whoever drives the exchange.
+        delivered: messages that a link accepted; counted by the caller.
     """
 
     vehicle: Address
@@ -93,18 +94,18 @@ class Exchange(abc.ABC):
 
     @abc.abstractmethod
     def start(self, now: float) -> list[Message]:
-        """Begin; returns what is to be sent."""
+        """Start; returns the messages to send."""
 
     @abc.abstractmethod
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Take a message of the vehicle; returns what is to be sent."""
+        """Process a message of the vehicle; returns the messages to send."""
 
     @abc.abstractmethod
     def tick(self, now: float) -> list[Message]:
-        """Let time pass; returns what is to be sent."""
+        """Process the passing of time; returns the messages to send."""
 
     def rebooted(self, now: float) -> list[Message]:
-        """The vehicle has started anew; returns what is to be sent. Most dialogues just go on asking."""
+        """The vehicle has rebooted; returns the messages to send. Most dialogues just repeat their requests."""
         return []
 
     def cancel(self, why: str) -> None:
@@ -114,7 +115,7 @@ class Exchange(abc.ABC):
             self._end(False, f"vehicle {self.vehicle.system}: {why}", sent)
 
     def took(self) -> None:
-        """A link has taken a message of this exchange."""
+        """A link has accepted a message of this exchange."""
         self.delivered += 1
 
     @property
@@ -143,7 +144,7 @@ class Exchange(abc.ABC):
 
 @dataclass(slots=True)
 class RoundTrip:
-    """How long to wait for an answer before asking again: a few times what answers took, longer after silence.
+    """Time to wait for an answer before repeating a request: a few round-trip times, longer after silence.
 
     Attributes:
         wait_s: the time to wait now.
@@ -156,12 +157,12 @@ class RoundTrip:
     _smooth_s: float | None = None
 
     def answered(self, took_s: float, *, asked_again: bool) -> None:
-        """An answer came. Which of several equal questions it answers is not known, so those tell nothing."""
+        """An answer arrived; after repeated requests it is ambiguous which one it answers, so it is not measured."""
         if not asked_again:
             self._smooth_s = took_s if self._smooth_s is None else 0.8 * self._smooth_s + 0.2 * took_s
             self._usual_s = max(0.2, 4.0 * self._smooth_s)
         self.wait_s = min(self.longest_s, self._usual_s)
 
     def missed(self) -> None:
-        """No answer came in time."""
+        """No answer arrived in time."""
         self.wait_s = min(self.longest_s, 1.4 * self.wait_s)

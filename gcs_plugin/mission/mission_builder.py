@@ -1,4 +1,4 @@
-"""From a plan or a mission file to the items that one autopilot wants.
+"""Builds the mission items for one autopilot from a plan or a mission file.
 
 ArduPilot's item 0 is home, which it overwrites: a list without it loses its takeoff. PX4's item 0 is flown: a list with
 home in front is refused at MISSION_START. ArduPilot refuses NaN in a parameter; PX4 reads a yaw of 0 as "turn north",
@@ -46,7 +46,7 @@ def build_mission(
         name: for messages.
 
     Raises:
-        InputError: nothing to fly, a place that is none, or more items than the autopilot holds.
+        InputError: nothing to fly, an invalid position, or more items than the autopilot can store.
     """
     flown = [_wire(item, autopilot) for item in items]
     if not flown:
@@ -81,7 +81,7 @@ def read_mission(path: Path, autopilot: Autopilot) -> Mission:
 
 
 def trigger_sections(items: Sequence[MissionItem]) -> list[tuple[int, int, float]]:
-    """Where the camera is on: sequence number of the trigger, of its end, and its distance in metres."""
+    """Sections with the camera on: sequence number of the trigger, of its end, and its distance in metres."""
     sections: list[tuple[int, int, float]] = []
     begun: tuple[int, float] | None = None
     for seq, item in enumerate(items):
@@ -100,7 +100,8 @@ def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
     if not placed.has_place:
         x, y = (int(value) if math.isfinite(value) else 0 for value in (item.lat_deg, item.lon_deg))
         placed = replace(placed, x=x, y=y)
-        if item.command == TRIGGER_DISTANCE:  # its param5 to 7 mean nothing; files carry rests of other items there
+        # its param5 to 7 are unused; files may have leftovers of other items there
+        if item.command == TRIGGER_DISTANCE:
             placed = MissionItem.do(item.command, *item.params)
     params = [_for(value, autopilot) for value in placed.params]
     if autopilot is Autopilot.PX4 and item.command in _WITH_YAW and not params[3]:

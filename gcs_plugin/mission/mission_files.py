@@ -1,7 +1,7 @@
 """Missions as files: QGroundControl `.plan` (JSON) and `.waypoints` ("QGC WPL 110"), read and written.
 
-A mission here is a row of items WITHOUT the home position, numbered from nothing: seq 0 is home on ArduPilot and the
-first item on PX4, so only whoever uploads or writes adds it. `.plan` never holds home as an item; `.waypoints` always
+A mission here is a list of items WITHOUT the home position and without numbers: seq 0 is home on ArduPilot and the
+first item on PX4, so home is added only for upload or writing. `.plan` never holds home as an item; `.waypoints` always
 does, as line 0.
 """
 
@@ -62,11 +62,11 @@ class Mission:
 
     Attributes:
         items: the items in order, home not among them.
-        home: latitude, longitude (degrees) and altitude (metres) of home, where the file tells.
+        home: latitude, longitude (degrees) and altitude (metres) of home, None if not in the file.
         surveys: outlines of survey items, each a ring of (latitude, longitude) in degrees.
         polylines: centre lines of corridor items, (latitude, longitude) in degrees.
         no_fly: rings of exclusion fences, (latitude, longitude) in degrees.
-        speed_m_s: speed that the file asks for, or None.
+        speed_m_s: speed set in the file, or None.
     """
 
     items: tuple[MissionItem, ...]
@@ -77,7 +77,7 @@ class Mission:
     speed_m_s: float | None = None
 
     def lines(self) -> tuple[tuple[LatLon, ...], ...]:
-        """What is to be photographed: the stretches flown with the camera triggering by distance, if any, else all.
+        """The lines to be photographed: the sections flown with the camera triggering by distance, if any, else all.
 
         Each is a row of latitudes and longitudes in degrees of two or more waypoints; takeoff and landing are left out.
         """
@@ -195,7 +195,7 @@ def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float
 
 
 def parse_mission(text: str, name: str = "the file") -> Mission:
-    """Read a `.plan` or a `.waypoints` file, told apart by content.
+    """Read a `.plan` or a `.waypoints` file, distinguished by content.
 
     Args:
         text: the file's content.

@@ -1,4 +1,4 @@
-"""The folder of a plan: which mission file is whose, and when each vehicle takes off."""
+"""The folder of a plan: the mission file and takeoff time of each vehicle."""
 
 import json
 import re
@@ -12,7 +12,7 @@ def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]
 
     Args:
         folder: as `orthoswarm plan` writes it; without its report, files named v1.plan or v1.waypoints and so on.
-        sortie: which flight, from 1; vehicles with fewer flights stay away.
+        sortie: which flight, from 1; vehicles with fewer flights are left out.
 
     Raises:
         InputError: there is no such plan or flight.

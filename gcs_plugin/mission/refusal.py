@@ -25,8 +25,8 @@ class Refusal:
 
     Attributes:
         code: MAV_MISSION_RESULT.
-        item: sequence number that it is about, None if it is about the mission as a whole.
-        field: the field that it is about, empty if none.
+        item: sequence number of the refused item, None if the complete mission is refused.
+        field: the refused field, empty if none.
         reason: one sentence without the vehicle's name.
     """
 
@@ -41,8 +41,8 @@ def explain(code: int, mission: Mission, item: int | None) -> Refusal:
 
     Args:
         code: MAV_MISSION_RESULT of the acknowledgement.
-        mission: what was being uploaded.
-        item: the item that the vehicle had been sent last, None if it had not asked for one yet.
+        mission: the uploaded mission.
+        item: the last item sent, None if the vehicle had not requested one yet.
     """
     if code == DENIED:
         return Refusal(code, None, "", "another ground station is uploading to it; wait until that has ended")

@@ -1,4 +1,4 @@
-"""Where a vehicle is when it flies a mission, and whether two missions keep apart: the planner's own model and measure.
+"""Positions of vehicles over time on their missions, and the separation of missions, by the planner's own model.
 
 A mission is a path: takeoff at home, waypoints, the way back. The planner's `Motion` says when each point of it is
 passed (orthoswarm.planning.sorties.flight_time), and vehicles keep apart if at any moment, and a few seconds earlier or
@@ -90,13 +90,13 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
 
 
 def flight_seconds(mission: "Mission") -> float:
-    """How long a mission takes, by the planner's model."""
+    """Duration of a mission by the planner's model, seconds."""
     home = _home_of(mission)
     return 0.0 if home is None else _STEP_S * max(0, len(track_of(mission, home).places) - 1)
 
 
 def highest_m(mission: "Mission") -> float | None:
-    """The greatest height above takeoff in a mission, None where it says none."""
+    """The greatest height above takeoff in a mission, None if it contains none."""
     base = _ground_m(mission)
     heights = [
         item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
@@ -108,7 +108,7 @@ def highest_m(mission: "Mission") -> float | None:
 
 @dataclass(slots=True)
 class Airspace:
-    """Missions that are flown together, and the times at which that is safe.
+    """Missions that are flown together, and their safe start times.
 
     Attributes:
         tracks: by system id.
@@ -129,9 +129,9 @@ class Airspace:
         return cls({s: track_of(mission, origin) for s, mission in missions.items()}, distance_m, height_m)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
-        """When (seconds after the first one's start) and how near two come if the other starts so much later.
+        """When (seconds after the first one's start) and how close two vehicles come if the other starts later.
 
-        None if they keep apart by the plan's measure: at any moment, and `slack_s` earlier or later.
+        None if they stay separated by the plan's measure: at any time, and `slack_s` earlier or later.
         """
         a, b = self.tracks[one].places, self.tracks[other].places
         if not len(a) or not len(b):
@@ -158,7 +158,7 @@ class Airspace:
         return worst
 
     def conflicts(self, starts: Mapping[int, float]) -> list[tuple[int, int, float, float]]:
-        """Pairs that come too near with these starts: both vehicles, when on the starts' clock, how near in metres."""
+        """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres."""
         systems = sorted(set(starts) & set(self.tracks))
         found = []
         for index, one in enumerate(systems):
@@ -169,7 +169,7 @@ class Airspace:
         return found
 
     def next_start(self, system: int, earliest_s: float, others: Mapping[int, float]) -> float:
-        """The first time, not before `earliest_s`, at which a vehicle keeps apart from others that have their times.
+        """The first time, not before `earliest_s`, at which a vehicle stays separated from others with fixed times.
 
         Args:
             system: the vehicle. earliest_s: on the clock of the others' starts.

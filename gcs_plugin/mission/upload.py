@@ -3,8 +3,8 @@
 The vehicle leads: MISSION_COUNT makes it ask for one item after the other, in its own time, and it acknowledges at the
 end (https://mavlink.io/en/services/mission.html). An item that brings no further request is sent once more before the
 vehicle asks again: ArduPilot takes a second for that. Every one of these messages may be lost, doubled or late, so
-neither an acknowledgement nor its absence is believed: the mission is read back and compared. ArduPilot's store is not
-atomic; after a refusal or a time-out it holds a mixture of the old and the new mission, which must never pass for a
+neither an acknowledgement nor its absence is trusted: the mission is read back and compared. ArduPilot's store is not
+atomic; after a refusal or a time-out it holds a mixture of the old and the new mission, which must never count as a
 success.
 
 What the acknowledgements mean in practice (measured): 13 (invalid sequence) answers a duplicate and is not the end; 1
@@ -23,7 +23,8 @@ from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip, V
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.refusal import ACCEPTED, CANCELLED, DENIED, ERROR, INVALID_SEQUENCE, NO_SPACE, Refusal, explain
 
-# Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): silence of a few of these means more than loss.
+# Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): a silence of several intervals is more than packet
+# loss.
 _COUNT_AGAIN_S: Final = 1.0
 _SILENCE_S: Final = 4.0
 _LAST_SILENCE_S: Final = 3.0
@@ -31,14 +32,14 @@ _AFTER_REFUSAL_S: Final = 0.3
 _DENIED_AGAIN_S: Final = 1.5
 _DOUBT_S: Final = 1.5
 _CLEARS: Final = 6
-# How often a store may differ after a whole upload before that is reported.
+# How often the stored mission may differ after a complete upload before that is reported.
 _MIXTURES: Final = 4
 # Copies of one request within this time are the network's; a vehicle that misses an item waits longer.
 _SAME_REQUEST_S: Final = 0.03
 
 
 class Stage(enum.Enum):
-    """What the upload is waiting for."""
+    """The state of an upload."""
 
     COUNT = "announced"
     ITEMS = "sending"
@@ -50,12 +51,12 @@ class Stage(enum.Enum):
 
 @dataclass(slots=True)
 class MissionUpload(Exchange):
-    """One upload; its outcome is ok only if the vehicle was seen to hold this mission and nothing else.
+    """One upload; its outcome is ok only if the mission read back from the vehicle is this one.
 
     Attributes:
         mission: what to upload.
         patience_s: silence after which it gives up.
-        attempts: how often it begins anew (time-outs of the vehicle, reboots, a store that differs).
+        attempts: number of restarts (time-outs of the vehicle, reboots, a different stored mission).
         stage: what it is doing.
         refusal: the vehicle's refusal in words, where the outcome is one.
     """
@@ -89,7 +90,7 @@ class MissionUpload(Exchange):
         return self._announce(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
-        """Take requests, acknowledgements and, while reading back, items."""
+        """Process requests, acknowledgements and, while reading back, items."""
         kind = self._mission_kind(message)
         if self.stage is Stage.CLEAR:
             if kind == "MISSION_ACK" and message.type == ACCEPTED:
@@ -104,7 +105,7 @@ class MissionUpload(Exchange):
         return []
 
     def tick(self, now: float) -> list[Message]:
-        """Repeat, begin anew, or give up."""
+        """Repeat, start again, or give up."""
         if self.outcome is not None or now < self.deadline:
             return []
         if self.stage is Stage.CLEAR:
@@ -130,7 +131,7 @@ class MissionUpload(Exchange):
         return self._announce(now)
 
     def rebooted(self, now: float) -> list[Message]:
-        """Begin anew: a vehicle that restarts has forgotten the upload, and perhaps keeps half of it."""
+        """Start again: a rebooted vehicle has dropped the upload, and perhaps stored half of it."""
         return [] if self.outcome is not None else self._announce(now)
 
     @property
@@ -198,7 +199,7 @@ class MissionUpload(Exchange):
         if code != DENIED:
             self._heard_at = now
         if self._reading is not None:
-            if code == CANCELLED:  # it had still been waiting for an item
+            if code == CANCELLED:  # it was still waiting for an item
                 return self._announce(now)
             return self._read(self._reading.feed(message, now), now)
         if code == INVALID_SEQUENCE and self.stage is Stage.ITEMS and self._repeated and not self._all_sent:

@@ -1,4 +1,4 @@
-"""A bad radio link in memory: packets are lost, doubled and late, reproducibly, in a time of its own."""
+"""A simulated bad radio link: packets are lost, repeated and delayed, reproducibly, in simulated time."""
 
 import heapq
 import itertools
@@ -15,10 +15,10 @@ _QUEUE_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What a link does to packets, each on its own.
+    """Faults of a link, applied to each packet independently.
 
     Attributes:
-        loss: share of packets that vanish, 0 to 1.
+        loss: share of packets lost, 0 to 1.
         duplicate: share of packets that arrive twice.
         delay_s: least and greatest delay; packets overtake each other within it.
         silent: intervals (from, to) in seconds in which nothing gets through.
@@ -81,7 +81,7 @@ class Channel(Generic[Cargo]):
             heapq.heappush(self._queue, (arrival, next(self._order), cargo))
 
     def take(self, now: float) -> list[Cargo]:
-        """The packets that have arrived by now, in order of arrival."""
+        """The packets that have arrived, in order of arrival."""
         arrived: list[Cargo] = []
         while self._queue and self._queue[0][0] <= now:
             arrived.append(heapq.heappop(self._queue)[2])

@@ -1,4 +1,4 @@
-"""Simulated vehicles behind a link in memory, in a time of its own: hours of flight in seconds, the same every time."""
+"""Simulated vehicles on a link in memory, in simulated time: hours of flight in seconds, reproducibly."""
 
 import selectors
 from collections.abc import Callable, Iterator, Sequence
@@ -38,7 +38,7 @@ class VirtualClock:
 
 
 class SimLink(Link):
-    """A link whose other end are simulated vehicles, each a peer of its own.
+    """A link to simulated vehicles, each a separate peer.
 
     Attributes:
         vehicles: the vehicles.
@@ -76,7 +76,7 @@ class SimLink(Link):
         return True
 
     def receive(self, source: Any, events: int, now: float) -> Iterator[tuple[Peer, bytes]]:
-        """Let the vehicles take what has arrived, live up to now, and speak."""
+        """Let the vehicles receive, advance to the present time, and send."""
         for peer, data in self.up.take(now):
             for packet in self._framers[peer].feed(data):
                 sender = Address(packet.system, packet.component)
@@ -100,7 +100,7 @@ class World:
         vehicles: by system id.
         fleet: the ground station.
         clock: the time of both.
-        events: what the fleet has said.
+        events: of the fleet.
         link: the radio between them.
     """
 
@@ -121,7 +121,7 @@ class World:
         self.fleet.close()
 
     def until(self, done: Callable[[], bool], limit_s: float = 600.0, step_s: float = 0.02) -> bool:
-        """Let time pass until something is so, at most so long; returns whether it is."""
+        """Advance time until a condition holds or the limit; returns whether it holds."""
         end = self.clock.now + limit_s
         while not done() and self.clock.now < end:
             self.clock.now += step_s
@@ -129,16 +129,16 @@ class World:
         return done()
 
     def wait(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance time."""
         self.until(lambda: False, seconds)
 
     def finish(self, *dialogues: Exchange, limit_s: float = 600.0) -> list[Outcome | None]:
-        """Let time pass until dialogues have ended; returns how."""
+        """Advance time until dialogues have ended; returns their outcomes."""
         self.until(lambda: all(dialogue.outcome is not None for dialogue in dialogues), limit_s)
         return [dialogue.outcome for dialogue in dialogues]
 
     def meet(self) -> None:
-        """Let time pass until all vehicles are found and their streams run."""
+        """Advance time until all vehicles are found and their streams run."""
         self.until(lambda: all(v in self.fleet.vehicles for v in self.vehicles), 30.0)
         self.until(lambda: all(v.lat_deg is not None and v.landed for v in self.fleet.vehicles.values()), 30.0)
 

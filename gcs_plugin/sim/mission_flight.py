@@ -1,4 +1,4 @@
-"""How a simulated vehicle flies its mission: item by item, with the camera, and ending it as its autopilot does."""
+"""A simulated vehicle's flight of its mission: items, camera, and the end as its autopilot does it."""
 
 import enum
 from collections.abc import Collection
@@ -49,7 +49,7 @@ class State(enum.IntEnum):
 
 
 class Task(enum.Enum):
-    """What the vehicle is doing."""
+    """The vehicle's present task."""
 
     STAND = "stand"
     HOLD = "hold"
@@ -66,8 +66,8 @@ class Exposure:
     Attributes:
         index: counts from 0.
         time_s: seconds since boot.
-        pose: where the vehicle truly was.
-        lat_deg: where it believed to be; lon_deg: longitude.
+        pose: the vehicle's true pose.
+        lat_deg: latitude by its receiver; lon_deg: longitude.
     """
 
     index: int
@@ -79,12 +79,12 @@ class Exposure:
 
 @dataclass(slots=True)
 class Flight:
-    """Everything about flying.
+    """The flight of one vehicle.
 
     Attributes:
         autopilot: the dialect; modes: its modes.
         store: the mission.
-        motion: where it is.
+        motion: its position and velocity.
         mode: custom mode number.
         armed: motors on.
         seq: current item; state: MISSION_STATE.
@@ -264,7 +264,7 @@ class Flight:
         self._run_from(max(self.seq, self._first))
 
     def _run_from(self, seq: int) -> None:
-        """Do what needs no flying, up to the next item that is flown."""
+        """Execute items up to the next one that is flown."""
         while seq < len(self.store.items):
             item = self.store.items[seq]
             if item.is_nav:
@@ -352,7 +352,7 @@ class Flight:
     # --- going home and landing ---
 
     def _hold(self, *, at_target: bool = False) -> None:
-        """Stay: at the last waypoint, or where it is."""
+        """Hold position: at the last waypoint, or here."""
         if not at_target:
             self.motion.stop()
         self._task = Task.HOLD

@@ -42,7 +42,7 @@ class _Transfer:
 
 @dataclass(slots=True)
 class MissionStore:
-    """What a vehicle holds, and the dialogue by which it changes.
+    """A vehicle's stored mission, and the protocol that changes it.
 
     Attributes:
         autopilot: the dialect.
@@ -63,7 +63,7 @@ class MissionStore:
     _next_sent: int = 0
 
     def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
-        """Take a message of the mission protocol that is meant for this vehicle; returns the answers."""
+        """Process a message of the mission protocol for this vehicle; returns the answers."""
         if getattr(message, "mission_type", _MISSION) != _MISSION:
             return [self._ack(sender, UNSUPPORTED, int(message.mission_type))]
         match message.get_type():
@@ -89,7 +89,7 @@ class MissionStore:
         return []
 
     def tick(self, now: float) -> list[Message]:
-        """Ask again for an item that does not come, and give up in the end."""
+        """Request a missing item again, and finally give up."""
         transfer = self._transfer
         if transfer is None:
             return []
@@ -185,7 +185,7 @@ class MissionStore:
         self.items[seq : seq + 1] = [item]
 
     def _as_stored(self, item: MissionItem, seq: int) -> MissionItem:
-        """What ArduPilot gives back: see `mission.compare`."""
+        """An item as ArduPilot returns it: see `mission.comparison`."""
         if seq == 0:
             return self.home
         params = tuple(_kept(value) for value in item.params)

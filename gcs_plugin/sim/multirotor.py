@@ -1,4 +1,4 @@
-"""How a simulated multirotor moves: straight to its target, with limited acceleration, leaning into it, nose ahead.
+"""Motion of a simulated multirotor: straight to its target with limited acceleration, tilted accordingly, nose ahead.
 
 Positions are metres north and east of home and up from it, in a chart of the ellipsoid around home (degrees have the
 length everywhere that they have at home's latitude). Angles are radians: yaw clockwise from true north, pitch nose up,
@@ -57,7 +57,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a vehicle truly is.
+    """The true pose of a vehicle.
 
     Attributes:
         time_s: seconds since its boot.
@@ -78,7 +78,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Airframe:
-    """What a vehicle can do.
+    """Performance of a vehicle.
 
     Attributes:
         speed_m_s: cruise, until a mission says otherwise; climb_m_s, sink_m_s: vertical speeds.
@@ -106,7 +106,7 @@ class Motion:
         chart: around home.
         north: true position with east and up; velocities vn, ve, vu.
         speed: present cruise speed, m/s.
-        target: where it wants to be (north, east, up), None to stay on the ground; see `go`.
+        target: its target (north, east, up), None to stay on the ground; see `go`.
     """
 
     chart: Chart
@@ -144,7 +144,7 @@ class Motion:
         self.target = target
 
     def stop(self) -> None:
-        """Come to rest as soon as it can, ahead of here."""
+        """Stop as soon as possible."""
         north, east = self.seen
         after_s = math.hypot(self.vn, self.ve) / (2.0 * self.airframe.accel_m_s2) + 0.7
         self.go((north + self.vn * after_s, east + self.ve * after_s, self.up))
@@ -156,7 +156,7 @@ class Motion:
 
     @property
     def seen(self) -> tuple[float, float]:
-        """North and east as its receiver has it."""
+        """North and east from its receiver."""
         return self.north + self._error[0], self.east + self._error[1]
 
     def distance(self) -> tuple[float, float]:
@@ -208,7 +208,7 @@ class Motion:
         distance = math.hypot(target[0] - seen_north, target[1] - seen_east)
         dn, de = self._carrot(target, seen_north, seen_east)
         ahead = math.hypot(dn, de)
-        # As fast as it may go and still stop in time, with a little in hand for the lag of its lean.
+        # The highest speed from which it can stop in time, with a margin for the lag of its tilt.
         wanted = min(self.speed, math.sqrt(1.4 * frame.accel_m_s2 * distance), 0.8 * distance)
         scale = wanted / ahead if ahead > 1e-6 else 0.0
         an, ae = (dn * scale - self.vn) / 0.5, (de * scale - self.ve) / 0.5

@@ -36,7 +36,7 @@ class _End:
 
 
 class SimSwarm:
-    """Runs simulated vehicles on links of their own, in a thread (`with SimSwarm(...)`) or in the caller's (`run`).
+    """Runs simulated vehicles on their own links, in a thread (`with SimSwarm(...)`) or in the caller's (`run`).
 
     Attributes:
         vehicles: by system id.
@@ -61,7 +61,7 @@ class SimSwarm:
             vehicles: the vehicles.
             address: `udpout:HOST:PORT`, each vehicle from a port of its own to a ground station there, or
                 `tcpin:HOST:PORT`, the vehicles serving PORT, PORT + 1 and so on (0: any free ones).
-            together: all of them behind one link, as behind a router or a radio.
+            together: True for all on one link, as behind a router or a radio.
             speed: vehicle seconds in a second.
             up: faults from the ground to the vehicles, in vehicle time.
             down: faults back.
@@ -96,7 +96,7 @@ class SimSwarm:
 
     @property
     def addresses(self) -> list[str]:
-        """Where a ground station connects to vehicles that serve TCP."""
+        """Addresses of vehicles that serve TCP."""
         return [f"tcp:127.0.0.1:{end.link.port}" for end in self._ends if isinstance(end.link, TcpLink)]
 
     @property
@@ -109,7 +109,7 @@ class SimSwarm:
         self._work.put(lambda now: self.vehicles[system].reboot(now, silence_s))
 
     def silence(self, system: int, seconds: float) -> None:
-        """Let a vehicle go on but not be heard, nor hear, for so many of its seconds (any thread)."""
+        """Cut a vehicle's link in both directions for some of its seconds (any thread)."""
         self._work.put(lambda now: self._muted.__setitem__(system, now + seconds))
 
     def __enter__(self) -> "SimSwarm":
@@ -130,7 +130,7 @@ class SimSwarm:
         self._selector.close()
 
     def run(self, stop: threading.Event, until_s: float = float("inf")) -> None:
-        """Fly until told to stop, or until so many vehicle seconds have passed."""
+        """Fly until stopped, or for a number of vehicle seconds."""
         while not stop.is_set() and self.now < until_s:
             started = self._clock()
             self.step()
@@ -138,7 +138,7 @@ class SimSwarm:
             self._selector.select(max(0.0, spare))
 
     def step(self) -> None:
-        """Take what has arrived, let time pass, and speak."""
+        """Receive, advance time, and send."""
         now = self.now
         while not self._work.empty():
             self._work.get()(now)

@@ -1,4 +1,4 @@
-"""A simulated vehicle: a small autopilot that takes and gives MAVLink messages, in a time of its own.
+"""A simulated vehicle: a small autopilot that receives and sends MAVLink messages in simulated time.
 
 ArduPilot's dialect sends heartbeats only until it is asked for more; PX4's sends 50 Hz of position and attitude as soon
 as a ground station is there. Both answer commands and missions as measured (docs/vehicles.md).
@@ -42,15 +42,15 @@ class SimVehicle:
 
     Attributes:
         system: system id.
-        autopilot: dialect. kind: MAV_TYPE that it says it is; it flies as a multirotor all the same.
+        autopilot: dialect. kind: MAV_TYPE that it reports; it flies as a multirotor in any case.
         home: latitude, longitude (degrees), altitude (metres).
-        airframe: what it can do.
+        airframe: its performance.
         boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
-        ready_s: when its filter has a position, so that it lets itself be armed; its receiver has a fix before that.
+        ready_s: when its filter has a position, so that it can be armed; its receiver has a fix before that.
         seed: of its receiver's errors.
         arms: False for one that refuses to arm although all its checks pass.
         wipes: True for ArduPilot's simulation with -w, which loses the mission at each restart.
-        tx_bytes_s: what its radio carries. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
+        tx_bytes_s: capacity of its radio. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
             are sent first.
         on_exposure: called at each picture.
     """
@@ -107,7 +107,7 @@ class SimVehicle:
         return self._now < self._off_until
 
     def pose_at(self, time_s: float) -> Pose:
-        """Where it truly was at a time since boot, in the last ten minutes of flight."""
+        """Its true pose at a time since boot, in the last ten minutes of flight."""
         return self.flight.motion.pose_at(time_s)
 
     def utc_s(self, time_s: float) -> float:
@@ -115,7 +115,7 @@ class SimVehicle:
         return self.boot_utc_s + time_s
 
     def reboot(self, now: float, silence_s: float = 3.0) -> None:
-        """Restart: silent for a while, all but the stored mission forgotten."""
+        """Restart: silent for a while, with all state lost except the stored mission."""
         self._off_until = now + silence_s
         self.reboots += 1
         self.store.rebooted()
@@ -136,7 +136,7 @@ class SimVehicle:
     # --- messages in ---
 
     def handle(self, message: Message, sender: Address, now: float) -> list[Message]:
-        """Take a message that is meant for this vehicle or for all; returns the answers."""
+        """Process a message for this vehicle or for all; returns the answers."""
         self._now = max(self._now, now)
         if self.off or getattr(message, "target_system", self.system) not in (0, self.system):
             return []
@@ -196,7 +196,7 @@ class SimVehicle:
 
     @property
     def _mission_unchecked(self) -> str:
-        """What PX4 says to a start right after an upload; empty when it has looked at the mission."""
+        """PX4's refusal of a start right after an upload; empty once it has checked the mission."""
         checks = self.autopilot is Autopilot.PX4 and self._now - self.store.stored_at < _CHECKS_MISSION_S
         return "Mission start denied! No valid mission" if checks else ""
 
@@ -229,7 +229,7 @@ class SimVehicle:
     # --- messages out ---
 
     def advance(self, now: float) -> list[Message]:
-        """Let time pass up to now; returns what it says meanwhile."""
+        """Advance to the present time; returns the messages sent meanwhile."""
         self._now = now
         if self.off:
             self._stepped = now
@@ -257,7 +257,7 @@ class SimVehicle:
         return messages
 
     def _spend(self, messages: Sequence[Message], now: float) -> None:
-        """Take messages from what its radio carries."""
+        """Charge messages to the radio's capacity."""
         if self.tx_bytes_s < math.inf:
             self._tx_room = min(_TX_BUFFER, self._tx_room + self.tx_bytes_s * (now - self._tx_at))
             self._tx_room -= sum(_bytes(message) for message in messages)
@@ -265,7 +265,7 @@ class SimVehicle:
 
     @property
     def next_due(self) -> float:
-        """When it has something to say next, as far as is known now."""
+        """Time of its next message, as far as known."""
         return min(self._due[0][0] if self._due else math.inf, self._stepped + STEP_S)
 
     def _stream(self, kind: int, hz: float) -> None:
@@ -276,7 +276,7 @@ class SimVehicle:
             heapq.heappush(self._due, (self._now + 1.0 / hz, kind))
 
     def _happened(self) -> list[Message]:
-        """What must be told at once: reached items, texts, pictures, arming."""
+        """Messages to be sent at once: reached items, texts, pictures, arming."""
         flight = self.flight
         messages: list[Message] = []
         if flight.reached:
@@ -406,7 +406,7 @@ class SimVehicle:
         return dialect.MAVLink_sys_status_message(said, said, health, 250, 15800, 1200, left, 0, 0, 0, 0, 0, 0)
 
     def _filter(self) -> Message:
-        """What it says of its filter; flags as ArduCopter 4.7 and PX4 were seen to send them."""
+        """Its message about the filter, with the flags that ArduCopter 4.7 and PX4 were observed to send."""
         if self.autopilot is Autopilot.PX4:
             flags = 0x3FF if self._ready else 0xA5
             return dialect.MAVLink_estimator_status_message(self._boot_ms * 1000, flags, *(0.0,) * 8)

@@ -1,7 +1,7 @@
-"""The out-of-core canvas: an RGBA raster of any size on the ground, of which only what was drawn takes room.
+"""The out-of-core canvas: an RGBA raster of any size on the ground; only drawn tiles use disk space.
 
 100 km2 at 0.1 m is 10^10 pixels in 38,000 tiles: making such a canvas writes a few hundred kilobytes, drawing maps
-single tiles (tiles.TileStore), looking at all of it reads the reduced copies (overview.Overview).
+single tiles (tile_store.TileStore), a view of all of it reads the reduced copies (overviews.Overview).
 
 Crash safety (a killed process, not a power cut, which needs `flush`): a tile's new version goes to disk before its
 first pixel changes and into memory after its last one, and whoever draws writes a pixel's colour before its score. So
@@ -36,7 +36,7 @@ _DTYPES: dict[str, type[np.generic]] = {"orthogonality": np.float32, "frame": np
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What `canvas.json` says.
+    """The content of `canvas.json`.
 
     Attributes:
         grid: where the canvas lies.
@@ -85,7 +85,7 @@ class Canvas:
         self._overview = Overview(path, self.tile_rows, self.tile_cols, self.tile_px, writable=writable)
         self._index = VersionIndex(path / "versions.u64", (self.tile_rows, self.tile_cols), writable=writable)
         self._reduced = VersionIndex(path / "reduced.u64", (self.tile_rows, self.tile_cols), writable=writable)
-        if writable and self._index.newest == 0:  # a lost index: what is there counts as changed once
+        if writable and self._index.newest == 0:  # a lost index: all existing tiles count as changed once
             for key in self._store.existing():
                 self._index.put(key, 1, visible=True)
         self._version = self._index.newest
@@ -135,7 +135,7 @@ class Canvas:
 
     @classmethod
     def open(cls, path: Path, *, memory_mb: float = 128.0, writable: bool = True) -> "Canvas":
-        """The canvas of a folder as it was left, also by a process that was killed.
+        """Open the canvas of a folder, also one left by a killed process.
 
         Args:
             path: folder.
@@ -174,12 +174,12 @@ class Canvas:
 
     @staticmethod
     def _reset(path: Path) -> None:
-        """Clear what a creation that was killed has left."""
+        """Remove the remains of an interrupted creation."""
         for name in ("versions.u64", "reduced.u64", *(f"overview{factor}.rgba" for factor in FACTORS)):
             (path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Bring the overviews of rendered tiles up to date and let go of all files."""
+        """Update the overviews of rendered tiles and close all files."""
         with self._lock:
             self._store.close()
             self._overview.close()
@@ -193,13 +193,13 @@ class Canvas:
         self.close()
 
     def flush(self) -> None:
-        """Force what was drawn to the disk, so that a power cut does not lose it."""
+        """Sync drawn tiles to the disk against power cuts."""
         self._store.flush()
         self._index.flush()
 
     @property
     def mapped_mb(self) -> float:
-        """Megabytes of tiles that are mapped now."""
+        """Size of the mapped tiles, megabytes."""
         return self._store.mapped * 8e-6 * self.tile_px**2
 
     # -- drawing --------------------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ class Canvas:
             return tile
 
     def commit(self, key: Key) -> int:
-        """Publish what was drawn on a tile since `begin`; gives its new version."""
+        """Publish changes of a tile since `begin`; returns its new version."""
         with self._lock:
             self._version += 1
             self._index.publish(key, self._version)
@@ -227,7 +227,7 @@ class Canvas:
         """Replace tiles by those of another store of the same layout (moved, one at a time and each at once).
 
         Args:
-            staged: where the new tiles are, on the same file system; its maps are let go.
+            staged: store of the new tiles, on the same file system; its maps are released.
             keys: the tiles to replace; one that the store does not have becomes empty.
         """
         staged.close()
@@ -249,7 +249,7 @@ class Canvas:
                 self.commit(key)
 
     def staging(self, name: str, *, memory_mb: float = 128.0) -> TileStore:
-        """A store of the same layout in a sub-folder, to prepare tiles in that `adopt` then takes over."""
+        """A store of the same layout in a sub-folder, for preparing tiles for `adopt`."""
         return TileStore(
             self.path / name, tile_px=self.tile_px, dtype=_DTYPES[self.plane], memory_mb=memory_mb, writable=True
         )
@@ -298,7 +298,7 @@ class Canvas:
         )
 
     def _follow(self) -> None:
-        if not self._writable:  # another process writes
+        if not self._writable:  # written by another process
             self._index.reload()
             self._version = self._index.newest
 

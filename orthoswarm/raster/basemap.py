@@ -1,7 +1,7 @@
 """The pre-disaster map: windows of a GeoTIFF, COG, MBTiles file or folder of XYZ tiles on the area's grid.
 
-Nothing is read but the windows that are asked for. Whatever the file holds (grey, colour, palette, 16 bit, floats,
-alpha, nodata, a rotated or foreign grid) leaves here as 8-bit values and a mask of where they mean something.
+Only requested windows are read. All kinds of content (grey, colour, palette, 16 bit, floats,
+alpha, nodata, a rotated or different grid) are returned as 8-bit values and a validity mask.
 """
 
 from functools import cached_property
@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 
 class _Source(Protocol):
-    """Where pixels come from: a raster file or a folder of tiles."""
+    """A source of pixels: a raster file or a folder of tiles."""
 
     native_gsd_m: float
     bounds: BoundingBox
@@ -32,14 +32,14 @@ class _Source(Protocol):
         """A pixel size for each of the resolutions that are stored, metres."""
 
     def require_complete(self, bounds: BoundingBox) -> None:
-        """Raise UnreadableMapError if the file is shorter than what it says to hold within bounds."""
+        """Raise UnreadableMapError if the file is too short for its blocks within bounds."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
         """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
 
 
 class Basemap:
-    """A pre-disaster map as the core sees it (`placement.MapWindow`); may be pickled and shared among threads.
+    """A pre-disaster map (a `placement.MapWindow`); can be pickled and shared among threads.
 
     Attributes:
         path: the file or folder.
@@ -53,7 +53,7 @@ class Basemap:
 
     @cached_property
     def _source(self) -> _Source:
-        """The open map; a copy in another process opens its own at its first use, where an error can be said."""
+        """The open map; a copy in another process opens its own at its first use, where an error can be reported."""
         kind = TileFolder if self.path.is_dir() else RasterMap
         return kind(self.path, self.epsg, self._near)
 
@@ -99,10 +99,10 @@ class Basemap:
             )
 
     def require_readable(self, near: BoundingBox) -> None:
-        """Raise UnreadableMapError if a map that was opened is cut short or damaged where it is needed.
+        """Raise UnreadableMapError if the opened map is truncated or damaged where it is needed.
 
         Args:
-            near: west, south, east, north of the area in its grid, metres. Only what the map has of it counts.
+            near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
         """
         bounds = near.intersection(self.bounds)
         if bounds.empty:

@@ -1,4 +1,4 @@
-"""A map in a file that GDAL reads: windows of it on the area's grid, as 8-bit values and where they mean something."""
+"""A map in a file that GDAL reads: windows on the area's grid, as 8-bit values with a validity mask."""
 
 import os
 import threading
@@ -28,7 +28,7 @@ os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """How stored values become 8 bit: per band, low to 0 and high to 255."""
+    """Scaling of stored values to 8 bit: per band, low to 0 and high to 255."""
 
     low: NDArray[np.float32]
     high: NDArray[np.float32]
@@ -83,7 +83,7 @@ class RasterMap:
                 options["USE_BOUNDS"] = "NO"
             try:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", NotGeoreferencedWarning)  # said as an error, in plain words
+                    warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported as an error in plain words
                     handles[key] = rasterio.open(self._path, **options)
             except (RasterioIOError, OSError):
                 raise UnreadableMapError(
@@ -109,7 +109,7 @@ class RasterMap:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        """What goes wrong within is said in plain words."""
+        """Turn GDAL's errors into plain words."""
         try:
             yield
         except (self._error, OSError) as error:
@@ -205,7 +205,7 @@ class RasterMap:
         return data, valid
 
     def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Mask]:
-        """Palette numbers cannot be averaged: take them three times finer, look colours up, then average those."""
+        """Read a palette map three times finer and average the colours, as palette numbers cannot be averaged."""
         import cv2
 
         west, _, _, north = grid.bounds
@@ -330,7 +330,7 @@ def _alpha_range(dtype: str) -> float:
 
 
 def _blank(values: NDArray[Any]) -> Mask:
-    """Where a map without a mask is plain black or plain white over a patch: a collar, which only has false edges."""
+    """Where a map without a mask is uniformly black or white over a patch: a collar, which has only false edges."""
     import cv2
 
     side = active().raster.collar_px

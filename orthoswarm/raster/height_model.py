@@ -1,4 +1,4 @@
-"""An outside height model: a GeoTIFF of any CRS as terrain of the area, relative to the takeoff level."""
+"""The user's height model: a GeoTIFF of any CRS as terrain of the area, relative to the takeoff level."""
 
 import warnings
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class KnownGround:
     """Heights of a DEM in a window.
 
     Attributes:
-        terrain: heights over the model's zero; smoothly filled where the DEM has none.
+        terrain: heights above the model's zero; smoothly filled where the DEM has none.
         known: bool (rows, columns), nodes where it has.
     """
 
@@ -45,9 +45,9 @@ class KnownGround:
 
 @dataclass(frozen=True, slots=True)
 class HeightModel:
-    """A DEM that was looked at: where it lies and what counts as zero. Heights are read where and when they are needed.
+    """A checked DEM: its location and zero level. Heights are read where and when they are needed.
 
-    It is small, so that a task for another process can carry it; the file must lie at the same path there.
+    It is small, so that it can be part of a task for another process; the file must have the same path there.
 
     Attributes:
         path: the file. epsg: CRS of the area.
@@ -62,7 +62,7 @@ class HeightModel:
 
     @classmethod
     def open(cls, path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) -> "HeightModel":
-        """Look at a DEM before the work begins.
+        """Check a DEM before the work starts.
 
         Args:
             path: a GeoTIFF (or anything that GDAL reads) with a CRS. epsg: CRS of the area.
@@ -171,7 +171,7 @@ def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
 
 
 def check_dem(path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) -> None:
-    """Look at a DEM before the work begins.
+    """Check a DEM before the work starts.
 
     Args:
         path, epsg, bounds: see `read_dem`.
@@ -235,7 +235,7 @@ def _on_area(
             raise InputError(f"{name} cannot be read as heights ({error}); check the file") from None
         z = z * float(dataset.scales[0] or 1.0) + float(dataset.offsets[0] or 0.0)
         z *= _METRES.get(str(dataset.units[0] or "").strip().lower(), 1.0)
-    z[~np.isfinite(z) | (z > 12000.0) | (z < -1000.0)] = np.nan  # no ground of this planet
+    z[~np.isfinite(z) | (z > 12000.0) | (z < -1000.0)] = np.nan  # impossible heights
     return np.ascontiguousarray(z[::-1]), left, low, step
 
 

@@ -1,4 +1,4 @@
-"""The map in tiles that are read once, for windows of one pixel size that overlap a lot."""
+"""A cache of map tiles, for many overlapping windows of one pixel size."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,9 @@ TILE_PX = 128
 
 
 class TiledMap:
-    """A `MapWindow` that keeps what it has read at one pixel size; other sizes go to the map itself.
+    """A `MapWindow` that caches what it has read at one pixel size; other sizes are read from the map itself.
 
-    Memory grows with the ground that the windows cover, so one of these serves one task.
+    Memory grows with the ground that the windows cover, so use one instance per task.
     """
 
     def __init__(self, basemap: MapWindow, gsd_m: float) -> None:

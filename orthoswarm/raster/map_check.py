@@ -1,7 +1,7 @@
-"""Whether a map can be read where it is needed: found before the work begins, without reading all of it.
+"""Checks before the work starts that a map can be read where it is needed, without reading all of it.
 
-A copy that was cut short opens like a complete one (a TIFF's directory often stands at its beginning), and blocks that
-were never written are zeros. So the places of all blocks are compared with the file's length, and some are decoded.
+A truncated copy opens like a complete one (a TIFF's directory is often at its beginning), and blocks that
+were never written are zeros. So the offsets of all blocks are compared with the file's length, and some are decoded.
 """
 
 from pathlib import Path
@@ -53,7 +53,7 @@ def ends_early(source: Any, path: Path, window: tuple[int, int, int, int]) -> bo
 
 
 def _last_byte(source: Any, level: int | None, band: int, window: tuple[int, ...]) -> int:
-    """Where the last of the blocks ends that a window of one resolution touches; 0 if it has none of its own."""
+    """End of the last block that a window of one resolution touches; 0 if there is none."""
     high, wide = _block_shape(source, level)
     row0, row1, col0, col1 = window
     last = 0

@@ -25,7 +25,7 @@ class PictureError(OrthoSwarmError):
 
 
 def reduction(width: int, height: int, longest: int) -> int:
-    """By how much a picture of a size may be reduced while it is decoded: 8, 4, 2 or 1.
+    """Factor by which a picture of a size may be reduced while decoding: 8, 4, 2 or 1.
 
     The greatest that leaves at least `longest` pixels on the longer side and divides both sides, so that column u of
     the picture is column (u + 0.5) / factor - 0.5 of the reduced one everywhere.
@@ -129,7 +129,7 @@ def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int
 
 
 def _bytes(path: Path) -> bytes:
-    """A picture file's content, once its size is known to be bearable."""
+    """A picture file's content, after checking its size."""
     data = _content(path)
     if data[:2] == b"\xff\xd8":
         width, height = _jpeg_size(data)
@@ -144,7 +144,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Columns and rows by a JPEG's header; 0, 0 where that is damaged, which decoding says better."""
+    """Columns and rows from a JPEG's header; 0, 0 if that is damaged, which decoding reports better."""
     import simplejpeg
 
     try:

@@ -16,7 +16,7 @@ LEAST_SIDE_PX = _BLOCK_PX + 8
 
 @dataclass(frozen=True, slots=True)
 class PictureQuality:
-    """What a picture's own pixels say about it. Only a comparison with pictures of the same scene makes it a verdict.
+    """Quality measures of a picture's pixels; they are only meaningful compared with pictures of the same scene.
 
     Attributes:
         sharpness: energy of differences over 1 pixel divided by that over 4 pixels, 0 to about 1; it hardly depends on
