@@ -1,4 +1,4 @@
-"""The pictures of a run: which frames each of them shows, and drawing them as COGs."""
+"""The rasters of a run: which frames each shows, and drawing them as COGs."""
 
 import shutil
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 
 
 def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
-    """coarse.tif and orthoimage.tif; gives the frames as last placed."""
+    """Draw coarse.tif and orthoimage.tif; returns the frames as last placed."""
     if refinement is None:
         placed = _looking_down(run, state, state.recorded.placed)
         name = ORTHOIMAGE if run.options.until == "fine" else COARSE
@@ -71,7 +71,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
 
 
 def _looking_down(run: RunContext, state: RunState, placed: Sequence[PlacedFrame]) -> list[PlacedFrame]:
-    """The frames without those that look far aside among others, which are left out."""
+    """The frames without strongly oblique ones among nadir ones, which are left out."""
     aside = strays(placed)
     state.leave_out(aside, placed)
     state.warnings += stray_warning(aside)
@@ -79,7 +79,7 @@ def _looking_down(run: RunContext, state: RunState, placed: Sequence[PlacedFrame
 
 
 def _ground(run: RunContext, state: RunState, refinement: Refinement) -> Terrain | None:
-    """The ground under the pictures: found from them, or an outside height model brought to their level."""
+    """The ground under the pictures: found from them, or the user's height model at their level."""
     if run.options.dem is None or state.dem is not None:  # the refiner has used it
         return refinement.terrain
     fine = [p for s in refinement.fine for p in s.placed]
@@ -147,7 +147,7 @@ def draw(
     *,
     realtime: bool = False,
 ) -> RenderStats:
-    """Render frames on a canvas of their own and write it as a COG."""
+    """Render frames on their own canvas and write it as a COG."""
     drawn = partial(run.progress, f"drawing {name.removesuffix('.tif')}")
     with _canvas(run, name, placed, terrain, state) as canvas:
         if realtime:
@@ -200,10 +200,10 @@ def _copy_coarse(run: RunContext, state: RunState) -> None:
 
 
 def _shared_terrain(solutions: Sequence[Solution]) -> Terrain | None:
-    """The ground that coarse solutions share, None where there is none."""
+    """The common ground of coarse solutions, None if there is none."""
     return next((s.terrain for s in solutions if s.terrain is not None), None)
 
 
 def _named(vehicle: str, warning: str) -> str:
-    """A warning that begins with whom it is about."""
+    """A warning that begins with its vehicle's name."""
     return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"

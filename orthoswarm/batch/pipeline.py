@@ -50,17 +50,18 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
         load: reads the inputs, calling a progress function meanwhile.
         out: output folder; holds `PRODUCTS` afterwards.
         options: see Options.
-        workers: where work runs; the products do not depend on their number.
+        workers: run the tasks; the products do not depend on their number.
         progress: called during long work.
 
     Returns:
         The content of report.json.
 
     Raises:
-        InputError: if the inputs hold no picture with a position, or the basemap is of no use.
-        OrthoSwarmError: if nothing could be made, or the refinement failed by a fault of the program: then the
-            real-time picture, the frames as recorded and the report with the fault stand, and no orthoimage that would
-            pass for a refined one.
+        InputError: if the inputs have no picture with a position, or the basemap cannot be used.
+        OrthoSwarmError: if nothing could be made, or the refinement failed by an error of the program: then the
+            real-time picture, the frames as recorded and the report with the error exist, but no orthoimage, which
+            would
+            look like a refined one.
     """
     if options.basemap is not None and not options.basemap.exists():
         raise InputError(f"the basemap {options.basemap} does not exist; check the path")
@@ -131,7 +132,7 @@ def _load(run: RunContext, load: Load) -> RunState:
 
 
 def _control_points(run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None) -> list[Checkpoint]:
-    """The points of --control; useless ones, and a file of --checkpoints that cannot be read, are refused now."""
+    """Read the points of --control; refuse unusable ones, and an unreadable file of --checkpoints, before the work."""
     options = run.options
     if options.checkpoints is not None:
         read_checkpoints(options.checkpoints, options.pixel_scale)
@@ -143,7 +144,7 @@ def _control_points(run: RunContext, grid: LocalGrid, recorded: Recorded, basema
 
 
 def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:
-    """The outside height model for the refiner that uses one; a useless one is told now, not after hours."""
+    """The user's height model for a refiner that uses one; an unusable one is refused now, not after hours."""
     bounds = placed_bounds(recorded.placed, 0.0, 0.0)
     at = np.array([p.camera.position for p in recorded.placed])
     told = np.array([p.frame.fix.height_m is not None for p in recorded.placed])
@@ -154,7 +155,7 @@ def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Record
 
 
 def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
-    """The picture from recorded poses; the frames that it holds."""
+    """Draw the real-time picture from recorded poses; returns its frames."""
     aside = strays(state.recorded.placed)
     placed = [p for p in state.recorded.placed if p.frame.image not in aside]
     if run.options.until != "realtime":

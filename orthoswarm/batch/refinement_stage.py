@@ -21,7 +21,7 @@ from orthoswarm.refine.registration.map_offset import measure_map_offset
 
 
 def refine(run: RunContext, state: RunState) -> Refinement | None:
-    """Coarse and fine cameras of all vehicles, without the refiner's states; None if it could place none."""
+    """Refine all vehicles: coarse and fine cameras, without the refiner's states; None if none could be placed."""
     by_kind = split_refinable(state.recorded.placed)
     state.still, state.odd = by_kind.still, by_kind.odd
     state.warnings += by_kind.warnings
@@ -43,7 +43,7 @@ def refine(run: RunContext, state: RunState) -> Refinement | None:
         except OrthoSwarmError as error:
             state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
             return None
-        except Exception as error:  # in the field a rough map is better than none; the fault is told in full
+        except Exception as error:  # in the field a rough map is better than none; the error is reported in full
             logging.getLogger(__name__).exception("the refinement failed")
             state.fault = f"the refinement failed ({type(error).__name__}: {error})"
             state.warnings.append(f"{state.fault}; the map is the real-time one")
@@ -59,7 +59,7 @@ def refine(run: RunContext, state: RunState) -> Refinement | None:
 
 
 def onto_ground(state: RunState, refinement: Refinement) -> Refinement:
-    """The map compared with the receivers; then all frames moved onto the control points, where there are some."""
+    """Compare the map with the receivers; then move all frames onto the control points, if there are any."""
     state.map_offset = measure_map_offset(state.recorded.placed, [p for s in refinement.fine for p in s.placed])
     if state.control_points:
         gsd = None if state.basemap is None else state.basemap.native_gsd_m
@@ -71,9 +71,9 @@ def onto_ground(state: RunState, refinement: Refinement) -> Refinement:
 
 
 def _refined(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:
-    """The refinement; without the map where that turns out to be unreadable after its check.
+    """Run the refinement; without the map if that proves unreadable after its check.
 
-    The photos adjusted to each other are worth more than the real-time picture, and hours may have gone into it.
+    Photos adjusted to each other are better than the real-time picture, and hours of work may be done already.
     """
     try:
         return _call_refiner(run, frames, state)
@@ -95,7 +95,7 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     lost = state.basemap is None and run.options.basemap is not None
     tasks = run.space.remembering("vehicle without map" if lost else "vehicle", run.workers.map)
     refinement = refiner.refine_batch(vehicles, basemap, tasks, run.progress)
-    # The states behind the solutions are by far the largest part; nothing needs them any more.
+    # The states behind the solutions are by far the largest part and are not needed any more.
     refinement.coarse, refinement.fine = (
         [replace(s, state=None) for s in solutions] for solutions in (refinement.coarse, refinement.fine)
     )
@@ -111,7 +111,7 @@ def _append_carried(solutions: list[Solution], carried: Sequence[PlacedFrame]) -
 
 
 def _split_time(stage: Stage, refinement: Refinement, until: str, with_map: bool) -> list[Stage]:
-    """The refinement's time by stage: what was done before the map counts as coarse."""
+    """The refinement's time by stage: the part before map registration counts as coarse."""
     laps: Counter[str] = Counter()
     for solution in refinement.fine:
         laps.update(solution.timings)

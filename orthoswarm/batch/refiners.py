@@ -1,4 +1,4 @@
-"""The refiners by name. Only the one that is asked for is imported: the other's imports would cost memory."""
+"""The refiners by name. Only the requested one is imported, as the other's imports would cost memory."""
 
 from collections.abc import Callable, Mapping
 from typing import Literal
@@ -22,7 +22,7 @@ def _swarm(epsg: int, origin: Array, dem: HeightModel | None) -> Refiner:
 
 
 def _paper(epsg: int, origin: Array, dem: HeightModel | None) -> Refiner:
-    """The paper's refiner; its ground is flat, so that a height model is of no use to it."""
+    """The paper's refiner; its ground is flat, so it does not use a height model."""
     from orthoswarm.paper import PaperRefiner
 
     return PaperRefiner(epsg, origin)
@@ -36,6 +36,6 @@ def make_refiner(name: RefinerName, epsg: int, origin: Array, dem: HeightModel |
 
     Args:
         name: which one. epsg: the area's grid. origin: float64 (2,) of the local frame, see `geo.local_origin`.
-        dem: heights of the ground from outside, for a refiner that uses them.
+        dem: the user's height model, for a refiner that uses it.
     """
     return REFINERS[name](epsg, origin, dem)

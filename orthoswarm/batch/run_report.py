@@ -1,4 +1,4 @@
-"""What a run says of itself: frames.jsonl, footprints, report.json and the report's page."""
+"""The report of a run: frames.jsonl, footprints, report.json and the report's page."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ def write_products(
     run: RunContext, state: RunState, placed: list[PlacedFrame], refinement: Refinement | None
 ) -> dict[str, Any]:
     """frames.jsonl, footprints and the report."""
-    for name in PRODUCTS:  # of an earlier run with other options
+    for name in PRODUCTS:  # left by an earlier run with other options
         if name not in _made(run, state.fault is not None):
             (run.out / name).unlink(missing_ok=True)
     with run.clock.stage("final: report", len(placed)) as stage:
@@ -29,7 +29,7 @@ def write_products(
         left_out = list(state.rejected.values())
         try:
             report["against_map_m"] = write_page(run.out, report, stated, left_out, state.basemap)
-        except InputError as error:  # a map that is damaged where only the report's pictures read it
+        except InputError as error:  # a map may be damaged where only the report reads it
             report["warnings"].append(f"the report's pictures are without the map: {error}")
             report["against_map_m"] = write_page(run.out, report, stated, left_out, None)
     wall, cpu, memory = run.clock.totals()

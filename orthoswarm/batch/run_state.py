@@ -1,4 +1,4 @@
-"""What a run was asked for, what it works with, and what it knows so far."""
+"""The options, context and state of a run."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -46,18 +46,18 @@ PRODUCTS = (
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What to make of the frames.
+    """The options of a run.
 
     Attributes:
         basemap: the pre-disaster map, None to stay in the receivers' frame.
         refine: which refiner. until: the last stage to run.
         fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
-        dem: raster of ground heights. split_legs: a leg of a vehicle is a vehicle of its own.
-        gains: even out brightness between pictures. blend: mix the two pictures at each seam, see Seams.
+        dem: raster of ground heights. split_legs: treat each leg of a vehicle as a separate vehicle.
+        gains: balance brightness between pictures. blend: mix the two pictures at each seam, see Seams.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
-        config: thresholds of the refiner in the place of their defaults.
+        config: thresholds that replace the defaults.
     """
 
     basemap: Path | None = None
@@ -77,11 +77,11 @@ class Options:
 
 @dataclass(slots=True)
 class RunContext:
-    """What the stages of a run work with.
+    """The environment of a run's stages.
 
     Attributes:
-        out: output folder; space: its lock and what an interrupted run left there.
-        options: see Options. workers: where work runs. progress: called during long work. clock: times by stage.
+        out: output folder; space: its lock and results of an interrupted run.
+        options: see Options. workers: run the tasks. progress: called during long work. clock: times by stage.
     """
 
     out: Path
@@ -94,20 +94,20 @@ class RunContext:
 
 @dataclass(slots=True)
 class RunState:
-    """What is known so far in a run.
+    """The results of a run so far.
 
     Attributes:
         ingest: the frames as read. grid: the area's. recorded: cameras as recorded. gsd_m: pixel of the products.
-        basemap: the map; None without one, or once it turned out to be unreadable. dem: heights for the refiner.
+        basemap: the map; None without one, or once it proved unreadable. dem: heights for the refiner.
         warnings: for the report. rejected: image -> why it was left out.
-        thumbnails, gains: image -> small picture, factors that even out brightness.
-        still: frames of vehicles that stood at one spot. odd: frames that look elsewhere than their vehicle's others.
+        thumbnails, gains: image -> small picture, brightness gains.
+        still: frames of vehicles that hovered. odd: frames of another camera or direction than their vehicle's others.
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
         previews: small copies of the pictures, for the seams.
         undrawn: image -> why the real-time picture does not show it.
-        control_points: surveyed points to place the map on. control: what they did, None before or without them.
-        map_offset: the map against the receivers, None where nothing lies on a map.
-        fault: what went wrong inside the refiner, None if nothing did.
+        control_points: surveyed points to move the map onto. control: their result, None before or without them.
+        map_offset: offset between map and receivers, None without a map.
+        fault: error inside the refiner, None without one.
     """
 
     ingest: Ingest

@@ -1,4 +1,4 @@
-"""A single drone's flight as a swarm: each straight leg a vehicle of its own."""
+"""A single drone's flight treated as a swarm: each straight leg is a vehicle."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ from orthoswarm.trajectory.legs import split_legs
 
 
 def legs_as_vehicles(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
-    """Frames with each straight leg of a vehicle as a vehicle of its own (`id/leg1`); turns go to the leg before."""
+    """Frames with each straight leg renamed to a separate vehicle (`id/leg1`); turns belong to the leg before."""
     members: dict[str, list[Frame]] = {}
     for frame in frames:
         members.setdefault(frame.vehicle, []).append(frame)

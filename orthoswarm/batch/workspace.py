@@ -1,4 +1,4 @@
-"""The output folder of a run, and what an interrupted run left there for the next one to go on from."""
+"""The output folder of a run, with the results of an interrupted run from which the next one continues."""
 
 import contextlib
 import hashlib
@@ -21,7 +21,7 @@ VIDEO = "video"
 
 
 def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
-    """What a run is made of: pictures (name, size, date, fix), options, other files (map, heights) by size and date.
+    """Key of a run: pictures (name, size, date, fix), options, other files (map, heights) by size and date.
 
     A run with another key starts afresh.
     """

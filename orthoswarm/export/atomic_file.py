@@ -1,4 +1,4 @@
-"""A product's name never stands on a half-written file: write under another name in the same folder, then rename."""
+"""Atomic writing: a product is written under another name in the same folder, then renamed."""
 
 import errno
 import os
@@ -12,7 +12,7 @@ from orthoswarm.model.errors import DiskFullError, StorageError
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a name to write a file or folder under; on success it takes the place of `path`, on failure it goes.
+    """Yield a temporary path to write to; on success it replaces `path`, on failure it is removed.
 
     Raises:
         StorageError: if the disk is full or the folder cannot be written.

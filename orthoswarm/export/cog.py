@@ -4,7 +4,7 @@ Layout as the OGC's COG standard (21-026) and GDAL's driver have it: header, all
 then tiles from the coarsest overview to full resolution. Tile positions are filled in at the end, which is possible
 because the length of every table is known at the beginning. Transparent tiles take no room (offset and size 0).
 
-A picture that cannot exceed 4 GiB, however badly it compresses, is a classic TIFF, which everything reads; a larger one
+A picture that cannot exceed 4 GiB even without compression is a classic TIFF, which all programs read; a larger one
 is a BigTIFF.
 """
 
@@ -35,7 +35,7 @@ _STRUCTURE = (
 
 
 class Source(Protocol):
-    """What a COG is made of; mosaic.canvas.Canvas is one."""
+    """The source of a COG's pixels, for example a canvas.canvas.Canvas."""
 
     grid: GroundGrid
 
@@ -105,7 +105,7 @@ def _levels(rows: int, cols: int) -> list[_Level]:
 
 
 class _Table:
-    """Where the tiles of one level are; its room in the file is known before they are written."""
+    """Offsets and sizes of the tiles of one level; its place in the file is reserved before they are written."""
 
     def __init__(self, count: int, form: "_Form") -> None:
         self.offsets = np.zeros(count, f"<u{form.word}")
@@ -165,12 +165,12 @@ _WORST_TILE = _TILE_BYTES + _TILE_BYTES // 64 + 1024  # deflate stores what it c
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """The two forms of a TIFF, which differ in how wide places in the file and counts are.
+    """The two forms of a TIFF, which differ in the width of offsets and counts.
 
     Attributes:
-        header: of the file but for the place of its first directory.
-        word: bytes of a place or of an entry's count. count: struct format of a directory's number of entries.
-        place: struct format of a place. place_kind: TIFF type of one.
+        header: of the file, without the offset of its first directory.
+        word: bytes of an offset or of an entry's count. count: struct format of a directory's number of entries.
+        place: struct format of an offset. place_kind: TIFF type of an offset.
     """
 
     header: bytes
@@ -181,7 +181,7 @@ class _Form:
 
     @property
     def entry(self) -> int:
-        """Bytes of a directory's entry: tag, type, count, and a value or its place."""
+        """Bytes of a directory's entry: tag, type, count, and a value or its offset."""
         return 4 + 2 * self.word
 
 
@@ -198,7 +198,7 @@ def _form_of(levels: list[_Level], classic_bytes: int) -> _Form:
 def _write_directories(
     file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level], form: "_Form"
 ) -> list[_Table]:
-    """Header and directories, with room for the tile tables; the file is left at the first tile's place."""
+    """Write header and directories with room for the tile tables; the file is left at the first tile's offset."""
     ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
     ghost += bytes(-len(ghost) % 16)
     at = len(form.header) + form.word + len(ghost)
@@ -215,7 +215,7 @@ def _write_directories(
 
 
 def _tags(level: _Level, grid: GroundGrid | None, first: tuple[int, int]) -> dict[int, tuple[int, bytes | list[float]]]:
-    """Tag -> type and values; the full resolution (grid given) also says where it lies."""
+    """Tag -> type and values; the full resolution (grid given) also has the georeference."""
     tags: dict[int, tuple[int, bytes | list[float]]] = {
         254: (_LONG, [0 if grid else 1]),  # a reduced picture
         256: (_LONG, [level.cols]),
@@ -253,7 +253,7 @@ def _directory(
     values = bytearray()
 
     def add(tag: int, kind: int, count: int, data: bytes) -> int:
-        """Write an entry; gives where its data lies in the file."""
+        """Write an entry; returns the offset of its data."""
         head = struct.pack("<HH", tag, kind) + struct.pack(form.place, count)
         if len(data) <= form.word:
             place = entries_at + form.entry * len(entries) + len(head)

@@ -30,12 +30,12 @@ def write_colmap(
 
     Args:
         rows: lines of frames.jsonl.
-        find: from a row to its picture file, None where it is gone.
+        find: returns the picture file of a row, None if it is missing.
         folder: appears when it is complete; an existing one is replaced.
         progress: called with pictures done and pictures in all.
 
     Returns:
-        Images whose files are gone: they are in the model, but not in `images`.
+        Images whose files are missing: they are in the model, but not in `images`.
 
     Raises:
         InputError: if no picture was placed.
@@ -61,7 +61,7 @@ def write_colmap(
 
 
 def _model(lens: Lens) -> str:
-    """COLMAP's model of a lens with its parameters: the plainest that holds all its terms."""
+    """COLMAP's camera model of a lens with its parameters: the simplest one with all its terms."""
     u, v = (c + 0.5 for c in lens.principal_point)
     f = lens.focal_px
     if lens.is_pinhole:

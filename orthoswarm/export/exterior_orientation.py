@@ -1,4 +1,4 @@
-"""Cameras from the lines of frames.jsonl, for programs that go on from our orientation (densify, measure)."""
+"""Cameras from the lines of frames.jsonl, for programs that use our orientation (densify, measure)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +23,10 @@ class OrientedPicture:
     """A placed picture of a map.
 
     Attributes:
-        name: plain file name, different from all others. image: its name in frames.jsonl. row: its line there.
+        name: unique plain file name. image: its name in frames.jsonl. row: its line there.
         camera: position in the map's grid (east, north, height), orientation and lens.
         lat_deg: latitude of the camera. lon_deg: its longitude. altitude_m: its altitude, or the height over the
-            takeoff level where the photos told none.
+            takeoff level if the photos have none.
     """
 
     name: str
@@ -88,7 +88,7 @@ def link_pictures(
     folder: Path,
     progress: Callable[[int, int], None] | None,
 ) -> list[str]:
-    """Put the pictures' files into a folder under their plain names; gives the images whose files are gone.
+    """Link the pictures' files into a folder under their plain names; returns the images whose files are missing.
 
     Raises:
         OrthoSwarmError: if the disk is full.

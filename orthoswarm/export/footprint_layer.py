@@ -29,7 +29,7 @@ _AT_ONCE = 4096
 
 
 def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None:
-    """Write polygons with what is known about their frames, some thousands at a time.
+    """Write polygons with the attributes of their frames, some thousands at a time.
 
     Args:
         path: the GeoPackage; appears when it is complete.
@@ -61,7 +61,8 @@ def gpkg_file(path: Path) -> Iterator[Path]:
         try:
             yield part
         except (pyogrio.errors.DataSourceError, RuntimeError) as error:
-            # GDAL does not say why; a folder that takes a file of a page is not full and may be written.
+            # GDAL does not give the reason; if a small file can be written, the disk is not full and the folder is
+            # writable.
             part.with_suffix(".probe").write_bytes(bytes(65536))
             part.with_suffix(".probe").unlink()
             raise OSError(0, str(error)) from None

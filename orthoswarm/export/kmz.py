@@ -29,7 +29,7 @@ def write_kmz(
     Args:
         source: the raster, an orthoimage.
         path: the file; appears when it is complete.
-        name: what viewers call it.
+        name: shown by viewers.
         progress: called with tiles done and tiles in all.
 
     Raises:
@@ -57,7 +57,7 @@ def write_kmz(
 
 
 class _Pyramid:
-    """One archive: tiles by level (0 holds all in one), row and column."""
+    """One archive: tiles by level (0 has all in one tile), row and column."""
 
     def __init__(
         self,

@@ -59,8 +59,8 @@ def write_mbtiles(
     Args:
         source: the raster, an orthoimage.
         path: the file; appears when it is complete.
-        name: what viewers call it.
-        tile_format: "png" is understood by all, "webp" is a third of its size, "jpg" has no transparency.
+        name: shown by viewers.
+        tile_format: "png" is read by all programs, "webp" is a third of its size, "jpg" has no transparency.
         quality: of webp and jpg.
         progress: called with tiles done and tiles in all.
 
@@ -114,8 +114,9 @@ def _tiles_from_north_west(lon: float, lat: float, zoom: int) -> tuple[float, fl
 def _whole_pixels(bounds: tuple[float, float, float, float], zoom: int) -> tuple[float, float, float, float]:
     """West, south, east, north in degrees, moved outwards to the next pixel's edge.
 
-    GDAL (and so QGIS) takes the bounds for the corners of its raster and shows whole pixels from there: bounds within a
-    pixel would move the map by up to half of one.
+    GDAL (and so QGIS) uses the bounds as the corners of its raster and shows complete pixels from there: bounds within
+    a
+    pixel would shift the map by up to half a pixel.
     """
     west, south, east, north = bounds
     (left, top), (right, bottom) = _tiles_from_north_west(west, north, zoom), _tiles_from_north_west(east, south, zoom)

@@ -21,16 +21,16 @@ def write_odm(
     """Write `images/` and `geo.txt`.
 
     geo.txt has longitude, latitude, altitude, yaw from true north, pitch (0 looks straight down, as ODM counts),
-    roll, and one sigma of the position. Where the photos told no altitude, the height over the takeoff level stands in.
+    roll, and one sigma of the position. If the photos have no altitude, the height above the takeoff level is used.
 
     Args:
         rows: lines of frames.jsonl.
-        find: from a row to its picture file, None where it is gone.
+        find: returns the picture file of a row, None if it is missing.
         folder: appears when it is complete; an existing one is replaced.
         progress: called with pictures done and pictures in all.
 
     Returns:
-        Images that were left out because their files are gone.
+        Images that were left out because their files are missing.
 
     Raises:
         InputError: if no picture was placed or found.
@@ -92,7 +92,7 @@ def unique_names(images: Iterable[str]) -> dict[str, str]:
 
 
 def link_file(file: Path, target: Path) -> None:
-    """The same file under another name, without a copy where the file system can."""
+    """Link a file under another name, or copy it if the file system has no links."""
     try:
         os.link(file, target)
     except OSError:

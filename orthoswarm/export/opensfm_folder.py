@@ -31,12 +31,12 @@ def write_opensfm(
 
     Args:
         rows: lines of frames.jsonl.
-        find: from a row to its picture file, None where it is gone.
+        find: returns the picture file of a row, None if it is missing.
         folder: appears when it is complete; an existing one is replaced.
         progress: called with pictures done and pictures in all.
 
     Returns:
-        Images whose files are gone: they are in the reconstruction, but not in `images`.
+        Images whose files are missing: they are in the reconstruction, but not in `images`.
 
     Raises:
         InputError: if no picture was placed.

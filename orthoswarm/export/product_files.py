@@ -1,4 +1,4 @@
-"""What a run writes besides pictures: a line per picture (frames.jsonl), footprints, and the report's numbers."""
+"""The files of a run besides pictures: a line per picture (frames.jsonl), footprints, and the report's numbers."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
     """The line of frames.jsonl of a placed frame.
 
     `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
-    `ground_z_m`; `camera` says where the camera was, how it looked (yaw from true north) and through which lens (focal
+    `ground_z_m`; `camera` has the camera's position, attitude (yaw from true north) and lens (focal
     length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for other programs.
     """
     frame, camera = placed.frame, placed.camera
@@ -83,7 +83,7 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
 
 
 def takeoff_altitudes(placed: Sequence[PlacedFrame]) -> dict[str, float]:
-    """Absolute altitude of each vehicle's takeoff level, from photos that tell their own; absent where none does."""
+    """Absolute altitude of each vehicle's takeoff level, from photos with an altitude; absent without one."""
     found: dict[str, list[float]] = {}
     for p in placed:
         if p.frame.fix.altitude_m is not None:
@@ -104,7 +104,7 @@ def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
 
 @lru_cache(maxsize=256)
 def simple_lens(lens: Lens) -> tuple[Lens, Array]:
-    """A lens with k1 and k2 about the picture's centre alone that does nearly what a fuller one does.
+    """A lens with only k1 and k2 about the picture's centre that approximates a full one.
 
     Returns:
         The lens (same focal length), and the 3x3 matrix from its normalised coordinates to those of the full one.
@@ -132,7 +132,7 @@ def simple_lens(lens: Lens) -> tuple[Lens, Array]:
 
 
 def rejection_row(rejection: Rejection, epsg: int | None) -> dict[str, Any]:
-    """The line of frames.jsonl of a picture that was left out."""
+    """The line of frames.jsonl of a rejected picture."""
     return {
         "image": rejection.image,
         "vehicle": rejection.vehicle,
@@ -165,7 +165,7 @@ def write_frames(
     """
     levels = takeoff_altitudes(placed)
 
-    def lines() -> Iterator[str]:  # one at a time: an area of 32,544 pictures has 60 MB of them
+    def lines() -> Iterator[str]:  # one at a time: 32,544 pictures have 60 MB of lines
         both: list[PlacedFrame | Rejection] = [*placed, *rejected]
         for one in sorted(both, key=_image):
             row = rejection_row(one, grid.epsg) if isinstance(one, Rejection) else frame_row(one, grid, z)
@@ -210,7 +210,7 @@ def read_frames(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -> list[dict[str, Any]]:
-    """`vehicles` of report.json: those that were refined, then those that were placed as recorded.
+    """`vehicles` of report.json: the refined ones, then those placed as recorded.
 
     `positions_from` counts the pictures by the source of their recorded position.
     """
@@ -250,7 +250,7 @@ def stage_row(stage: Stage) -> dict[str, Any]:
 
 
 def image_root(frames: Sequence[Frame]) -> str | None:
-    """The folder that picture names are relative to; None where they are pictures of videos."""
+    """The folder that picture names are relative to; None for pictures of videos."""
     for frame in frames:
         path = frame.path.absolute().as_posix()
         if path.endswith("/" + frame.image):

@@ -27,7 +27,7 @@ _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
 _AGAIN: Final = 10
-"""So many pictures that came late have their vehicle refined again; fewer are laid beside its refined ones."""
+"""With so many late pictures a vehicle is refined again; fewer are registered to its refined ones."""
 
 
 @dataclass(slots=True)
