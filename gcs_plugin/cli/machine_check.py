@@ -1,4 +1,7 @@
-"""What a machine has for mapping: programs, codecs, weights, cores, memory, disk; and what a lack of it costs."""
+"""Checks what a machine has for mapping: programs, codecs, weights, cores, memory, disk.
+
+And what is lost without it.
+"""
 
 import importlib
 import json
@@ -26,11 +29,11 @@ _WEIGHT_SUFFIXES = (".pt", ".pth", ".safetensors", ".onnx")
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
-        name: what. ok: it is there. detail: what was found.
-        needed: mapping does not work without it. cost: what its lack costs, and what to do.
+        name: of the check. ok: it is available. detail: the finding.
+        needed: mapping does not work without it. cost: consequence of its absence, and what to do.
     """
 
     name: str
@@ -206,7 +209,7 @@ def _is_warm(module: str, source: Path) -> bool:
 
 
 def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels by making two tiny maps of simulated pictures and two plans; gives the seconds it took."""
+    """Compile the kernels by making two tiny maps of simulated pictures and two plans; returns the seconds needed."""
     import tempfile
 
     started = time.perf_counter()
@@ -218,7 +221,7 @@ def warm_kernels(say: Callable[[str], None]) -> float:
 
 
 def _make_maps(folder: Path) -> None:
-    """A dense flight, and a sparse one, whose pictures are matched in pairs instead of being followed."""
+    """Map a dense flight, and a sparse one, whose pictures are matched in pairs instead of tracked."""
     import telemetry
     from orthoswarm.batch.pipeline import Options, run
     from orthoswarm.compute.workers import Serial
@@ -238,7 +241,7 @@ def _make_maps(folder: Path) -> None:
 
 
 def _make_plans(folder: Path) -> None:
-    """Plans of two methods round a hole."""
+    """Make plans by two methods around a hole."""
     from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 
     ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]

@@ -1,4 +1,4 @@
-"""Progress bars with the time left, on stderr; silent where stderr is not a terminal, but for a line per stage."""
+"""Progress bars with the time left, on stderr; where stderr is not a terminal, only one line per stage."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class ProgressBars:
-    """One bar a stage; call it with what is being done, how many are done, how many there are."""
+    """One bar per stage; call it with stage, number done and total."""
 
     def __init__(self) -> None:
         self._bars: Any = None

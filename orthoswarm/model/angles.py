@@ -1,9 +1,9 @@
-"""Angles brought within half a turn, the one way for all."""
+"""Wrapping of angles to half a turn."""
 
 import math
 from typing import TYPE_CHECKING, overload
 
-if TYPE_CHECKING:  # the simulated vehicles turn angles, too, and need no numpy for it
+if TYPE_CHECKING:  # the simulated vehicles wrap angles, too, without numpy
     import numpy as np
     from numpy.typing import NDArray
 
@@ -15,7 +15,7 @@ def wrap_rad(angle: float) -> float: ...
 @overload
 def wrap_rad(angle: "Array") -> "Array": ...
 def wrap_rad(angle: "float | Array") -> "float | Array":
-    """Angles in radians brought to [-pi, pi); NaN stays."""
+    """Angles in radians wrapped to [-pi, pi); NaN stays NaN."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -24,5 +24,5 @@ def wrap_deg(angle: float) -> float: ...
 @overload
 def wrap_deg(angle: "Array") -> "Array": ...
 def wrap_deg(angle: "float | Array") -> "float | Array":
-    """Angles in degrees brought to [-180, 180); NaN stays."""
+    """Angles in degrees wrapped to [-180, 180); NaN stays NaN."""
     return (angle + 180.0) % 360.0 - 180.0

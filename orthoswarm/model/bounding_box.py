@@ -66,7 +66,7 @@ class BoundingBox(NamedTuple):
         return BoundingBox(self.west + east_m, self.south + north_m, self.east + east_m, self.north + north_m)
 
     def intersection(self, other: "BoundingBox") -> "BoundingBox":
-        """What two boxes share; `empty` where that is nothing."""
+        """The intersection of two boxes; `empty` if they do not overlap."""
         return BoundingBox(
             max(self.west, other.west), max(self.south, other.south),
             min(self.east, other.east), min(self.north, other.north),
@@ -86,7 +86,7 @@ class BoundingBox(NamedTuple):
         return self.gap_m(other) < 0.0
 
     def gap_m(self, other: "BoundingBox") -> float:
-        """How far two boxes lie apart, the larger of both axes; 0 where they touch, negative where they overlap."""
+        """Distance of two boxes, the larger of both axes; 0 if they touch, negative if they overlap."""
         return max(
             self.west - other.east, other.west - self.east,
             self.south - other.north, other.south - self.north,

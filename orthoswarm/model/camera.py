@@ -3,7 +3,7 @@
 Axes: ground east, north, up (grid metres); camera x right, y down, z forward; pixel centres at integers.
 The orientation is R_ned = Rz(yaw) Ry(pitch + 90 deg) Rx(roll) with camera (x, y, z) -> body (-y, x, z), so
 pitch -90 deg looks straight down and yaw is the azimuth of the picture's up direction at nadir.
-This module is the one place of these sign and axis conventions.
+Sign and axis conventions are defined only in this module.
 """
 
 from dataclasses import dataclass
@@ -111,13 +111,14 @@ class Lens:
             r2 = r * r
             g = r * (1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) - rd
             dg = 1.0 + r2 * (3 * self.k1 + r2 * (5 * self.k2 + r2 * 7 * self.k3))
-            r = np.clip(r - g / np.maximum(dg, 0.2), 0.0, 4.0)  # folded lenses have no inverse: stay finite
+            # where the distortion is not monotonic there is no inverse: stay finite
+            r = np.clip(r - g / np.maximum(dg, 0.2), 0.0, 4.0)
         return np.asarray(d * np.where(rd > 1e-12, r / np.maximum(rd, 1e-12), 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A lens somewhere over the ground, looking somewhere: everything that places a picture.
+    """Exterior and interior orientation of a picture.
 
     Attributes:
         position: float64 (3,), easting, northing, height in metres (heights share the datum of the ground plane).

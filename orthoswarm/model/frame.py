@@ -1,4 +1,4 @@
-"""A frame: one picture with what was recorded about where its camera was. Sources of telemetry yield frames."""
+"""A frame: one picture with the recorded pose of its camera. Readers of telemetry yield frames."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """What was recorded about a camera at the moment of a picture. Evidence, not truth; None where unknown.
+    """The recorded pose of a camera at a picture, an observation with errors; None where unknown.
 
     Attributes:
         lat_deg: latitude, WGS 84; lon_deg: longitude.
@@ -15,7 +15,7 @@ class Fix:
         yaw_rad: azimuth of the picture's up direction at nadir, clockwise from true north.
         pitch_rad: -pi/2 looks straight down. roll_rad: > 0 right side down.
         flight_yaw_rad: heading of the airframe, where it is recorded besides the camera's yaw.
-        position_sigma_m: one sigma of the horizontal position, where the source states it (RTK).
+        position_sigma_m: one sigma of the horizontal position, if the source states it (RTK).
         height_is_ground: True where the height is above the ground below (rangefinder), not above takeoff.
     """
 
@@ -40,14 +40,14 @@ class Frame:
         path: the readable picture file on this machine (for a video, the extracted picture).
         vehicle: id of the vehicle that took it.
         time_s: UTC epoch seconds, None if unknown.
-        fix: where the camera was, as recorded.
+        fix: the recorded pose.
         width: columns as stored in the file (EXIF rotation not applied); height: rows.
-        camera: what tells lenses of one vehicle apart (model, size, zoom); frames of equal `vehicle` and
+        camera: distinguishes lenses of one vehicle (model, size, zoom); frames of equal `vehicle` and
             `camera` share one lens.
         fov_hint_rad: horizontal field of view from the picture's own tags, None if there is none.
-        origin: which source gave which field, for `inspect` and the report.
-        damaged: True where parts of the picture were predicted from something that was lost: it serves for its
-            position only, and is drawn only where no other sees.
+        origin: field -> source, for `inspect` and the report.
+        damaged: True if parts of the picture were predicted from lost data: it is used for its
+            position only, and is drawn only where there is no other picture.
         ambiguous: True where the position is that of one of several camera events of a log, and nothing tells of which;
             the fix's sigma covers the others.
     """
@@ -71,8 +71,8 @@ class Rejection:
     """A picture that could not become a frame, or that was left out later.
 
     Attributes:
-        image: its name. reason: why, in one clear sentence. vehicle, time_s: whose and when, as far as known.
-        lacks_position: True where only a position is missing, so that a log that comes later may still help.
+        image: its name. reason: one clear sentence. vehicle, time_s: as far as known.
+        lacks_position: True if only a position is missing, which a later log may provide.
     """
 
     image: str
@@ -84,7 +84,7 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class Ingest:
-    """What a set of inputs yielded.
+    """The result of reading a set of inputs.
 
     Attributes:
         frames: sorted by vehicle, then time (then name where times are unknown).

@@ -104,7 +104,7 @@ class LocalGrid:
 
 @dataclass(frozen=True, slots=True)
 class GroundGrid:
-    """A north-up raster on the ground: where it lies, how fine it is, how large.
+    """The grid of a north-up raster: location, pixel size and extent.
 
     Attributes:
         epsg: CRS of the raster.

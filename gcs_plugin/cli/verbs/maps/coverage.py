@@ -1,4 +1,4 @@
-"""`orthoswarm coverage`: which ground of an area the pictures of a flight have seen well, what was missed, and why."""
+"""`orthoswarm coverage`: which ground of an area the pictures of a flight cover well, what was missed, and why."""
 
 import argparse
 import json
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[CameraEvent]":
-    """The camera events of logs, each for the vehicle that it is given for, or for the only one of the map."""
+    """The camera events of logs, each for its given vehicle, or for the only one of the map."""
     import numpy as np
 
     from orthoswarm.coverage.camera_events import CameraEvent
@@ -117,7 +117,7 @@ def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[Cam
 
 
 def _judged(flown: "MapFolder") -> "MapFolder":
-    """The map's pictures with what their pixels say."""
+    """The map's pictures with their quality."""
     from dataclasses import replace
 
     from gcs_plugin.cli.progress import ProgressBars
@@ -144,7 +144,7 @@ def _cover(args: argparse.Namespace, flown: "MapFolder", area: "Area") -> "Cover
 
 
 def _terrain(dem: Path, bounds: Any, flown: "MapFolder") -> "Terrain":
-    """A DEM's heights, shifted so that the ground below the cameras has the level that the map found."""
+    """A DEM's heights, shifted so that the ground below the cameras has the level found by the map."""
     from dataclasses import replace
 
     import numpy as np

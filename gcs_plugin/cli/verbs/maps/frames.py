@@ -1,4 +1,4 @@
-"""`orthoswarm frames`: the pictures of a video as JPEG files that carry their poses."""
+"""`orthoswarm frames`: the pictures of a video as JPEG files with their poses."""
 
 import argparse
 from pathlib import Path
@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Take the pictures."""
+    """Extract the pictures."""
     import json
     import sys
     import tempfile
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
-    """Write one frame's picture with its pose; returns the file, which is none of those taken, and is one then.
+    """Write one frame's picture with its pose; returns the file, whose unique name is added to those in use.
 
     Raises:
         OSError: it cannot be written.
@@ -105,7 +105,7 @@ def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
     name = _safe(Path(stem).stem + (f"_{number}" if number else ""))
     target = folder / f"{name}.jpg"
     again = 1
-    while _key(target) in taken:  # two files of that name, in folders of one vehicle or with other suffixes
+    while _key(target) in taken:  # two files of the same name, in folders of one vehicle or with other suffixes
         again += 1
         target = folder / f"{name}-{again}.jpg"
     taken.add(_key(target))
@@ -119,11 +119,11 @@ def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
 
 
 def _key(path: Path) -> Path:
-    """The same for names that are one file's on systems that do not tell capitals from small letters."""
+    """A key that is equal for names of one file on case-insensitive systems."""
     return path.with_name(path.name.casefold())
 
 
 def _safe(name: str) -> str:
-    """A name that is one file's on every system."""
+    """A file name that is valid on every system."""
     kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(" .")
     return kept or "_"

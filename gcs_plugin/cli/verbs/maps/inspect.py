@@ -1,4 +1,4 @@
-"""`orthoswarm inspect`: what there is, and what is suspicious."""
+"""`orthoswarm inspect`: the content of inputs, and what is suspicious."""
 
 import argparse
 from pathlib import Path
@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at the inputs and tell."""
+    """Read the inputs and print the summary."""
     import json
     import sys
 
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tell(document: dict[str, Any]) -> None:
-    """The document as tables on stdout."""
+    """Print the document as tables."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

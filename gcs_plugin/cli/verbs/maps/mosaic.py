@@ -59,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import Workers, single_threaded, workers
 
     single_threaded()
-    # What is made of tens of thousands of photos stays to the end: looking through it again and again costs a tenth.
+    # Objects of tens of thousands of photos live to the end: collecting garbage among them would cost a tenth of the
+    # time.
     gc.set_threshold(100_000, 50, 50)
     import json
     import sys
@@ -89,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         config=read_overrides(args.config) if args.config is not None else {},
     )
 
-    override(options.config)  # before workers are made, which have values of their own
+    override(options.config)  # before workers are started, which have their own values
 
     def load(progress: pipeline.Progress) -> Ingest:
         reading = telemetry.LoadOptions(
@@ -107,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         if args.cluster:
             from orthoswarm.compute.dask_cluster import Cluster
 
-            args.out.mkdir(parents=True, exist_ok=True)  # the workers must see it
+            args.out.mkdir(parents=True, exist_ok=True)  # the workers read it from there
             pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
         else:
             pool = workers(args.workers)
@@ -126,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse values that make no sense."""
+    """Refuse invalid values."""
     from orthoswarm.model.errors import InputError
 
     if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
@@ -152,7 +153,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _tell(report: dict[str, object], out: Path) -> None:
-    """A few lines for people."""
+    """Print a few lines for people."""
     import sys
 
     frames = report["frames"]

@@ -1,7 +1,7 @@
 """`orthoswarm bench`: accuracy and cost on sets with truth; how cost grows; other programs on the same photos.
 
-Every map is made by the `mosaic` verb in a process of its own, as a user would make it, so that times and memory are
-whole and comparable. What is measured already is kept: an interrupted benchmark goes on, and more sets can be added.
+Every map is made by the `mosaic` verb in its own process, as by a user, so that times and memory are
+complete and comparable. Results are kept: an interrupted benchmark continues, and more sets can be added.
 """
 
 import argparse
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     for folder in args.sets:
         check_set(folder)
     args.out.mkdir(parents=True, exist_ok=True)
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a program that is measured ends, too
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a measured program is ended, too
     try:
         result, table = {"accuracy": _accuracy, "scaling": _scaling, "peers": _peers}[args.kind](args)
     finally:

@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at the machine."""
+    """Check the machine."""
     from orthoswarm.compute.workers import single_threaded
 
     single_threaded()

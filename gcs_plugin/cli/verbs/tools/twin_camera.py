@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--rate {args.rate:g} is not possible; choose 0.05 to 30 pictures a second")
     if (args.lat is None) != (args.lon is None):
         raise InputError("give --lat and --lon together")
-    open_outlet(args.stream, 1).close()  # a wrong address is told before anything is built
+    open_outlet(args.stream, 1).close()  # a wrong address is reported before anything is built
     own = Address(_SYSTEM, 191)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     with Fleet(args.link, own=own, key=find_key()) as fleet:
         relay = Relay(fleet, args.relay, own) if args.relay else None
         if relay is not None:
-            relay.start()  # before anything waits: it takes every packet that the fleet hears
+            relay.start()  # first of all, as it receives every packet of the fleet
         try:
             place = wait_for_place(fleet, args.vehicles, _WAIT_S, stop, _say)
             if place is None:
@@ -114,7 +114,7 @@ def _say(text: str) -> None:
 
 
 def _world(args: argparse.Namespace, place: tuple[float, float]) -> tuple[Path, Any]:
-    """The set's folder and what it is made of; made if it is not there."""
+    """The set's folder and its specification; made if absent."""
     from gcs_plugin.cli.progress import ProgressBars
     from gcs_plugin.demo.city_site import away_m, place_spec, read_spec, set_there, write_set
     from orthoswarm.model.errors import InputError
@@ -147,7 +147,7 @@ def _opened(follower: "Follower") -> None:
 
 
 def _watch(crew: Any, fleet: "Fleet", stop: "threading.Event") -> None:
-    """Take pictures; on a terminal say every few seconds how many."""
+    """Take pictures; on a terminal print their number every few seconds."""
     import threading
     import time
 

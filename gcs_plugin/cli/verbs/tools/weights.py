@@ -1,4 +1,4 @@
-"""`orthoswarm weights`: the weights of learned matchers: what is here, bring files, try them."""
+"""`orthoswarm weights`: the weights of learned matchers: list, import and test them."""
 
 import argparse
 from pathlib import Path
@@ -81,7 +81,7 @@ def describe(weight: Any) -> dict[str, Any]:
 
 
 def checked_files() -> list[dict[str, Any]]:
-    """Files that are here, compared with the published ones."""
+    """Installed files, compared with the published ones."""
     from orthoswarm.matchers import weight_files
 
     rows = []
@@ -99,7 +99,7 @@ def checked_files() -> list[dict[str, Any]]:
 
 
 def checked_matchers() -> list[dict[str, Any]]:
-    """Every built-in matcher, run once on a made-up picture and its shifted copy."""
+    """Run every built-in matcher once on a synthetic picture and its shifted copy."""
     from time import perf_counter
 
     import cv2

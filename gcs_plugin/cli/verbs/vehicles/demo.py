@@ -71,7 +71,7 @@ def _has_display() -> bool:
 
 
 def _tell(report: dict[str, object], out: Path) -> None:
-    """A few lines for people."""
+    """Print a few lines for people."""
     accuracy, realtime, completions = report["accuracy"], report["accuracy_realtime"], report["completions"]
     assert isinstance(accuracy, dict) and isinstance(realtime, dict) and isinstance(completions, list)
     for row in completions:

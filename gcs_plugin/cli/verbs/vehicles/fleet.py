@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _WAIT_S = 8.0
 _LEGAL_HEIGHT_M = 120.0
-_PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that pass with time
+_PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that clear by waiting
 _DEFAULT_LINK = "udpin:0.0.0.0:14550"
 _VERBS = {
     "list": "show the vehicles",
@@ -130,7 +130,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Open the links, do it, close them."""
+    """Open the links, run the action, close them."""
     from gcs_plugin.backends import open_backend
     from gcs_plugin.links.signing import find_key
     from gcs_plugin.mission.exchange import Address
@@ -164,12 +164,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Prepared:
-    """What the arguments name, read before any link is opened.
+    """The files and vehicles of the arguments, read before any link is opened.
 
     Attributes:
-        systems: vehicles that are asked for, empty for all.
-        files: mission file for each vehicle of an upload, or of a plan that is started; `single` a file for whichever
-            vehicle is there.
+        systems: requested vehicles, empty for all.
+        files: mission file for each vehicle of an upload or of a started plan; `single`: a file for the only
+            vehicle heard.
         delays: seconds after the first takeoff for each vehicle of a plan.
     """
 
@@ -326,14 +326,14 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
 
 
 def _say(args: argparse.Namespace, text: str) -> None:
-    """A line of progress, as it happens; stdout is for results where it is to be JSON."""
+    """Print a line of progress; with --json not on stdout, which is for the result."""
     print(text, file=sys.stderr if args.json else sys.stdout, flush=True)
 
 
 def _ready(
     backend: "Backend", args: argparse.Namespace, prepared: _Prepared, systems: list[int]
 ) -> "Airspace | dict[int, Outcome]":
-    """Wait until all vehicles have passed their check; what they will fly, or why nobody was started."""
+    """Wait until all vehicles have passed their check; returns their missions, or why none was started."""
     from gcs_plugin.fleet.preflight import ITEMS, red_text
     from gcs_plugin.mission.exchange import Outcome, Verdict
     from gcs_plugin.mission.track import Airspace
@@ -365,7 +365,7 @@ def _ready(
 def _missions(
     backend: "Backend", prepared: _Prepared, systems: list[int]
 ) -> "tuple[dict[int, Mission], dict[int, Mission], dict[int, float]]":
-    """The plan's missions, what the vehicles hold, and the plan's takeoffs."""
+    """The plan's missions, the vehicles' stored ones, and the plan's takeoffs."""
     from gcs_plugin.mission.mission_builder import read_mission
 
     missions = {s: read_mission(prepared.files[s], backend.autopilot(s)) for s in systems if s in prepared.files}
@@ -405,7 +405,7 @@ def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
 
 
 def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], good: bool) -> int:
-    """Tell events until all missions have ended; with --json all at once at the end."""
+    """Print events until all missions have ended; with --json all at once at the end."""
     told: list[FleetEvent] = []
     print(f"following {', '.join(f'v{s}' for s in systems)}; Ctrl-C ends it, not the flights", file=sys.stderr)
 
@@ -426,7 +426,7 @@ def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], go
 def _report(
     args: argparse.Namespace, outcomes: "dict[int, Outcome]", more: dict[int, dict[str, Any]], *, said: bool = False
 ) -> int:
-    """Say how it went for each vehicle, unless that was said as it happened; 0 if well for all."""
+    """Print the outcome for each vehicle, unless printed before; 0 if all succeeded."""
     if args.json:
         rows = [
             {
@@ -443,7 +443,7 @@ def _report(
 
 
 def _refusal(outcome: "Outcome") -> dict[str, Any]:
-    """What a vehicle refused."""
+    """The details of a vehicle's refusal."""
     if outcome.code is None:
         return {}
     return {"refusal": {"code": outcome.code, "item": outcome.item, "field": outcome.field}}

@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _request(args: argparse.Namespace) -> "PlanRequest":
-    """The arguments as a value."""
+    """The plan request of the arguments."""
     from gcs_plugin.plans.plan_request import PlanRequest
 
     if (args.area is None) == (args.gaps is None):
@@ -152,7 +152,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
 
 
 def _solved_fov(folder: Path) -> float:
-    """The smallest field of view of a map's vehicles, less two sigma, degrees."""
+    """The smallest field of view of a map's vehicles minus two sigma, degrees."""
     try:
         rows = json.loads((folder / "report.json").read_text(encoding="utf-8"))["vehicles"]
         fov = [float(r["fov_deg"]) - 2.0 * float(r["fov_sigma_deg"] or 0.0) for r in rows if r["frames"]]
@@ -182,7 +182,7 @@ def _position(text: str) -> tuple[float, float]:
 
 
 def _say(stage: str) -> None:
-    """Show on a terminal what is being done."""
+    """Show the present step on a terminal."""
     if sys.stderr.isatty():
         print(f"\r\033[K{stage}", end="", file=sys.stderr, flush=True)
 

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show_token(settings: "Settings") -> int:
-    """Print the page's link with the workspace's token, for a daemon that runs there or will."""
+    """Print the page's link with the workspace's token, for a running or future daemon."""
     import contextlib
 
     from gcs_plugin.web.guard import take_token
@@ -103,7 +103,7 @@ def _url(settings: "Settings", port: int) -> str:
 
 
 def settings_of(args: argparse.Namespace) -> "Settings":
-    """The workspace's file, with the flags over it."""
+    """The settings of the workspace's file, overridden by the flags."""
     from dataclasses import replace
 
     from gcs_plugin.daemon.intake.can_reader import CAN
@@ -133,8 +133,8 @@ def settings_of(args: argparse.Namespace) -> "Settings":
 def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     """Run daemon and web server until SIGINT or SIGTERM, or (`end_with_input`) until standard input ends.
 
-    A program that starts the daemon and holds the other end of its standard input takes the daemon with it however
-    it ends, since the operating system closes that end.
+    A program that starts the daemon and holds the other end of its standard input ends the daemon with itself in any
+    case, since the operating system closes that end.
     """
     import logging
     import os
@@ -150,7 +150,7 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     from gcs_plugin.web.listener import open_listener
 
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
-    os.umask(0o077)  # pictures, plans and the token are their owner's alone
+    os.umask(0o077)  # pictures, plans and the token are readable by their owner only
     listener = open_listener(settings.bind, settings.port)
     url = _url(settings, listener.getsockname()[1])
     with Daemon(settings) as daemon, listener:
@@ -159,7 +159,8 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
             make_app(daemon, token, settings.bind), log_level="warning", access_log=False, server_header=False,
             timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=2048,
         )  # fmt: skip
-        listener.listen(config.backlog)  # whoever reads the address may come at once, and waits until it is served
+        # a client may connect as soon as it reads the address, and waits until it is served
+        listener.listen(config.backlog)
         (settings.workspace / ADDRESS_FILE).write_text(url + "\n", encoding="utf-8")
         _print_link(url, token)
         server = uvicorn.Server(config)
@@ -173,7 +174,7 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
             threading.Thread(target=_when_input_ends, args=(end,), name="input", daemon=True).start()
         server.run(sockets=[listener])
     if any(thread.name.startswith(STREAM_THREAD) for thread in threading.enumerate()):
-        logging.shutdown()  # a dead stream keeps its reader inside a library; everything else is closed
+        logging.shutdown()  # a dead stream blocks its reader inside a library; everything else is closed
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)

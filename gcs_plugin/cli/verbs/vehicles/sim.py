@@ -1,4 +1,4 @@
-"""`orthoswarm sim`: simulated vehicles that speak real MAVLink, for trying things out without an autopilot."""
+"""`orthoswarm sim`: simulated vehicles that speak real MAVLink, for tests without an autopilot."""
 
 import argparse
 import sys
