@@ -92,7 +92,10 @@ class FlightConfig:
     sparse_stated_floor_m: float = 0.03
     """Added in squares to the sigma of a position that states its own, metres (chosen; not measured)."""
     sparse_position_sigma_m: float = 1.0
-    """Sigma of a recorded position across the way, metres (chosen; along the way a varying lag is added)."""
+    """Sigma of a recorded position across the way, metres; along the way a varying lag is added, so that it is less
+    than that of other flights (`records.position_sigma_m`). Measured on two flights with photos 75 m apart: with 1.0
+    and 1.5 ground is 0.91 and 0.97 m off under hard noise, 0.72 and 0.72 m under usual noise; on the map 0.037 m
+    both."""
     sparse_stated_height_floor_m: float = 0.05
     """Least sigma of a height whose position states its sigma, metres (chosen; not measured)."""
     sparse_height_sigma_m: float = 0.3
