@@ -182,7 +182,7 @@ def test_a_position_beats_a_bare_time_stamp_and_both_are_kept():
 
 
 def test_a_users_decoder_takes_ten_lines_and_may_fail(monkeypatch):
-    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))
+    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))  # a decoder stays registered for the process
     uuid = bytes.fromhex("00112233445566778899aabbccddeeff")
     sei.register(sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=b[0] / 2, lon_deg=b[1] / 2)))
     assert sei.read(user_data(uuid, b"\x10\x20")).sample.lon_deg == 16.0
@@ -203,7 +203,7 @@ def test_a_decoder_is_found_by_its_entry_point_and_a_broken_one_is_passed_over(m
 
     uuid = bytes(range(100, 116))
     mine = sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=47.0, lon_deg=8.0))
-    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))
+    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))  # a decoder stays registered for the process
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda group: [Point(None), Point("no decoder"), Point(mine)]
     )
