@@ -32,17 +32,18 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=20, help="flights in each cell (default: 20)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("orthoimage", type=Path, help="ground that the pictures show")
+    parser.add_argument("--interval", type=float, action="append", help="seconds between exposures (default: all)")
     parser.add_argument("--times-only", action="store_true")
     parser.add_argument("--whole-only", action="store_true", help="clocks of whole seconds only")
     args = parser.parse_args()
-    rng = np.random.default_rng(args.seed)
     ground = None if args.times_only else ground_of(args.orthoimage)
     print("interval  clock          missing   both  decided  wrong  marked  of these wrong  s a flight")
-    for interval in (0.3, 0.7, 1.0, 2.0, 5.0):
+    for interval in args.interval or (0.3, 0.7, 1.0, 2.0, 5.0):
         for whole in (True,) if args.whole_only else (False, True):
             for missing in (0.0, 0.1, 0.3):
                 start = time.process_time()
-                seeds = rng.integers(1 << 31, size=args.flights).tolist()
+                cell = [args.seed, round(10 * interval), int(whole), round(100 * missing)]
+                seeds = np.random.default_rng(cell).integers(1 << 31, size=args.flights).tolist()
                 rows = [fly(seed, interval, whole, missing, ground) for seed in seeds]
                 each_s = (time.process_time() - start) / args.flights
                 both, decided, wrong, marked, uncertain = (

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from orthoswarm.model.robust import mad_sigma
-from telemetry.ingest.alignment import CERTAIN, SequenceMatch
+from telemetry.ingest.alignment import SequenceMatch
 from telemetry.ingest.motion_chains import Chains, PictureMotion, chains_of, variants
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def _alignment(problem: "_Problem", candidates: list[tuple[float, float]], singl
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
     """(N,) whether a photo's event is certain, or that it has none."""
     likeliest = match.probability.max(axis=1, initial=0.0)
-    return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
+    return np.asarray((likeliest >= match.certain) | (match.probability.sum(axis=1) <= 1.0 - match.certain))
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
@@ -137,7 +137,9 @@ def _without_coincidences(
     rows = np.arange(len(problem.p))
     best = np.argmax(probability, axis=1)
     expected = offset + (1.0 + drift) * problem.e[np.clip(first + best, 0, len(problem.e) - 1)]
-    farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s
+    # With pictures legs are placed one by one, under a clock of whole seconds that is known to half a second only.
+    clock_s = 0.5 * problem.resolution_s if problem.chains is not None else 0.0
+    farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s + clock_s
     total = probability.sum(axis=1)
     alone = (farthest < least) & (probability[rows, best] > 1e-4)
     return np.where(alone[:, None], probability / np.maximum(total, 1e-300)[:, None], probability)

