@@ -20,15 +20,21 @@ class Block:
     bias: np.ndarray
 
 
-def make_block(seed=0, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_s=0.0, focal_start=330.0) -> Block:
+def make_block(
+    seed=0, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_s=0.0, focal_start=330.0, lean_deg=0.0
+) -> Block:
+    """Pictures over flat ground; `lean_deg`: how far the airframe leans at most, and its fixed camera with it."""
     rng = np.random.default_rng(seed)
     n, speed = per_leg * legs, 8.75
     along = np.arange(per_leg) * speed
     xy = np.concatenate([np.c_[np.full(per_leg, 90.0 * k), along if k % 2 == 0 else along[::-1]] for k in range(legs)])
     heading = np.repeat([0.0 if k % 2 == 0 else np.pi for k in range(legs)], per_leg)
     position = np.c_[xy + rng.normal(0, 0.2, (n, 2)), 150 + rng.normal(0, 0.1, n)]
+    lean = np.radians(lean_deg) * np.sin(np.pi * np.tile(np.arange(per_leg) / per_leg, legs))
     rotation = rotation_from_angles(
-        heading + 0.1 + rng.normal(0, 0.01, n), -np.pi / 2 + 0.03 + rng.normal(0, 0.01, n), rng.normal(0, 0.01, n)
+        heading + 0.1 + rng.normal(0, 0.01, n),
+        -np.pi / 2 + 0.03 + lean + rng.normal(0, 0.01, n),
+        rng.normal(0, 0.01, n),
     )
     zero = np.zeros(n, np.int32)
     true = CameraBlock(position, rotation, zero, np.array([[300.0, k1, k2, 0, 0, 0, 640, 480]]))

@@ -228,13 +228,18 @@ def begin(served):
     return row["id"]
 
 
-@pytest.mark.parametrize("address", [a for a in REAL if a.startswith("tcp:")])
+def further_link(address):
+    """Another link of the same autopilot: ArduPilot's SERIAL1, PX4's for ground stations."""
+    kind, host, port = address.split(":")
+    return f"tcp:{host}:{int(port) + 2}" if kind == "tcp" else f"{kind}:{host}:14550"
+
+
+@pytest.mark.parametrize("address", REAL)
 def test_a_second_station_that_asks_for_everything_disturbs_nothing(address):
-    host, port = address.removeprefix("tcp:").split(":")
     place = Real(address)
     site = Site(place)  # ArduPilot opens its further links after the first
     stop_second = threading.Event()
-    second = Fleet([f"tcp:{host}:{int(port) + 2}"], own=Address(252, 190))
+    second = Fleet([further_link(address)], own=Address(252, 190))
     thread = threading.Thread(target=second.run, args=(stop_second,))
     thread.start()
     try:

@@ -38,6 +38,9 @@ class FeaturesConfig:
     """Flow that is farther from the median of its picture is dropped, pixels (chosen; not measured)."""
     flow_least: int = 3
     """Fewer corners that agree are not a consensus (chosen; not measured)."""
+    flow_chance_share: float = 0.1
+    """Share of the corners that agree where pictures show different ground (textures of noise: 0.09 in the middle;
+    past holes of flights in simulation 0.10 at most, where the ground is the same 0.25 or more, usually 0.6)."""
     shift_below_share: float = 0.3
     """Where a smaller share of the corners is followed, its shift is measured on the whole picture (chosen)."""
     shift_below_corners: int = 6

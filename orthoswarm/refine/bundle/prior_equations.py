@@ -60,6 +60,20 @@ def position_residuals(cameras: CameraBlock, priors: Priors, layout: Layout, com
     return np.asarray(out)
 
 
+def bias_axes(rotation: Array) -> Array:
+    """Axes of a group's attitude bias in each camera's frame, float64 (N, 3, 3), one in each column.
+
+    The camera's x and y (how it is mounted), and the vertical (a compass error turns the heading, however far the
+    camera leans). For a camera that looks straight down the vertical is its z axis.
+
+    Args:
+        rotation: float64 (N, 3, 3), recorded attitudes, camera to ground.
+    """
+    axes = np.tile(np.eye(3), (len(rotation), 1, 1))
+    axes[:, :, 2] = -rotation[:, 2]
+    return axes
+
+
 def _add_attitudes(
     system: BandedSystem,
     cameras: CameraBlock,
@@ -74,17 +88,21 @@ def _add_attitudes(
     `at`: first row of each free camera.
     """
     base = np.asarray(layout.offset)[priors.group[index]]
-    bias = common[base[:, None] + np.arange(3)]
-    r = log_rotation(np.swapaxes(priors.rotation[index], 1, 2) @ cameras.rotation[index]) - bias
+    recorded = priors.rotation[index]
+    axes = bias_axes(recorded)
+    bias = np.einsum("nab,nb->na", axes, common[base[:, None] + np.arange(3)])
+    r = log_rotation(np.swapaxes(recorded, 1, 2) @ cameras.rotation[index]) - bias
     w = _weights(priors.rotation_sigma[index])
     e2 = (r * r * w).sum(1)
     w = w * robust_weights(e2, active().bundle.attitude_robust_c)[:, None]
     for a in range(3):
         system.band[0, at + 3 + a] += w[:, a]
         system.rhs[at + 3 + a] -= w[:, a] * r[:, a]
-        system.side[at + 3 + a, base + a] -= w[:, a]
-        np.add.at(system.corner, (base + a, base + a), w[:, a])
-        np.add.at(system.rhs_common, base + a, w[:, a] * r[:, a])
+        for b in range(3):
+            system.side[at + 3 + a, base + b] -= w[:, a] * axes[:, a, b]
+            np.add.at(system.rhs_common, base + b, w[:, a] * axes[:, a, b] * r[:, a])
+            for d in range(3):
+                np.add.at(system.corner, (base + b, base + d), w[:, a] * axes[:, a, b] * axes[:, a, d])
 
 
 def _add_positions(

@@ -186,7 +186,8 @@ class Tracker:
             found=found,
             ok=ok,
         )
-        return _gate(guess, found, ok, gray.shape), found
+        expected = int(is_inside(guess, gray.shape, 0.0).sum())
+        return _gate(guess, found, ok, gray.shape, expected), found
 
     def _start(self, gray: Gray) -> None:
         """New corners: the strongest of each empty cell."""
@@ -267,9 +268,12 @@ def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
 
 
 def _gate(
-    guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...]
+    guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...], expected: int
 ) -> NDArray[np.bool_]:
-    """Keep flow close to the median residual, which must itself be close to the prediction."""
+    """Keep flow close to the median residual, which must itself be close to the prediction.
+
+    None is kept where no more agree than `expected` corners on different ground would by chance (binomial, 3 sigma).
+    """
     config = active().features
     good = ok & is_inside(found, shape, config.flow_inside_px)
     if good.sum() < config.flow_least:
@@ -278,7 +282,10 @@ def _gate(
     centre = np.median(residual[good], axis=0)
     if np.hypot(*centre) > config.flow_median_limit_px:
         return np.zeros_like(good)
-    return np.asarray(good & (np.hypot(*(residual - centre).T) < config.flow_gate_px))
+    agree = np.asarray(good & (np.hypot(*(residual - centre).T) < config.flow_gate_px))
+    share = config.flow_chance_share
+    by_chance = share * expected + 3.0 * np.sqrt(share * (1.0 - share) * expected)
+    return agree if agree.sum() > by_chance else np.zeros_like(good)
 
 
 def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:

@@ -15,6 +15,7 @@ from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
 from orthoswarm.refine.bundle.height_consistency import release_heights
+from orthoswarm.refine.bundle.prior_equations import bias_axes
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.flight.relative_block import first_points
@@ -174,7 +175,7 @@ def _attitude_sigmas_from_residuals(adjustment: Adjustment) -> None:
     sigma = p.rotation_sigma.copy()
     for g in range(len(p.models)):
         rows = np.flatnonzero(p.group == g)
-        bias = adjustment.group_values(g)[0]
+        bias = bias_axes(p.rotation[rows]) @ adjustment.group_values(g)[0]
         off = log_rotation(np.swapaxes(p.rotation[rows], 1, 2) @ adjustment.cameras.rotation[rows]) - bias
         scatter = mad_sigmas(off)
         sigma[rows] = np.clip(c.sparse_attitude_scatters * scatter, *np.radians(c.sparse_attitude_range_deg))

@@ -40,6 +40,21 @@ def test_focal_length_distortion_and_attitude_bias_are_found():
     np.testing.assert_allclose(np.degrees(bias), np.degrees(block.bias), atol=0.1)
 
 
+def test_a_wrong_compass_is_found_where_the_camera_leans_with_the_airframe():
+    """The error turns the heading about the vertical, which is another axis of the camera as it leans."""
+    block = make_block(lean_deg=35.0)
+    turn = exp_rotation(np.radians([[0.0, 0.0, 4.0]]))[0]
+    recorded = turn @ block.priors.rotation
+    wrong = replace(
+        block,
+        priors=replace(block.priors, rotation=recorded),
+        start=replace(block.start, rotation=recorded.copy()),
+    )
+    adj = solved(wrong)
+    off = np.degrees(log_rotation(np.swapaxes(block.true.rotation, 1, 2) @ adj.cameras.rotation))
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.3
+
+
 def test_positions_are_relatively_better_than_their_records():
     block = make_block()
     adj = solved(block)

@@ -118,6 +118,17 @@ def test_pictures_of_different_ground_are_not_followed(ground):
     assert tracker.add(1, view(ground, placed(0.0, 1200, 1200)), np.eye(3)) < 0.3  # some corners look alike
 
 
+def test_a_handful_of_corners_that_agree_by_chance_is_no_track(ground):
+    """Of pictures of different ground none is followed: a few would pull both places together."""
+    rng = np.random.default_rng(5)
+    for _ in range(25):
+        tracker = Tracker()
+        first, second = rng.uniform(400, 450, 2), rng.uniform(1120, 1200, 2)
+        tracker.add(0, view(ground, placed(rng.uniform(0, 6), *first)), None)
+        shift = np.array([[1, 0, rng.uniform(-200, 200)], [0, 1, rng.uniform(-150, 150)], [0, 0, 1.0]])
+        assert tracker.add(1, view(ground, placed(rng.uniform(0, 6), *second)), shift) == 0.0
+
+
 def test_there_is_at_most_one_track_in_a_cell(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(8)]
     tracker, _ = follow(ground, matrices)
