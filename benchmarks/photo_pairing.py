@@ -31,11 +31,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=20, help="flights in each cell (default: 20)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("orthoimage", type=Path, help="ground that the pictures show")
+    parser.add_argument("orthoimage", type=Path, nargs="?", help="ground that the pictures show")
     parser.add_argument("--interval", type=float, action="append", help="seconds between exposures (default: all)")
     parser.add_argument("--times-only", action="store_true")
     parser.add_argument("--whole-only", action="store_true", help="clocks of whole seconds only")
     args = parser.parse_args()
+    if args.orthoimage is None and not args.times_only:
+        parser.error("name an orthoimage that the pictures show, or give --times-only")
     ground = None if args.times_only else ground_of(args.orthoimage)
     print("interval  clock          missing   both  decided  wrong  marked  of these wrong  s a flight")
     for interval in args.interval or (0.3, 0.7, 1.0, 2.0, 5.0):

@@ -39,6 +39,8 @@ _CLOCK_DOUBT = 1e-3
 _COARSE_S = 0.5
 """Resolution of a clock from which on pictures tell more than times do."""
 _LEAST_AGREEMENT = 0.9
+_LEAST_MATCHED = 0.6
+"""Share of photos or events with a partner; a clock that leaves more alone is not the right one."""
 _CANDIDATES = 24
 _FIRST_JITTER_S = 0.08
 _JITTERS_S = (0.02, 0.04, 0.08, 0.16)
@@ -99,7 +101,8 @@ def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
     """Whether more photos are decided than before, and as many have an event: else log and pictures disagree."""
     more = _decided(now).sum() > _decided(before).sum()
-    return bool(more and now.probability.sum() > _LEAST_AGREEMENT * before.probability.sum())
+    least = _LEAST_MATCHED * min(len(now.probability), len(now.events))
+    return bool(more and now.probability.sum() > max(_LEAST_AGREEMENT * before.probability.sum(), least))
 
 
 def _chained(problem: "_Problem", match: SequenceMatch, motion: PictureMotion) -> "_Problem | None":
