@@ -4,7 +4,7 @@ One vehicle on two links (radio and LTE) is normal. Two vehicles with one system
 start at their boots, distinguish them.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -117,13 +117,22 @@ class Routes:
         """The route of a packet, and whether the best route has changed with it."""
         route = self.known.get((side, peer))
         if route is None:
-            route = self.known[side, peer] = Route(side, peer, now)
+            route = self.known[side, peer] = Route(side, peer, now, clock=self._clock(now))
         route.heard = now
         best = self.best
         if best is None or (best is not route and now - best.heard > FRESH_S):
             self.best = route
             return route, best is not None
         return route, False
+
+    def _clock(self, now: float) -> BootClock:
+        """The watch over a new route's clock.
+
+        A vehicle that restarts closes its TCP connection and comes back on another: where no other route is heard, the
+        watch goes on, so that the clock that has gone back is noticed.
+        """
+        best = self.best
+        return BootClock() if best is None or now - best.heard < FRESH_S else replace(best.clock)
 
     def stale(self, route: Route, now: float) -> bool:
         """True for a route that is not the active one: its state of the vehicle may be late."""

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.routes import BootClock
+from gcs_plugin.fleet.routes import BootClock, Routes
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.tlog_writer import read_tlog
@@ -245,6 +245,20 @@ def test_a_boot_clock_tells_restarts_from_late_copies():
     assert [clock.feed(t / 10, 20 + t / 10) for t in range(4)].count("rebooted") == 1
     mixed = [clock.feed(t / 10 + (100 if t % 2 else 0), 30 + t / 10) for t in range(100)]
     assert "mixed" in mixed and "rebooted" not in mixed
+
+
+def test_a_restart_that_comes_back_on_another_connection_is_noticed():
+    side, routes = object(), Routes()
+    first, _ = routes.heard(side, 1, 0.0)
+    for k in range(100):
+        first.clock.feed(300.0 + k / 10, k / 10)
+    routes.heard(side, 1, 10.0)
+    second, _ = routes.heard(side, 2, 10.5)  # another link, whose messages come late
+    assert [second.clock.feed(305.0 + k / 10, 10.5 + k / 10) for k in range(9)] == [""] * 9
+    assert routes.best is first
+    third, changed = routes.heard(side, 3, 30.0)
+    assert changed
+    assert [third.clock.feed(2.0 + k / 10, 30.0 + k / 10) for k in range(9)].count("rebooted") == 1
 
 
 def test_an_unsigned_world_is_not_believed(make_world):
