@@ -140,21 +140,9 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  #
                     worst = _claim(best, label, r0, r1, c0, c1, marks[k], position[k, 0], position[k, 1], gsd)
                 else:
                     worst = _contest(
-                        best,
-                        label,
-                        r0,
-                        r1,
-                        c0,
-                        c1,
-                        marks[k],
-                        position[k],
-                        rotation[k],
-                        lens[k],
-                        lattice,
-                        flat,
-                        gsd,
+                        best, label, r0, r1, c0, c1, marks[k], position[k], rotation[k], lens[k], lattice, flat, gsd,
                         tan2,
-                    )
+                    )  # fmt: skip
 
 
 def label_tile(

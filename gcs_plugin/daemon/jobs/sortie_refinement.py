@@ -23,6 +23,8 @@ from orthoswarm.model.bounding_box import BoundingBox
 
 _REACH_M: Final = 400.0
 _DRAWN_S: Final = 3.0
+_BEGUN_S: Final = 60.0
+"""How long the first picture may take to begin the map, on a machine that is busy or compiles the kernels."""
 _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
@@ -58,7 +60,7 @@ class SortieRefinement:
         self.make_way(vehicle, None)
         if job.detail.get("trigger") == "complete":
             self._wait_quiet(job)
-        self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
+        self.wait_drawn(job)
         if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
             return _nothing_came(job)
         tell(0.03, "waiting for a free worker process")
@@ -121,6 +123,13 @@ class SortieRefinement:
         self.on_published(layer, job)
 
     # -- the parts ------------------------------------------------------------------------------------------------
+
+    def wait_drawn(self, job: Job) -> None:
+        """Wait a few seconds until the sortie's pictures are drawn, and longer for the first, which begins the map."""
+        vehicle, end = str(job.vehicle), time.monotonic() + _BEGUN_S
+        drawn = self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
+        while not drawn and self.drawer.area is None and time.monotonic() < end and not self.stopped():
+            drawn = self.drawer.wait_drawn(vehicle, job.sortie, _QUIET_S)
 
     def _wait_quiet(self, job: Job) -> None:
         """Wait for pictures that were under way when the vehicle completed; they belong to its sortie.

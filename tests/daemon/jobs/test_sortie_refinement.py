@@ -1,0 +1,46 @@
+"""A refinement waits for the map that its first picture begins."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from gcs_plugin.daemon.jobs.job_queue import Job
+from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
+
+JOB = Job(1, "refine", "v1", 1, "running", 0.0, "", 0.0, 0.0, None, 1)
+
+
+@dataclass
+class Drawing:
+    """A real-time layer that is asked in vain a number of times before its first picture is drawn."""
+
+    busy: int
+    begins: bool = True
+    asked: int = 0
+    area: object = None
+
+    def wait_drawn(self, vehicle, sortie, timeout_s):
+        self.asked += 1
+        if self.asked <= self.busy:
+            return False
+        self.area = object() if self.begins else None
+        return True
+
+
+@pytest.mark.parametrize("busy", [0, 5])
+def test_it_waits_until_the_first_picture_has_begun_the_map(busy):
+    drawing = Drawing(busy)
+    SortieRefinement(None, None, None, None, drawing, None).wait_drawn(JOB)
+    assert drawing.area is not None and drawing.asked == busy + 1
+
+
+def test_it_waits_no_longer_where_no_picture_can_begin_it():
+    drawing = Drawing(2, begins=False)
+    SortieRefinement(None, None, None, None, drawing, None).wait_drawn(JOB)
+    assert drawing.asked == 3
+
+
+def test_it_waits_no_longer_once_the_daemon_ends():
+    drawing = Drawing(1000)
+    SortieRefinement(None, None, None, None, drawing, None, stopped=lambda: drawing.asked == 4).wait_drawn(JOB)
+    assert drawing.asked == 4
