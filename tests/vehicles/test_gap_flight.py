@@ -1,6 +1,6 @@
 """Gaps flown from the daemon: a camera that fails for a while, the gap that this leaves, and the flight that closes it.
 
-On simulated autopilots (slow), and with `-m sitl` on real ones; see test_twin_camera.
+On real autopilots, with `-m sitl`; see test_twin_camera. tests/daemon/test_gaps_flown.py flies simulated ones.
 """
 
 import contextlib
@@ -14,9 +14,9 @@ import pytest
 
 from orthoswarm.model.geo import LocalGrid, utm_epsg
 from tests.kit.daemon_kit import exported, serving
-from tests.vehicles.test_twin_camera import RATE_HZ, CameraProcess, autopilot, free_port, small_area
+from tests.vehicles.test_twin_camera import PLACES, RATE_HZ, CameraProcess, free_port, small_area
 
-__all__ = ["autopilot"]  # the fixture
+REAL = [place for place in PLACES if any(mark.name == "sitl" for mark in place.marks)]
 LENGTH_M, WIDTH_M, ALTITUDE_M = 240.0, 60.0, 40.0
 FAILS_WITHIN_M = 60.0
 """Pictures nearer than this to the area's middle (east) do not arrive while the camera fails."""
@@ -54,6 +54,13 @@ class FailingUplink:
     def close(self):
         self.server.shutdown()
         self.server.server_close()
+
+
+@pytest.fixture(params=REAL)
+def autopilot(request):
+    kind, what = request.param
+    with kind(what) as place:
+        yield place
 
 
 @pytest.mark.timeout(1800)
