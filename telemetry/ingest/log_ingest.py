@@ -14,9 +14,9 @@ from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.event_pairing import Pairing, pair
-from telemetry.ingest.motion_chains import PictureMotion
-from telemetry.ingest.picture_evidence import picture_motion
+from telemetry.ingest.pairing.event_pairing import Pairing, pair
+from telemetry.ingest.pairing.motion_chains import PictureMotion
+from telemetry.ingest.pairing.picture_evidence import picture_motion
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
@@ -288,7 +288,7 @@ def _use_timeline(
     photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]
 ) -> None:
     """Without camera events: poses at the photos' times, the clock corrected by positions or whole quarter hours."""
-    from telemetry.ingest.clock_offset import offset_by_positions, offset_by_zone
+    from telemetry.ingest.pairing.clock_offset import offset_by_positions, offset_by_zone
 
     timed = [p for p in photos if p.time_s is not None]
     if not timed:

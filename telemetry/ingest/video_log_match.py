@@ -5,8 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.clock_offset import offset_by_positions, offset_by_turning, offset_by_zone, turning_of_pictures
 from telemetry.ingest.log_ingest import LogSource
+from telemetry.ingest.pairing.clock_offset import (
+    offset_by_positions,
+    offset_by_turning,
+    offset_by_zone,
+    turning_of_pictures,
+)
 from telemetry.samples.findings import Finding, plural
 from telemetry.video.picture_poses import Poses
 from telemetry.video.video_file import VideoScan

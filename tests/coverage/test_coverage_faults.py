@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.coverage_faults import simulate
+from benchmarks.robustness.coverage_faults import simulate
 
 
 @pytest.mark.parametrize("seed", [2, 3, 7])

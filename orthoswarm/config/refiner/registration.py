@@ -140,7 +140,7 @@ class RegistrationConfig:
     chosen, not measured."""
     false_matches: float = 1e-4
     """A flight is taken to lie on the map if a map of other ground would show an agreement of tie points as good as the
-    one found so many times only (expected number of false matches); measured by benchmarks/wrong_maps.py."""
+    one found so many times only (expected number of false matches); measured by benchmarks/robustness/wrong_maps.py."""
     leg_by_chance: float = 0.01
     """A leg of such a flight is matched if its ties agree with its place by chance with this probability only."""
     leg_agrees_m: float = 1.2

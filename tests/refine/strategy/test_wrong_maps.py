@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.wrong_maps import altered, blank, darkened, mirror_ew, mirror_ns, noise, season
+from benchmarks.robustness.wrong_maps import altered, blank, darkened, mirror_ew, mirror_ns, noise, season
 from orthoswarm.model.geo import local_origin
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.in_flight import place_in_flight

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.event_pairing import by_time
-from telemetry.ingest.motion_chains import PictureMotion
+from telemetry.ingest.pairing.event_pairing import by_time
+from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.photos.picture_motion import PictureFile, shifts_px
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from telemetry.formats.log.flight_logs import read_log
-from telemetry.ingest.clock_offset import offset_by_positions, offset_by_turning, offset_by_zone
 from telemetry.ingest.ingest import LoadOptions, load
+from telemetry.ingest.pairing.clock_offset import offset_by_positions, offset_by_turning, offset_by_zone
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 

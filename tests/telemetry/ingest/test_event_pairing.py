@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from telemetry.formats.log.flight_logs import read_log
-from telemetry.ingest.event_pairing import by_time, pair
 from telemetry.ingest.ingest import load
-from telemetry.ingest.motion_chains import PictureMotion
+from telemetry.ingest.pairing.event_pairing import by_time, pair
+from telemetry.ingest.pairing.motion_chains import PictureMotion
 from tests.telemetry.ingest.exposure_grid import exposures, flown_over, ground_of, scored
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 

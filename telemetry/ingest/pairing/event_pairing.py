@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.motion_chains import PictureMotion
-from telemetry.ingest.sequence_match import match_sequences
+from telemetry.ingest.pairing.motion_chains import PictureMotion
+from telemetry.ingest.pairing.sequence_match import match_sequences
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Wrong maps are refused, right ones are not: what the refiner accepts of maps that show other ground.
 
-    python -m benchmarks.wrong_maps SET... --out DIR [--town OTHER_SET] [--kinds mirror_ns blank ...]
+    python -m benchmarks.robustness.wrong_maps SET... --out DIR [--town OTHER_SET] [--kinds mirror_ns blank ...]
 
 SET is a folder of `orthoswarm twin make`. Each kind of map is made of the set's basemap, lies at the same place and
 is given to a refiner. A line a run: how many legs are `refine_matched`, `carried`, `failed`, how many pictures are

@@ -1,7 +1,7 @@
 """How many pictures a second the daemon takes: N simulated companion computers post at a rate, over loopback.
 
-    python benchmarks/daemon_load.py --vehicles 8 32 96 --rate 2 --seconds 20
-    python benchmarks/daemon_load.py --legs --vehicles 8 --rate 2 --seconds 60
+    python -m benchmarks.speed.daemon_load --vehicles 8 32 96 --rate 2 --seconds 20
+    python -m benchmarks.speed.daemon_load --legs --vehicles 8 --rate 2 --seconds 60
 
 With --legs the pictures show one ground along legs there and back, over a map, so that coarse maps of the legs are made
 meanwhile; without, they are alike, and nothing but the real-time layer is made of them.

@@ -1,6 +1,6 @@
 """Is the stated error true? Shares of pictures within one and two `sigma_m`, on maps that are right and distorted ones.
 
-    python -m benchmarks.sigma_truth SET... [--kinds plain season 2x150 ...] [--out FILE.jsonl]
+    python -m benchmarks.accuracy.sigma_truth SET... [--kinds plain season 2x150 ...] [--out FILE.jsonl]
 
 SET is a folder of `orthoswarm twin make`. A kind `AxL` is the set's basemap warped by a smooth random field: its
 displacements have a root mean square length of A metres and a Gaussian correlation of length L metres. The truth stays,
@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 import telemetry
-from benchmarks.wrong_maps import altered, season
+from benchmarks.robustness.wrong_maps import altered, season
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.model.geo import local_origin

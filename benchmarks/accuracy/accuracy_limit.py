@@ -1,6 +1,6 @@
 """What the paper's model could reach at best: true fields of view and the best homography for each leg.
 
-    python -m benchmarks.accuracy_limit SET...
+    python -m benchmarks.accuracy.accuracy_limit SET...
 
 SET is a folder of `orthoswarm twin make`. No picture is looked at: recorded poses, projected on their lines (Eq. 3),
 are compared with the true ones, leg by leg, over the middle of each picture, which is what the map is made of.

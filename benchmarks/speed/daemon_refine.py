@@ -1,6 +1,6 @@
 """How long it takes the daemon to show a vehicle refined: photos are posted, the refinement is asked for, timed.
 
-    python benchmarks/daemon_refine.py out/twin
+    python -m benchmarks.speed.daemon_refine out/twin
 
 The folder is one that `orthoswarm twin make` wrote (photos/, basemap.tif). Prints a line of JSON for each vehicle: its
 pictures, seconds from the wish to its refined pixels on the map, and CPU seconds of the solution; meanwhile the next

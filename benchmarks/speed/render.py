@@ -1,6 +1,6 @@
 """Cost of the final orthoimage: CPU seconds and memory against the number of frames, and what decoding takes of it.
 
-    python benchmarks/render.py [--frames 250 1000] [--workers 1]
+    python -m benchmarks.speed.render [--frames 250 1000] [--workers 1]
 
 Memory is the peak of this process (and of its children, each) as the system counts it, mapped tiles included.
 """
@@ -14,8 +14,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from flight import area, fly
 
+from benchmarks.speed.made_up_flight import area, fly
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields

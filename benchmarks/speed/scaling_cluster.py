@@ -1,6 +1,6 @@
 """Throughput per core: a Dask cluster on loopback against the local pool, with the same number of processes.
 
-    python -m benchmarks.scaling_cluster PHOTOS... --basemap MAP [--processes 2]
+    python -m benchmarks.speed.scaling_cluster PHOTOS... --basemap MAP [--processes 2]
 
 Needs the extra `cluster`. Both make the same map, one after the other; products are compared, too.
 """

@@ -19,8 +19,8 @@ from gcs_plugin.mission.items import RTL
 from gcs_plugin.mission.mission_files import MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from tests.kit.daemon_kit import start, stop
-from tests.vehicles.test_fleet_scenarios import ADDRESSES, REAL, Real, Site
-from tests.vehicles.test_twin_camera import small_area
+from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site
+from tests.vehicles.autopilots.test_twin_camera import small_area
 
 pytestmark = pytest.mark.sitl
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4

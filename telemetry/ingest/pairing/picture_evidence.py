@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
-from telemetry.ingest.motion_chains import PictureMotion
+from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.photos.picture_motion import PictureFile, shifts_px
 from telemetry.samples.course import local_metres

@@ -1,6 +1,6 @@
 """How far the coverage layer can be trusted: random swarm flights with faults against what their true cameras saw.
 
-    python benchmarks/coverage_faults.py --flights 100
+    python -m benchmarks.robustness.coverage_faults --flights 100
 
 No picture is rendered: a plan is flown in geometry, some of it fails, and pictures are placed with the errors that
 they state (blur is taken as known, not measured). Truth is Camera.project of the true cameras at the

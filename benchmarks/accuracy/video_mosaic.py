@@ -1,6 +1,6 @@
 """Is a map from video as good as one from photos? The same pictures of a twin as JPEG, as H.264 and as H.265.
 
-python -m benchmarks.video_mosaic TWIN [--crf 18] [--out DIR]
+python -m benchmarks.accuracy.video_mosaic TWIN [--crf 18] [--out DIR]
 
 TWIN is a folder that `orthoswarm twin make` wrote. Each vehicle's photos become one video with B-frames, 30 pictures a
 second as a camera that took no others would write them, each with its pose as SEI. The three are mapped and measured

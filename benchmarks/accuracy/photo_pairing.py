@@ -1,4 +1,4 @@
-"""How well photos without positions find their camera events: python -m benchmarks.photo_pairing ORTHOIMAGE.
+"""How well photos without positions find their camera events: python -m benchmarks.accuracy.photo_pairing ORTHOIMAGE.
 
 Prints one line for each interval, clock resolution and share of missing exposures: photos whose exposure has an event
 too, photos paired without a mark, how many of these wrongly, marked ones, and seconds a flight. The pictures are cut

@@ -1,4 +1,4 @@
-"""Mutated files through every reader: python -m benchmarks.reader_fuzz [--inputs N] [--only READER].
+"""Mutated files through every reader: python -m benchmarks.robustness.reader_fuzz [--inputs N] [--only READER].
 
 Each reader runs in a process of its own with limits of memory and of processor seconds that hold inside C code, too:
 a reader that exceeds them ends its process and counts as a failure. Prints, for each reader, inputs, exceptions other

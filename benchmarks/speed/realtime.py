@@ -1,6 +1,6 @@
 """Speed of the real-time module: frames per second of one core, JPEG decoding included, at the default ground pixel.
 
-    python benchmarks/realtime.py [--frames 500] [--quality 90] [--runs 5]
+    python -m benchmarks.speed.realtime [--frames 500] [--quality 90] [--runs 5]
 
 Prints the median of several runs, by the process's CPU time, of frame after frame (as the daemon draws them while
 they arrive) and of all frames at once (as `orthoswarm mosaic` does).
@@ -12,8 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from flight import area, fly
-
+from benchmarks.speed.made_up_flight import area, fly
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.mosaic.realtime import RealtimeMosaic, mosaic
 from orthoswarm.raster.picture_file import read_rgba

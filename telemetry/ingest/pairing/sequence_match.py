@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from orthoswarm.model.robust import mad_sigma
-from telemetry.ingest.alignment import SequenceMatch
-from telemetry.ingest.motion_chains import Chains, PictureMotion, chains_of, variants
+from telemetry.ingest.pairing.alignment import SequenceMatch
+from telemetry.ingest.pairing.motion_chains import Chains, PictureMotion, chains_of, variants
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -1,6 +1,6 @@
 """How fast telemetry is read: photos, SEI with decoding, KLV. Prints CPU times; one thread.
 
-python benchmarks/telemetry.py [--photos FOLDER] [--pictures 600]
+python -m benchmarks.speed.telemetry_reading [--photos FOLDER] [--pictures 600]
 """
 
 import argparse

@@ -5,7 +5,7 @@ slower messages a second), every message in a datagram and every vehicle from a 
 asks for the streams, decodes and follows every message, and writes the telemetry log. After a warm-up its own processor
 time is measured, user and system.
 
-    python benchmarks/fleet96.py [--vehicles 96] [--seconds 30] [--link udp|tcp] [--json]
+    python -m benchmarks.speed.fleet96 [--vehicles 96] [--seconds 30] [--link udp|tcp] [--json]
 """
 
 import argparse

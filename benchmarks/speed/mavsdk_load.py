@@ -3,7 +3,7 @@
 Simulated vehicles in a process of their own are asked for 10 Hz of position and of attitude, as `orthoswarm serve` asks
 for them; each message is decoded (MAVSDK hands them over as JSON) and counted.
 
-    python -m benchmarks.mavsdk_load [--vehicles 1 4 8] [--seconds 20]
+    python -m benchmarks.speed.mavsdk_load [--vehicles 1 4 8] [--seconds 20]
 """
 
 import argparse
@@ -97,7 +97,7 @@ def main() -> int:
         return 0
     for count in args.vehicles:
         for only in ("fleet", "mavsdk"):
-            command = [sys.executable, "-m", "benchmarks.mavsdk_load", "--only", only, "--vehicles", str(count)]
+            command = [sys.executable, "-m", "benchmarks.speed.mavsdk_load", "--only", only, "--vehicles", str(count)]
             subprocess.run([*command, "--seconds", str(args.seconds)], check=True)
     return 0
 

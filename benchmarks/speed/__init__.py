@@ -1,0 +1,1 @@
+"""How fast the stages are, and how much load the ground station bears."""

@@ -1,0 +1,1 @@
+"""Whole missions on simulated vehicles and, with `-m sitl`, on real autopilots."""
