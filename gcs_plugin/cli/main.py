@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Sequence
 
+from gcs_plugin.cli.interrupt import safe_interrupts
 from orthoswarm import __version__
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -109,7 +110,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if getattr(parsed, "json", False) and isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(encoding="utf-8", errors="backslashreplace")  # JSON is UTF-8
     try:
-        return int(module.run(parsed))
+        with safe_interrupts():
+            return int(module.run(parsed))
     except OrthoSwarmError as error:
         print(f"orthoswarm: {error}", file=sys.stderr)
         return error.exit_code
