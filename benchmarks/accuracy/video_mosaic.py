@@ -47,9 +47,17 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
     def pose(number: int) -> Sample:
         frame, fix = frames[number], frames[number].fix
         return Sample(
-            frame.time_s, fix.lat_deg, fix.lon_deg, fix.height_m, fix.altitude_m, degrees(fix.yaw_rad),
-            degrees(fix.pitch_rad), degrees(fix.roll_rad), degrees(fix.flight_yaw_rad), vehicle=frame.vehicle,
-        )  # fmt: skip
+            time_s=frame.time_s,
+            lat_deg=fix.lat_deg,
+            lon_deg=fix.lon_deg,
+            height_m=fix.height_m,
+            altitude_m=fix.altitude_m,
+            yaw_deg=degrees(fix.yaw_rad),
+            pitch_deg=degrees(fix.pitch_rad),
+            roll_deg=degrees(fix.roll_rad),
+            flight_yaw_deg=degrees(fix.flight_yaw_rad),
+            vehicle=frame.vehicle,
+        )
 
     add_sei(plain, target, pose)
     plain.unlink()

@@ -60,7 +60,7 @@ class Flown:
     not_arrived: set[str]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """One flight: shares of the area.
 
@@ -94,7 +94,7 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     vehicles = int(rng.integers(2, 5))
     plan = plan_area(area, vehicles, height, foot)
     true_fov = fov_deg * (rng.uniform(0.6, 0.8) if "narrow lens" in faults else rng.uniform(1.0, 1.1))
-    flown = _fly(plan, area.grid, rng, faults, true_fov)
+    flown = _fly(plan, area.grid, rng, faults=faults, fov_deg=true_fov)
     shots = flown.shots
     cells = Cells.of_area(EPSG, area.ground, area.no_fly)
     cover = CoverageGrid(cells)
@@ -109,7 +109,7 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     solved = footprint(height, math.radians(true_fov * 0.996))
     missing = missing_by_events(cover.views, flown.events).pictures
     listed = {m.view.image for m in missing if m.cause is Cause.NOT_ARRIVED}
-    after = _fly_gaps(plan, cover, truth, solved, rng, true_fov, foot, flown.events)
+    after = _fly_gaps(plan, cover, truth, solved=solved, rng=rng, fov_deg=true_fov, planned=foot, events=flown.events)
     return Outcome(
         faults=faults,
         seen=float((said == State.SEEN)[wanted].mean()),
@@ -137,7 +137,7 @@ def _area(rng: np.random.Generator, side_m: float) -> Area:
 
 
 def _fly(
-    plan: Plan, grid: LocalGrid, rng: np.random.Generator, faults: tuple[str, ...], fov_deg: float, first: int = 0
+    plan: Plan, grid: LocalGrid, rng: np.random.Generator, *, faults: tuple[str, ...], fov_deg: float, first: int = 0
 ) -> Flown:
     """Pictures of a plan's legs; faults hit the first vehicle, wind all of them.
 
@@ -220,7 +220,7 @@ def _truly_seen(cells: Cells, shots: list[Shot]) -> NDArray[np.bool_]:
 
 
 def _fly_gaps(
-    plan: Plan, cover: CoverageGrid, truth: NDArray[np.bool_], solved: Footprint, rng: np.random.Generator,
+    plan: Plan, cover: CoverageGrid, truth: NDArray[np.bool_], *, solved: Footprint, rng: np.random.Generator,
     fov_deg: float, planned: Footprint, events: list[CameraEvent],
 ) -> float:  # fmt: skip
     """Fly gaps without further faults until none is left; returns the share that was truly seen in the end."""
@@ -239,8 +239,8 @@ def _fly_gaps(
             write_gaps(Path(folder), gaps, grid)
             found = read_gaps(Path(folder) / "gaps.geojson")
         target = gap_area(found, [], solved, fly_not_arrived=True).area
-        again = plan_gaps(replace(target, no_fly=shapely.MultiPolygon()), 2, plan.altitude_m, solved, Options())
-        flown = _fly(again, grid, rng, (), fov_deg, len(cover.views) * 10)
+        again = plan_gaps(replace(target, no_fly=shapely.MultiPolygon()), 2, plan.altitude_m, solved, options=Options())
+        flown = _fly(again, grid, rng, faults=(), fov_deg=fov_deg, first=len(cover.views) * 10)
         cover.put(s.view for s in flown.shots)
         seen |= _truly_seen(cells, flown.shots)
         events = [*events, *flown.events]

@@ -126,7 +126,7 @@ def write_map(ground: np.ndarray, path: Path) -> None:
 # -- the load --------------------------------------------------------------------------------------------------------
 
 
-async def fly(client: httpx.AsyncClient, vehicle: int, rate: float, until: float, course: Course, took: list[float]):
+async def fly(client: httpx.AsyncClient, vehicle: int, rate: float, *, until: float, course: Course, took: list[float]):
     grid = LocalGrid(EPSG)
     number = 0
     start = time.monotonic() + vehicle / (rate * 97.0)
@@ -153,7 +153,9 @@ async def load(url: str, vehicles: int, rate: float, seconds: float, course: Cou
     async with httpx.AsyncClient(base_url=url, timeout=120.0, limits=limits) as client:
         before = figures((await client.get("/metrics")).text)
         began = time.monotonic()
-        await asyncio.gather(*(fly(client, v, rate, began + seconds, course, took) for v in range(vehicles)))
+        await asyncio.gather(
+            *(fly(client, v, rate, until=began + seconds, course=course, took=took) for v in range(vehicles))
+        )
         wall = time.monotonic() - began
         posted = figures((await client.get("/metrics")).text)
         while figures((await client.get("/metrics")).text)["frames_drawn_total"] < len(took):

@@ -54,7 +54,15 @@ def fly(folder: Path, count: int, quality: int = 90) -> list[PlacedFrame]:
             name = f"uav{vehicle + 1}_{step:04d}.jpg"
             cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
             placed = Camera(camera.position + np.array([EAST, NORTH, 0.0]), camera.rotation, lens)
-            frame = Frame(name, folder / name, f"uav{vehicle + 1}", float(step), Fix(0.0, 0.0), WIDTH, HEIGHT)
+            frame = Frame(
+                image=name,
+                path=folder / name,
+                vehicle=f"uav{vehicle + 1}",
+                time_s=float(step),
+                fix=Fix(0.0, 0.0),
+                width=WIDTH,
+                height=HEIGHT,
+            )
             frames.append(PlacedFrame(frame, placed, "realtime", 1.0))
     return frames
 

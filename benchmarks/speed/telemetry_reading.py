@@ -46,7 +46,13 @@ def bench_video(count: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plain, marked = Path(folder, "plain.mp4"), Path(folder, "marked.mp4")
         video(plain, count)
-        add_sei(plain, marked, lambda i: Sample(1.7e9 + i / 30, 47.0 + 3e-6 * i, 8.25, 100.0, yaw_deg=0.0, vehicle="v"))
+        add_sei(
+            plain,
+            marked,
+            lambda i: Sample(
+                time_s=1.7e9 + i / 30, lat_deg=47.0 + 3e-6 * i, lon_deg=8.25, height_m=100.0, yaw_deg=0.0, vehicle="v"
+            ),
+        )
         megabits = marked.stat().st_size * 8 / 1e6 / (count / 30)
         found = 0
         start = time.process_time()

@@ -155,6 +155,8 @@ def command_all(
             for held in schedule.failed(system):
                 ended.add(held)
                 text = f"vehicle {held} stays on the ground, because vehicle {system} did not take off"
-                orders[held] = type(order)("start", held, time.monotonic(), order.id).end(text, Verdict.NOT_SENT)
+                orders[held] = type(order)(verb="start", system=held, given_s=time.monotonic(), id=order.id).end(
+                    text, Verdict.NOT_SENT
+                )
                 say(text)
     return orders

@@ -119,7 +119,11 @@ class DirectBackend(Backend):
     ) -> dict[int, Order]:
         """All commands at their times."""
         return command_all(
-            delays, lambda s: self.fleet.order(Order(verb, s, time.monotonic())), self.pump, say, airspace
+            delays,
+            lambda s: self.fleet.order(Order(verb=verb, system=s, given_s=time.monotonic())),
+            self.pump,
+            say,
+            airspace,
         )
 
     def pump(self, seconds: float) -> None:
@@ -171,7 +175,7 @@ class DirectBackend(Backend):
             try:
                 jobs[system] = start()
             except OrthoSwarmError as error:
-                outcomes[system] = Outcome(False, str(error))
+                outcomes[system] = Outcome(ok=False, text=str(error))
         while len(outcomes) < len(begin):
             self.fleet.poll(0.2)
             for system, job in jobs.items():

@@ -171,7 +171,7 @@ class MavsdkBackend(Backend):
         """All commands at their times."""
 
         def begin(system: int) -> Order:
-            order = Order(verb, system, time.monotonic())
+            order = Order(verb=verb, system=system, given_s=time.monotonic())
             try:
                 order.exchange = self._begin(system, verb, order.expires_s)
             except OrthoSwarmError as error:
@@ -225,9 +225,13 @@ class MavsdkBackend(Backend):
             autopilot = Autopilot.ARDUPILOT if kind == Kind.ARDUPILOT else Autopilot.PX4
             address = Address(number)
             vehicle = Vehicle(
-                address, autopilot, modes_of(autopilot, int(system.vehicle_type())), CompletionDetector(autopilot),
-                Streams(address, self._own, _RATES), heard=time.monotonic(),
-            )  # fmt: skip
+                address=address,
+                autopilot=autopilot,
+                modes=modes_of(autopilot, int(system.vehicle_type())),
+                detector=CompletionDetector(autopilot=autopilot),
+                streams=Streams(vehicle=address, own=self._own, rates=_RATES),
+                heard=time.monotonic(),
+            )
             craft = _Craft(vehicle, system, MavlinkDirect(system), MissionRaw(system))
             self._crafts[number] = craft
             for name in _HEARD:
@@ -293,7 +297,7 @@ class MavsdkBackend(Backend):
             )
 
     def _event(self, kind: str, system: int, text: str) -> None:
-        self.events.append(FleetEvent(kind, system, time.time(), f"vehicle {system} {text}"))
+        self.events.append(FleetEvent(kind=kind, system=system, time_s=time.time(), text=f"vehicle {system} {text}"))
 
     # --- missions and commands ---
 
@@ -301,11 +305,11 @@ class MavsdkBackend(Backend):
         """Upload and read back; in a thread of its own."""
         craft = self._crafts.get(system)
         if craft is None:
-            return Outcome(False, f"vehicle {system} is not on the links; check links and system ids")
+            return Outcome(ok=False, text=f"vehicle {system} is not on the links; check links and system ids")
         if craft.vehicle.detector.phase is Phase.ACTIVE and craft.vehicle.armed:
-            return Outcome(False, f"vehicle {system} is flying its mission; pause it or let it return first")
+            return Outcome(ok=False, text=f"vehicle {system} is flying its mission; pause it or let it return first")
         if why := why_no_missions(craft.vehicle.kind):
-            return Outcome(False, f"vehicle {system} {why}")
+            return Outcome(ok=False, text=f"vehicle {system} {why}")
         wrong = ""
         for _ in range(_ATTEMPTS):
             refused = self._write(craft, mission)
@@ -315,11 +319,11 @@ class MavsdkBackend(Backend):
                 continue
             found = difference(mission, stored.items)
             if found is None:
-                return Outcome(True, f"vehicle {system} holds the mission: {len(mission)} items, read back")
+                return Outcome(ok=True, text=f"vehicle {system} holds the mission: {len(mission)} items, read back")
             if refused:
-                return Outcome(False, f"vehicle {system} refused the mission {refused}; {found.text}")
+                return Outcome(ok=False, text=f"vehicle {system} refused the mission {refused}; {found.text}")
             wrong = f"vehicle {system} holds another mission than was sent: {found.text}; upload again before flying"
-        return Outcome(False, wrong)
+        return Outcome(ok=False, text=wrong)
 
     def _write(self, craft: _Craft, mission: Mission) -> str:
         """Upload; returns why it failed."""
@@ -349,7 +353,12 @@ class MavsdkBackend(Backend):
             raw = craft.raw.download_mission()
         except MissionRawError:
             return None
-        items = [MissionItem(i.command, i.frame, (i.param1, i.param2, i.param3, i.param4), i.x, i.y, i.z) for i in raw]
+        items = [
+            MissionItem(
+                command=i.command, frame=i.frame, params=(i.param1, i.param2, i.param3, i.param4), x=i.x, y=i.y, z=i.z
+            )
+            for i in raw
+        ]
         return Mission(craft.vehicle.autopilot, tuple(items))
 
     def _begin(self, system: int, verb: Verb, expires: float) -> Exchange:

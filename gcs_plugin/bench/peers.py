@@ -53,7 +53,7 @@ class Job:
     threads: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """A program to compare with.
 
@@ -88,7 +88,9 @@ def _own(refine: str) -> Program:
         report = kept(job.out / "map" / "report.json") or {}
         return job.out / "map" / "orthoimage.tif", report.get("frames", {}).get("used")
 
-    return Program(f"OrthoSwarm `{refine}`", (), command, product, "yes, on the map")
+    return Program(
+        title=f"OrthoSwarm `{refine}`", packages=(), command=command, product=product, georeferenced="yes, on the map"
+    )
 
 
 def _orthomosaic_command(job: Job, programs: Path) -> list[str]:
@@ -143,22 +145,26 @@ PROGRAMS = {
     "swarm": _own("swarm"),
     "paper": _own("paper"),
     "pyorthomosaic": Program(
-        "pyOrthomosaic", ("pyOrthomosaic==0.9.3",), _orthomosaic_command, _orthomosaic_product, "yes, by GPS tags"
+        title="pyOrthomosaic",
+        packages=("pyOrthomosaic==0.9.3",),
+        command=_orthomosaic_command,
+        product=_orthomosaic_product,
+        georeferenced="yes, by GPS tags",
     ),
     "stitcher": Program(
-        "OpenCV Stitcher, scans",
-        ("opencv-python-headless>=4.10,<5",),
-        _script("stitch.py"),
-        _stitched,
-        "no",
+        title="OpenCV Stitcher, scans",
+        packages=("opencv-python-headless>=4.10,<5",),
+        command=_script("stitch.py"),
+        product=_stitched,
+        georeferenced="no",
         placed=False,
     ),
     "pycolmap": Program(
-        "pycolmap, pasted on flat ground",
-        ("pycolmap==4.2.1",),
-        _script("colmap.py"),
-        _pasted,
-        "yes, by a similarity to the GPS tags",
+        title="pycolmap, pasted on flat ground",
+        packages=("pycolmap==4.2.1",),
+        command=_script("colmap.py"),
+        product=_pasted,
+        georeferenced="yes, by a similarity to the GPS tags",
     ),
 }
 
@@ -166,7 +172,7 @@ PROGRAMS = {
 # -- running ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """How to compare.
 

@@ -16,7 +16,14 @@ _SMALLEST_BLOCK = 1000
 
 
 def run_scaling(
-    folder: Path, counts: Sequence[int], images: Sequence[int], refine: str, out: Path, workers: int | None, maps: bool
+    folder: Path,
+    counts: Sequence[int],
+    images: Sequence[int],
+    *,
+    refine: str,
+    out: Path,
+    workers: int | None,
+    maps: bool,
 ) -> dict[str, Any]:
     """Map the first vehicles of a set, then the first pictures of all of them; each run's report.json is kept.
 
@@ -48,13 +55,13 @@ def run_scaling(
         if report is None:
             print(f"{count} vehicles, {number} pictures each", file=sys.stderr, flush=True)
             photos = [photo for vehicle in whole[:count] for photo in vehicle[:number]]
-            report = _run(folder, photos, name, refine, out, workers, maps)
+            report = _run(folder, photos, name, refine=refine, out=out, workers=workers, maps=maps)
         rows.append({"kind": kind, "vehicles": count, "images": number} | cost(report))
     return {"machine": machine(), "set": folder.absolute().name, "refine": refine, "rows": rows}
 
 
 def _run(
-    folder: Path, photos: list[Path], name: str, refine: str, out: Path, workers: int | None, maps: bool
+    folder: Path, photos: list[Path], name: str, *, refine: str, out: Path, workers: int | None, maps: bool
 ) -> dict[str, Any]:
     subset, product = out / "photos", out / f"map-{name}"
     linked(photos, folder / "photos", subset)

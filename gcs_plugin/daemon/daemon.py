@@ -109,7 +109,7 @@ class Daemon:
         )  # fmt: skip
         self.exposures = ExposureJournal(self.journal, lambda s: "" if self.links is None else self.links.name_of(s))
         self.coverage = LiveCoverage(
-            self.journal, self.events, PictureViews(self.journal, self.store, folder / "solutions", fov),
+            self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov),
             source=lambda: area_source(self.console.plan(), self.plans.folder),
             epsg=lambda: None if self.drawer.area is None else self.drawer.area.epsg,
             vehicles=lambda: [] if self.links is None else self.links.latest, exposures=self.exposures,
@@ -117,7 +117,12 @@ class Daemon:
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
         self.coarse = LegPlacement(
-            self.journal, self.store, publisher, self.background, settings.basemap, self._published
+            journal=self.journal,
+            store=self.store,
+            publisher=publisher,
+            workers=self.background,
+            basemap=settings.basemap,
+            on_published=self._published,
         )
         self.refinement = SortieRefinement(
             journal=self.journal,
@@ -131,7 +136,12 @@ class Daemon:
             stopped=lambda: self.jobs.stopping,
         )
         self.together = JointRefinement(
-            self.journal, publisher, self.background, settings.basemap, settings.redraw_px, self._published
+            journal=self.journal,
+            publisher=publisher,
+            workers=self.background,
+            basemap=settings.basemap,
+            least_px=settings.redraw_px,
+            on_published=self._published,
         )
         self.exports = Exports(
             settings=settings,
@@ -178,19 +188,21 @@ class Daemon:
             Source(
                 v.id,
                 v.pictures,
-                self.add_picture,
-                self.poses.at,
-                self._say,
-                folder / "videos",
-                self._link_log,
-                self._card_read,
+                take=self.add_picture,
+                pose_at=self.poses.at,
+                tell=self._say,
+                cache=folder / "videos",
+                link_log=self._link_log,
+                settled=self._card_read,
             )
             for v in settings.vehicles
             if v.pictures
         ]
         fleet = None if self.links is None else self.links.fleet
         self.buses = [
-            CanReader(v.id, v.can, self.poses.of(v.id), self._say, fleet, v.system or system_of(v.id))
+            CanReader(
+                v.id, v.can, poses=self.poses.of(v.id), tell=self._say, fleet=fleet, system=v.system or system_of(v.id)
+            )
             for v in settings.vehicles
             if v.can
         ]
@@ -280,7 +292,7 @@ class Daemon:
         time_s = came if pose.time_s is None else pose.time_s
         path = self.store.put(key, suffix, data)
         values = pose.values | ({"origin": pose.origin} if pose.origin else {})
-        change = add_frame(key, pose.vehicle, pose.image, time_s, path, (width, height), values)
+        change = add_frame(key, pose.vehicle, pose.image, time_s=time_s, path=path, size=(width, height), pose=values)
         seq, new = self.journal.write(change)
         if new:
             frame = frame_of(
@@ -322,7 +334,7 @@ class Daemon:
         """All vehicles that were heard or that sent pictures, as JSON values."""
         linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
         return views.vehicle_rows(
-            self.journal, self.settings.vehicles, self.sources, linked, self.buses, self.poses.origins()
+            self.journal, self.settings.vehicles, self.sources, linked, buses=self.buses, origins=self.poses.origins()
         )
 
     def legs(self) -> dict[str, Any]:
@@ -468,7 +480,7 @@ class Daemon:
         """The daemon's own facts for the report."""
         return facts_of(
             [j.document() for j in self.jobs.all()], self.completions(), time.time() - self.started,
-            time.process_time(), (self.workers.usage(), self.background.usage()), peak_rss_mb(),
+            cpu_s=time.process_time(), others=(self.workers.usage(), self.background.usage()), rss_mb=peak_rss_mb(),
         ) | ({} if self.coverage.document["state"] == "no area" else {"coverage": self.coverage.document})  # fmt: skip
 
     # -- health ---------------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ class Exports:
         self,
         settings: Settings,
         journal: Journal,
+        *,
         store: PictureStore,
         layers: Mapping[str, Layer],
         console: ConsoleState,

@@ -56,7 +56,7 @@ class VehicleSettings:
     can: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """The daemon's settings.
 
@@ -149,7 +149,7 @@ def read_settings(workspace: Path) -> Settings:
     """
     path = workspace / FILE
     if not path.exists():
-        return Settings(workspace)
+        return Settings(workspace=workspace)
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -167,7 +167,7 @@ def read_settings(workspace: Path) -> Settings:
     for key in ("basemap", "dem", "tak_certificate", "tak_authority"):
         if key in document:
             document[key] = workspace / document[key]
-    return replace(Settings(workspace), vehicles=vehicles, **document)
+    return replace(Settings(workspace=workspace), vehicles=vehicles, **document)
 
 
 def _vehicle(entry: Any, path: Path) -> VehicleSettings:

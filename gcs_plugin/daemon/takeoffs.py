@@ -175,7 +175,7 @@ class Takeoffs:
 
     def _start(self, vehicle: str, system: int) -> None:
         """Start one vehicle; if that fails, the waiting ones stay on the ground."""
-        order = Order("start", system, self._clock())
+        order = Order(verb="start", system=system, given_s=self._clock())
         try:
             self._links.fleet.call(lambda: self._links.fleet.order(order))
             while order.outcome is None and not self._closed:

@@ -60,7 +60,7 @@ _REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its p
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Kept:
     """The daemon's own data about a vehicle, besides the fleet's."""
 
@@ -204,7 +204,7 @@ class VehicleLinks:
         given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
         rows, systems = self._without_command(verb, names, number, override or {})
-        orders = {name: Order(verb, system, given, number) for name, system in systems.items()}
+        orders = {name: Order(verb=verb, system=system, given_s=given, id=number) for name, system in systems.items()}
         for order in orders.values():
             self.fleet.call(lambda o=order: self.fleet.order(o))  # type: ignore[misc]
         end = time.monotonic() + _OUTCOME_S
@@ -354,7 +354,7 @@ class VehicleLinks:
     def _keep(self, system: int) -> _Kept:
         if system not in self._kept:
             name = self.name_of(system)
-            self._kept[system] = _Kept(name, self._poses.of(name))
+            self._kept[system] = _Kept(id=name, poses=self._poses.of(name))
         return self._kept[system]
 
     def _message(self, vehicle: "Vehicle", message: Any, utc: float) -> None:

@@ -48,6 +48,7 @@ def vehicle_rows(
     named: Sequence[VehicleSettings],
     sources: Iterable[Source],
     linked: Mapping[str, dict[str, Any]],
+    *,
     buses: Iterable[CanReader] = (),
     origins: Mapping[str, Mapping[str, str]] | None = None,
 ) -> list[dict[str, Any]]:

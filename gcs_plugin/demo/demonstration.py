@@ -131,7 +131,7 @@ def _daemon(setting: Setting, out: Path, places: dict[str, list[str]]) -> "Daemo
 
     vehicles = tuple(VehicleSettings(f"v{n}", n, "", url) for n, url in enumerate(places["streams"], start=1))
     settings = Settings(
-        out, links=tuple(places["links"]), basemap=out / "twin" / "basemap.tif", fov_min_deg=FOV_MIN_DEG,
+        workspace=out, links=tuple(places["links"]), basemap=out / "twin" / "basemap.tif", fov_min_deg=FOV_MIN_DEG,
         workers=max(1, cores() - 1), vehicles=vehicles,
     )  # fmt: skip
     return Daemon(settings)

@@ -139,7 +139,7 @@ def open_outlet(url: str, system: int) -> Outlet:
         raise InputError(f"port {port + system - 1} cannot be served ({error.strerror}); give another one") from None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Shutter:
     """Says when a vehicle's next picture is due.
 
@@ -193,7 +193,7 @@ class Shutter:
         return moment
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Follower:
     """The camera under one vehicle.
 
@@ -286,9 +286,9 @@ class Crew:
         for system, vehicle in sorted(self._fleet.vehicles.items()):
             if system not in self.followers:
                 follower = Follower(
-                    vehicle, LivePoses(f"v{system}"), self._shutter(),
-                    TwinCamera(self._stage, self._site, self._setting, system, self._rays),
-                    open_outlet(self._stream, system), self._level,
+                    vehicle=vehicle, poses=LivePoses(f"v{system}"), shutter=self._shutter(),
+                    camera=TwinCamera(self._stage, self._site, self._setting, system, self._rays),
+                    outlet=open_outlet(self._stream, system), level=self._level,
                 )  # fmt: skip
                 self.followers[system] = follower
                 self._opened(follower)

@@ -262,7 +262,7 @@ class VideoSender(VideoStream):
         self._socket.close()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Studio:
     """Takes the pictures of all vehicles, one after the other, as they are asked for.
 

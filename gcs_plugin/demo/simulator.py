@@ -46,8 +46,8 @@ def simulate(setting: Setting, pipe: Connection) -> None:
     stage, site = build_stage(setting)
     systems = range(1, setting.vehicles + 1)
     studio = Studio(
-        {s: TwinCamera(stage, site, setting, s) for s in systems},
-        {s: VideoServer() for s in systems},
+        cameras={s: TwinCamera(stage, site, setting, s) for s in systems},
+        servers={s: VideoServer() for s in systems},
     )
     airframe = Airframe(climb_m_s=8.0, sink_m_s=6.0, gps_sigma_m=0.8)
     vehicles = make_swarm(

@@ -50,7 +50,7 @@ class CommandResult:
         }  # fmt: skip
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class Order:
     """One command to one vehicle, under way or ended.
 
@@ -80,7 +80,7 @@ class Order:
 
     def end(self, text: str, failure: Verdict) -> "Order":
         """End it without a dialogue."""
-        self._ended = Outcome(False, text, failure=failure)
+        self._ended = Outcome(ok=False, text=text, failure=failure)
         return self
 
     def result(self, name: str = "") -> CommandResult | None:

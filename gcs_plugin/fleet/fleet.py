@@ -86,12 +86,12 @@ class Fleet:
         self._reception = Reception(
             self.vehicles,
             self.hub,
-            self._dialogues,
-            own,
-            rates or default_rates(),
-            remembered or {},
-            self._publish,
-            wall,
+            dialogues=self._dialogues,
+            own=own,
+            rates=rates or default_rates(),
+            remembered=remembered or {},
+            event=self._publish,
+            wall=wall,
         )
         self.separation = self._reception.separation
         self._tick_at = 0.0

@@ -17,7 +17,7 @@ Pair = tuple[int, int]
 """System ids of two vehicles, in order."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FleetEvent:
     """Something that happened to a vehicle.
 

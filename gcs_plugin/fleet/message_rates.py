@@ -66,7 +66,7 @@ def default_rates(pose_hz: float = 10.0) -> Rates:
     )
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Stream:
     hz: float
     optional: bool
@@ -77,7 +77,7 @@ class _Stream:
     backoff_s: float = _BACKOFF_S[0]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Streams:
     """Keeps the streams of one vehicle running. Not a dialogue that ends, so driven by `seen`, `acknowledged`, `tick`.
 
@@ -107,7 +107,8 @@ class Streams:
         """Request everything (again after a reboot, or when a vehicle is found again)."""
         wanted = {**self.rates.wanted, **self.rates.optional}
         self._streams = {
-            kind: _Stream(hz, kind in self.rates.optional, again_at=now + _BACKOFF_S[0]) for kind, hz in wanted.items()
+            kind: _Stream(hz=hz, optional=kind in self.rates.optional, again_at=now + _BACKOFF_S[0])
+            for kind, hz in wanted.items()
         }
         self.refused.clear()
         self._queue, self._asking, self._window = list(wanted), None, now

@@ -61,7 +61,7 @@ class Reception:
     """
 
     def __init__(
-        self, vehicles: dict[int, Vehicle], hub: Hub, dialogues: Dialogues, own: Address, rates: Rates,
+        self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address, rates: Rates,
         remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
@@ -97,7 +97,9 @@ class Reception:
             route = self._route(vehicle, side, peer, now)
             route.counted(lost)
             beside = kind in _REPEATED and vehicle.routes.stale(route, now)
-            self._autopilot_says(vehicle, route, kind, packet.message, now, beside or (late and kind in _STATES))
+            self._autopilot_says(
+                vehicle, route, kind, message=packet.message, now=now, stale=beside or (late and kind in _STATES)
+            )
             if beside:
                 return
         elif kind in _PHOTOS:
@@ -137,7 +139,7 @@ class Reception:
         self._dialogues.send(vehicle.system, vehicle.streams.start(now))
 
     def _autopilot_says(
-        self, vehicle: Vehicle, route: Route, kind: int, message: Message, now: float, stale: bool
+        self, vehicle: Vehicle, route: Route, kind: int, *, message: Message, now: float, stale: bool
     ) -> None:
         if vehicle.lost or not vehicle.streams.started:
             if vehicle.lost:
@@ -191,9 +193,14 @@ class Reception:
         heartbeat, address = packet.message, Address(packet.system, packet.component)
         autopilot = Autopilot.of(heartbeat)
         vehicle = Vehicle(
-            address, autopilot, modes_of(autopilot, heartbeat.type), CompletionDetector(autopilot),
-            Streams(address, self._own, self._rates.of(autopilot)), heard=now, kind=int(heartbeat.type),
-        )  # fmt: skip
+            address=address,
+            autopilot=autopilot,
+            modes=modes_of(autopilot, heartbeat.type),
+            detector=CompletionDetector(autopilot=autopilot),
+            streams=Streams(vehicle=address, own=self._own, rates=self._rates.of(autopilot)),
+            heard=now,
+            kind=int(heartbeat.type),
+        )
         before = self._remembered.pop(packet.system, None)
         if before is not None and before.get("autopilot") == autopilot.value:
             vehicle.detector = CompletionDetector.from_state(before)
@@ -222,7 +229,9 @@ class Reception:
 
     def _event(self, kind: str, vehicle: Vehicle, text: str, pair: Pair | None = None, severity: int = 6) -> None:
         words = text if pair else f"vehicle {vehicle.system} {text}"
-        self._publish(FleetEvent(kind, vehicle.system, self._wall(), words, pair, severity))
+        self._publish(
+            FleetEvent(kind=kind, system=vehicle.system, time_s=self._wall(), text=words, pair=pair, severity=severity)
+        )
 
     def tick(self, now: float) -> None:
         """Check for missing messages, and for vehicles that are too close."""

@@ -48,7 +48,7 @@ class BootClock:
         return "mixed" if again else "rebooted"
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Route:
     """A route on which a vehicle is heard.
 
@@ -117,7 +117,7 @@ class Routes:
         """The route of a packet, and whether the best route has changed with it."""
         route = self.known.get((side, peer))
         if route is None:
-            route = self.known[side, peer] = Route(side, peer, now, clock=self._clock(now))
+            route = self.known[side, peer] = Route(side=side, peer=peer, heard=now, clock=self._clock(now))
         route.heard = now
         best = self.best
         if best is None or (best is not route and now - best.heard > FRESH_S):

@@ -26,7 +26,7 @@ _MISSION_PAUSED: Final = int(dialect.MISSION_STATE_PAUSED)
 _STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Vehicle:
     """One vehicle.
 

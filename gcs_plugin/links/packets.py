@@ -28,7 +28,7 @@ def checksum(data: bytes) -> int:
     return _MIRROR8[mirrored >> 8] | (_MIRROR8[mirrored & 0xFF] << 8)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Packet:
     """One complete packet with a correct checksum.
 
@@ -149,4 +149,4 @@ class Framer:
         if checksum(raw[1:body] + extra) != raw[body] | (raw[body + 1] << 8):
             self.bad_checksums += 1
             return None
-        return Packet(raw, raw[head], raw[head + 1], raw[head - 1], kind, signed)
+        return Packet(raw=raw, system=raw[head], component=raw[head + 1], seq=raw[head - 1], kind=kind, signed=signed)

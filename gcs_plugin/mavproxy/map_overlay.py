@@ -35,7 +35,7 @@ class Mosaic(SlipObject):  # type: ignore[misc]
         version: of the layer.
     """
 
-    def __init__(self, rgba: Pixels, north: float, west: float, south: float, east: float, version: int) -> None:
+    def __init__(self, rgba: Pixels, *, north: float, west: float, south: float, east: float, version: int) -> None:
         super().__init__(KEY, LAYER)
         self.rgba, self.version = rgba, version
         self.north, self.west, self.south, self.east = north, west, south, east
@@ -93,7 +93,14 @@ def fetch_mosaic(client: Client) -> Mosaic | None:
             top, left = (y - y0) * _TILE, (x - x0) * _TILE
             rgba[top : top + _TILE, left : left + _TILE] = tile
     n = 1 << zoom
-    return Mosaic(rgba, _lat(y0, n), _lon(x0, n), _lat(y1 + 1, n), _lon(x1 + 1, n), int(row["version"]))
+    return Mosaic(
+        rgba,
+        north=_lat(y0, n),
+        west=_lon(x0, n),
+        south=_lat(y1 + 1, n),
+        east=_lon(x1 + 1, n),
+        version=int(row["version"]),
+    )
 
 
 def _tiles(zoom: int, west: float, south: float, east: float, north: float) -> tuple[int, int, int, int]:

@@ -57,7 +57,7 @@ _PX4_AUTO_MISSION = (4 << 16) | (4 << 24)
 _PATIENCE = 3
 
 
-@dataclasses.dataclass(slots=True)
+@dataclasses.dataclass(slots=True, kw_only=True)
 class CompletionDetector:
     """Tracks one vehicle's mission; feed it every message of the vehicle's autopilot in order of arrival.
 

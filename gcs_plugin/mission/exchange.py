@@ -44,7 +44,7 @@ class Verdict(enum.Enum):
     UNKNOWN = "unknown"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """How an exchange ended.
 
@@ -139,7 +139,7 @@ class Exchange(abc.ABC):
         return kind if self._for_us(message) else ""
 
     def _end(self, ok: bool, text: str, failure: Verdict = Verdict.REFUSED) -> None:
-        self.outcome, self.deadline = Outcome(ok, text, failure=failure), NEVER
+        self.outcome, self.deadline = Outcome(ok=ok, text=text, failure=failure), NEVER
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ def _px4(main: int, sub: int = 0) -> int:
     return (main << 16) | (sub << 24)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Modes:
     """The modes of one kind of vehicle.
 
@@ -35,19 +35,19 @@ class Modes:
         return self.names.get(custom_mode, f"mode {custom_mode}")
 
 
-_COPTER: Final = Modes(3, 4, 17, 6, 9, {
+_COPTER: Final = Modes(mission=3, ready=4, hold=17, rtl=6, land=9, names={
     0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
     11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 20: "GUIDED_NOGPS",
     21: "SMART_RTL", 22: "FLOWHOLD", 23: "FOLLOW", 27: "AUTO_RTL",
 })  # fmt: skip
-_PLANE: Final = Modes(10, 15, 12, 11, 11, {
+_PLANE: Final = Modes(mission=10, ready=15, hold=12, rtl=11, land=11, names={
     0: "MANUAL", 5: "FBWA", 6: "FBWB", 7: "CRUISE", 10: "AUTO", 11: "RTL", 12: "LOITER", 13: "TAKEOFF", 15: "GUIDED",
     17: "QSTABILIZE", 18: "QHOVER", 19: "QLOITER", 20: "QLAND", 21: "QRTL",
 })  # fmt: skip
-_ROVER: Final = Modes(10, 15, 4, 11, 4, {
+_ROVER: Final = Modes(mission=10, ready=15, hold=4, rtl=11, land=4, names={
     0: "MANUAL", 1: "ACRO", 3: "STEERING", 4: "HOLD", 5: "LOITER", 10: "AUTO", 11: "RTL", 12: "SMART_RTL", 15: "GUIDED",
 })  # fmt: skip
-_PX4: Final = Modes(_px4(4, 4), _px4(4, 3), _px4(4, 3), _px4(4, 5), _px4(4, 6), {
+_PX4: Final = Modes(mission=_px4(4, 4), ready=_px4(4, 3), hold=_px4(4, 3), rtl=_px4(4, 5), land=_px4(4, 6), names={
     _px4(1): "MANUAL", _px4(2): "ALTCTL", _px4(3): "POSCTL", _px4(4, 2): "TAKEOFF", _px4(4, 3): "HOLD",
     _px4(4, 4): "MISSION", _px4(4, 5): "RTL", _px4(4, 6): "LAND", _px4(4, 8): "FOLLOW", _px4(5): "ACRO",
     _px4(6): "OFFBOARD", _px4(7): "STABILIZED",

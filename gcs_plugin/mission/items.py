@@ -30,7 +30,7 @@ PLAIN_FRAME = {5: 0, 6: 3, 11: 10}
 DEG_E7 = 1e7
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MissionItem:
     """One item as it travels; its place in the list is its sequence number.
 
@@ -58,17 +58,25 @@ class MissionItem:
         lat_deg: float,
         lon_deg: float,
         height_m: float,
+        *,
         params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
         frame: int = FRAME_RELATIVE,
     ) -> "MissionItem":
         """An item at a place; the height is above the takeoff level unless the frame says otherwise."""
-        return cls(command, frame, params, round(lat_deg * DEG_E7), round(lon_deg * DEG_E7), height_m)
+        return cls(
+            command=command,
+            frame=frame,
+            params=params,
+            x=round(lat_deg * DEG_E7),
+            y=round(lon_deg * DEG_E7),
+            z=height_m,
+        )
 
     @classmethod
     def do(cls, command: int, *params: float) -> "MissionItem":
         """An item without a place: up to four parameters, the rest 0."""
         first, second, third, fourth = (*params, 0.0, 0.0, 0.0, 0.0)[:4]
-        return cls(command, FRAME_MISSION, (first, second, third, fourth))
+        return cls(command=command, frame=FRAME_MISSION, params=(first, second, third, fourth))
 
     @property
     def is_nav(self) -> bool:
@@ -112,7 +120,15 @@ class MissionItem:
             scale = DEG_E7 if placed and dialect.enums["MAV_CMD"][message.command].has_location else 1.0
             x, y = round(_finite(x) * scale), round(_finite(y) * scale)
         params = (float(message.param1), float(message.param2), float(message.param3), float(message.param4))
-        return cls(message.command, message.frame, params, int(x), int(y), float(message.z), bool(message.autocontinue))
+        return cls(
+            command=message.command,
+            frame=message.frame,
+            params=params,
+            x=int(x),
+            y=int(y),
+            z=float(message.z),
+            autocontinue=bool(message.autocontinue),
+        )
 
 
 def _finite(value: float) -> float:

@@ -96,7 +96,7 @@ def trigger_sections(items: Sequence[MissionItem]) -> list[tuple[int, int, float
 
 
 def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
-    placed = MissionItem.at(item.command, item.lat_deg, item.lon_deg, item.alt_m, item.params, item.frame)
+    placed = MissionItem.at(item.command, item.lat_deg, item.lon_deg, item.alt_m, params=item.params, frame=item.frame)
     if not placed.has_place:
         x, y = (int(value) if math.isfinite(value) else 0 for value in (item.lat_deg, item.lon_deg))
         placed = replace(placed, x=x, y=y)

@@ -29,7 +29,7 @@ _MULTIROTOR = 2
 _ALTITUDE_MODE = {FRAME_GLOBAL_RELATIVE: 1, FRAME_TERRAIN: 4}  # QGroundControl's AltModeRelative, AltModeTerrainFrame
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MissionItem:
     """One mission item, free of any autopilot's numbering.
 
@@ -56,7 +56,7 @@ class MissionItem:
         return self.command in _WITH_POSITION and (self.lat_deg != 0.0 or self.lon_deg != 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Mission:
     """A mission file's content.
 
@@ -113,7 +113,9 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
     by_vehicle = plan.over_ground is not None and plan.over_ground.by_vehicle
 
     def nav(command: int, lat: float, lon: float, height: float, frame: int = FRAME_GLOBAL_RELATIVE) -> MissionItem:
-        return MissionItem(command, frame, (0.0, 0.0, 0.0, yaw), lat, lon, height)
+        return MissionItem(
+            command=command, frame=frame, params=(0.0, 0.0, 0.0, yaw), lat_deg=lat, lon_deg=lon, alt_m=height
+        )
 
     def fly_to(point: Waypoint) -> MissionItem:
         if by_vehicle and point.above_ground_m is not None:
@@ -122,7 +124,7 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
 
     items = [
         nav(NAV_TAKEOFF, sortie.home_lat_deg, sortie.home_lon_deg, sortie.takeoff_height_m),
-        MissionItem(DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
+        MissionItem(command=DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
     ]
     for point in sortie.waypoints:
         if by_vehicle and point.between:
@@ -130,11 +132,11 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
         items.append(fly_to(point))
         if point.camera is not None:
             distance, at_once = (plan.trigger_m, 1.0) if point.camera else (0.0, 0.0)
-            items.append(MissionItem(DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
+            items.append(MissionItem(command=DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
         if point.wait_s:
             items.append(replace(fly_to(point), command=NAV_LOITER_TIME, params=(point.wait_s, 0.0, 0.0, yaw)))
     if plan.end == "rtl":
-        items.append(MissionItem(NAV_RTL))
+        items.append(MissionItem(command=NAV_RTL))
     elif plan.end == "land":
         items.append(nav(NAV_LAND, sortie.home_lat_deg, sortie.home_lon_deg, 0.0))
     else:  # a plain waypoint last: both autopilots then report the mission as complete
@@ -184,7 +186,14 @@ def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
 
 def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float]) -> str:
     """The text of a `.waypoints` file: "QGC WPL 110", twelve tab-separated columns, line 0 is home."""
-    first = MissionItem(NAV_WAYPOINT, FRAME_GLOBAL, (0.0, 0.0, 0.0, 0.0), *home)
+    first = MissionItem(
+        command=NAV_WAYPOINT,
+        frame=FRAME_GLOBAL,
+        params=(0.0, 0.0, 0.0, 0.0),
+        lat_deg=home[0],
+        lon_deg=home[1],
+        alt_m=home[2],
+    )
     lines = ["QGC WPL 110"]
     for number, item in enumerate([first, *items]):
         params = "\t".join(f"{0.0 if math.isnan(p) else p:.8g}" for p in item.params)
@@ -238,11 +247,22 @@ def _parse_waypoints(text: str, name: str) -> Mission:
             ) from None
     if not all(math.isfinite(r[2]) and math.isfinite(r[3]) for r in rows):
         raise InputError(f"{name} has a command or a frame that is not finite; export it again")
-    items = [MissionItem(int(r[3]), int(r[2]), (r[4], r[5], r[6], r[7]), r[8], r[9], r[10], r[11] != 0) for r in rows]
+    items = [
+        MissionItem(
+            command=int(r[3]),
+            frame=int(r[2]),
+            params=(r[4], r[5], r[6], r[7]),
+            lat_deg=r[8],
+            lon_deg=r[9],
+            alt_m=r[10],
+            autocontinue=r[11] != 0,
+        )
+        for r in rows
+    ]
     home = (items[0].lat_deg, items[0].lon_deg, items[0].alt_m) if items else None
     for item in items:
         _check_item(item, name)
-    return Mission(tuple(items[1:]), home)
+    return Mission(items=tuple(items[1:]), home=home)
 
 
 def _parse_plan(document: Mapping[str, Any]) -> Mission:
@@ -268,12 +288,12 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
     return Mission(
-        tuple(items),
-        (float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,
-        tuple(surveys),
-        tuple(polylines),
-        tuple(no_fly),
-        float(speed) if speed else None,
+        items=tuple(items),
+        home=(float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,
+        surveys=tuple(surveys),
+        polylines=tuple(polylines),
+        no_fly=tuple(no_fly),
+        speed_m_s=float(speed) if speed else None,
     )
 
 
@@ -284,13 +304,13 @@ def _read_item(entry: Mapping[str, Any]) -> MissionItem:
     lat, lon, alt = (0.0 if math.isnan(v) else v for v in values[4:])
     p1, p2, p3, p4 = values[:4]
     return MissionItem(
-        int(entry["command"]),
-        int(entry["frame"]),
-        (p1, p2, p3, p4),
-        lat,
-        lon,
-        alt,
-        bool(entry.get("autoContinue", True)),
+        command=int(entry["command"]),
+        frame=int(entry["frame"]),
+        params=(p1, p2, p3, p4),
+        lat_deg=lat,
+        lon_deg=lon,
+        alt_m=alt,
+        autocontinue=bool(entry.get("autoContinue", True)),
     )
 
 

@@ -301,4 +301,6 @@ class MissionUpload(Exchange):
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
         if self.refusal is not None and self.outcome is not None:
             refusal = self.refusal
-            self.outcome = Outcome(False, self.outcome.text, refusal.item, refusal.field, refusal.code)
+            self.outcome = Outcome(
+                ok=False, text=self.outcome.text, item=refusal.item, field=refusal.field, code=refusal.code
+            )

@@ -125,7 +125,9 @@ class PlanRequest:
             endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
             endurances_s=[60.0 * minutes for minutes in self.endurances_min],
             clearance_m=self.clearance_m,
-            separation=Separation(self.separation_m, step, layers, swap_s=60.0 * self.swap_min),
+            separation=Separation(
+                distance_m=self.separation_m, height_m=step, layers=layers, swap_s=60.0 * self.swap_min
+            ),
             most_items=MOST_ITEMS[self.autopilot],
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
@@ -152,7 +154,16 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         area = make_area(shapes.polygons, no_fly)
 
         def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-            return plan_area(area, request.vehicles, above_m, foot, request.method, options, progress, heights)
+            return plan_area(
+                area,
+                request.vehicles,
+                above_m,
+                foot,
+                method=request.method,
+                options=options,
+                progress=progress,
+                heights=heights,
+            )
 
         return _over_ground(request, cover, area.ground, area.grid), area
     if not shapes.lines:
@@ -164,7 +175,16 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     paths = shapely.MultiLineString([grid.to_grid(line[:, 0], line[:, 1]) for line in shapes.lines])
 
     def follow(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-        return plan_lines(shapes.lines, request.vehicles, above_m, foot, zones, options, progress, heights)
+        return plan_lines(
+            shapes.lines,
+            request.vehicles,
+            above_m,
+            foot,
+            no_fly=zones,
+            options=options,
+            progress=progress,
+            heights=heights,
+        )
 
     return _over_ground(request, follow, paths, grid), zones
 
@@ -196,9 +216,14 @@ def _over_ground(
         tolerance_m = _TOLERANCE * request.altitude_m
     by_vehicle = request.terrain_items and request.autopilot in WITH_TERRAIN
     plan = plan_over_relief(
-        make, lambda above_m: _footprint(request, above_m), ground, request.altitude_m, tolerance_m, request.relief,
-        by_vehicle,
-    )  # fmt: skip
+        make,
+        lambda above_m: _footprint(request, above_m),
+        ground,
+        above_m=request.altitude_m,
+        tolerance_m=tolerance_m,
+        relief=request.relief,
+        by_vehicle=by_vehicle,
+    )
     notes = relief_notes(plan, ground)
     if request.terrain_items and not by_vehicle:
         notes.append(f"{request.autopilot} has no items with heights above the ground: heights count from takeoff")
@@ -221,7 +246,9 @@ def _gap_plan(request: PlanRequest, options: Options, progress: Callable[[str], 
     target = gap_area(read_gaps(request.area), no_fly, nominal, request.fly_not_arrived)
 
     def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-        return plan_gaps(target.area, request.vehicles, above_m, foot, options, progress, heights)
+        return plan_gaps(
+            target.area, request.vehicles, above_m, foot, options=options, progress=progress, heights=heights
+        )
 
     plan = _over_ground(request, cover, target.area.ground, target.area.grid)
     return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area

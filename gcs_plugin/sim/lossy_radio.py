@@ -13,7 +13,7 @@ Cargo = TypeVar("Cargo")
 _QUEUE_S: Final = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
     """Faults of a link, applied to each packet independently.
 
@@ -43,7 +43,7 @@ class Faults:
 NO_FAULTS: Final = Faults()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Channel(Generic[Cargo]):
     """One direction of a link.
 

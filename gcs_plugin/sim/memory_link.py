@@ -50,8 +50,8 @@ class SimLink(Link):
     ) -> None:
         super().__init__("simulation")
         self.vehicles, self._clock = list(vehicles), clock
-        self.up: Channel[tuple[int, bytes]] = Channel(up)
-        self.down: Channel[tuple[int, bytes]] = Channel(down)
+        self.up: Channel[tuple[int, bytes]] = Channel(faults=up)
+        self.down: Channel[tuple[int, bytes]] = Channel(faults=down)
         self._packers = [dialect.MAVLink(None, vehicle.system, 1) for vehicle in self.vehicles]
         self._framers = [Framer() for _ in self.vehicles]
 

@@ -77,7 +77,7 @@ class Exposure:
     lon_deg: float
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Flight:
     """The flight of one vehicle.
 
@@ -120,11 +120,17 @@ class Flight:
 
     @classmethod
     def make(
-        cls, autopilot: Autopilot, modes: Modes, store: MissionStore, chart: Chart, frame: Airframe, seed: int
+        cls, autopilot: Autopilot, modes: Modes, *, store: MissionStore, chart: Chart, frame: Airframe, seed: int
     ) -> "Flight":
         """A vehicle standing at home."""
         mode = modes.hold if autopilot is Autopilot.PX4 else 0
-        return cls(autopilot, modes, store, Motion(chart, frame, Random(seed), speed=frame.speed_m_s), mode)
+        return cls(
+            autopilot=autopilot,
+            modes=modes,
+            store=store,
+            motion=Motion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s),
+            mode=mode,
+        )
 
     # --- commands ---
 

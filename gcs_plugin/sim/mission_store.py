@@ -30,7 +30,7 @@ _CAPACITY: Final = 650
 _TIMING: Final = {Autopilot.ARDUPILOT: (1.0, 8.0), Autopilot.PX4: (0.25, 5.0)}
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Transfer:
     partner: Address
     count: int
@@ -40,7 +40,7 @@ class _Transfer:
     items: list[MissionItem] = field(default_factory=list)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class MissionStore:
     """A vehicle's stored mission, and the protocol that changes it.
 
@@ -144,7 +144,7 @@ class MissionStore:
             self.items = []
             self.generation += 1
             return [self._ack(sender, ACCEPTED)]
-        self._transfer = _Transfer(sender, count, 0, now, now)
+        self._transfer = _Transfer(partner=sender, count=count, wanted=0, asked_at=now, heard_at=now)
         return self._ask(self._transfer, now)
 
     def _ask(self, transfer: _Transfer, now: float) -> list[Message]:
@@ -192,14 +192,16 @@ class MissionStore:
         if item.command in (WAYPOINT, TAKEOFF):
             params = (float(int(params[0])), 0.0, 0.0, 0.0)
         if not item.has_place:
-            return MissionItem(item.command, FRAME_GLOBAL, (params[0], params[1], params[2], params[3]))
+            return MissionItem(
+                command=item.command, frame=FRAME_GLOBAL, params=(params[0], params[1], params[2], params[3])
+            )
         return MissionItem(
-            item.command,
-            PLAIN_FRAME.get(item.frame, item.frame),
-            (params[0], params[1], params[2], params[3]),
-            item.x,
-            item.y,
-            round(item.z * 100.0) / 100.0,
+            command=item.command,
+            frame=PLAIN_FRAME.get(item.frame, item.frame),
+            params=(params[0], params[1], params[2], params[3]),
+            x=item.x,
+            y=item.y,
+            z=round(item.z * 100.0) / 100.0,
         )
 
     def _check(self, item: MissionItem, count: int) -> int:

@@ -55,7 +55,7 @@ class Chart:
         return self.lat_deg + north / per_lat, self.lon_deg + east / per_lon
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
     """The true pose of a vehicle.
 
@@ -76,7 +76,7 @@ class Pose:
     roll_rad: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Airframe:
     """Performance of a vehicle.
 
@@ -98,7 +98,7 @@ class Airframe:
     gps_tau_s: float = 60.0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Motion:
     """The state of motion of one vehicle, advanced in steps of STEP_S.
 
@@ -189,7 +189,16 @@ class Motion:
     def _pose(self, time_s: float, values: tuple[float, ...]) -> Pose:
         north, east, up, yaw, pitch, roll = values
         lat, lon = self.chart.to_degrees(north, east)
-        return Pose(time_s, lat, lon, up, self.chart.alt_m + up, yaw, pitch, roll)
+        return Pose(
+            time_s=time_s,
+            lat_deg=lat,
+            lon_deg=lon,
+            height_m=up,
+            alt_m=self.chart.alt_m + up,
+            yaw_rad=yaw,
+            pitch_rad=pitch,
+            roll_rad=roll,
+        )
 
     def _wander(self) -> None:
         sigma, tau = self.airframe.gps_sigma_m, self.airframe.gps_tau_s

@@ -22,7 +22,7 @@ from orthoswarm.model.errors import InputError
 _TICK_S: Final = 0.02
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class _End:
     """One link of the swarm and the vehicles behind it."""
 
@@ -82,12 +82,22 @@ class SimSwarm:
         groups = [list(vehicles)] if together else [[vehicle] for vehicle in vehicles]
         for number, group in enumerate(groups):
             link = _open(address, number)
-            seeded = [Faults(f.loss, f.duplicate, f.delay_s, f.silent, f.seed + 2 * number) for f in (up, down)]
+            seeded = [
+                Faults(loss=f.loss, duplicate=f.duplicate, delay_s=f.delay_s, silent=f.silent, seed=f.seed + 2 * number)
+                for f in (up, down)
+            ]
             packers = {vehicle.system: dialect.MAVLink(None, vehicle.system, 1) for vehicle in group}
             for packer in packers.values():
                 packer.signing.secret_key, packer.signing.sign_outgoing = key, key is not None
             signing = Signing(key) if key else None
-            end = _End(link, group, Channel(seeded[0]), Channel(seeded[1]), packers, signing)
+            end = _End(
+                link=link,
+                vehicles=group,
+                up=Channel(faults=seeded[0]),
+                down=Channel(faults=seeded[1]),
+                packers=packers,
+                signing=signing,
+            )
             self._ends.append(end)
             self._by_link[link] = end
             link.open(self._selector, self._began)
@@ -234,9 +244,14 @@ def make_swarm(
     for number in range(count):
         lat, lon = chart.to_degrees(spacing_m * (number // 10), spacing_m * (number % 10))
         vehicle = SimVehicle(
-            number + 1, autopilots[number % len(autopilots)], (lat, lon, home[2]), airframe or Airframe(),
-            boot_utc_s=utc, seed=seed, **options,
-        )  # fmt: skip
+            system=number + 1,
+            autopilot=autopilots[number % len(autopilots)],
+            home=(lat, lon, home[2]),
+            airframe=airframe or Airframe(),
+            boot_utc_s=utc,
+            seed=seed,
+            **options,
+        )
         vehicle.flight.motion.yaw = random.uniform(-0.3, 0.3)
         swarm.append(vehicle)
     return swarm

@@ -36,7 +36,7 @@ _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 _HOME: Final = (47.397742, 8.545594, 488.0)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class SimVehicle:
     """One simulated vehicle; drive it with `handle` and `advance`, in seconds since its boot.
 
@@ -88,10 +88,12 @@ class SimVehicle:
         """Stand at home with an empty store."""
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
-        self.store = MissionStore(self.autopilot, home, items)
+        self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
         chart = Chart(*self.home)
         modes = modes_of(self.autopilot, self.kind)
-        self.flight = Flight.make(self.autopilot, modes, self.store, chart, self.airframe, self.seed + self.system)
+        self.flight = Flight.make(
+            self.autopilot, modes, store=self.store, chart=chart, frame=self.airframe, seed=self.seed + self.system
+        )
         self._boot(0.0)
 
     # --- for tests and cameras ---

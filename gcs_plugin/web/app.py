@@ -102,7 +102,7 @@ class Routes:
         """The latest jobs, oldest first."""
         return JsonAnswer(await self.work(lambda: [job.document() for job in self.daemon.jobs.all()]))
 
-    async def tile(self, layer: str, z: int, x: int, y: int, suffix: str, request: Request) -> Response:
+    async def tile(self, request: Request, *, layer: str, z: int, x: int, y: int, suffix: str) -> Response:
         """A map tile; transparent where nothing is drawn. The ETag changes with the content."""
         address = TileAddress(z, x, y)
         if layer not in self.daemon.tiles.names or suffix not in _TYPES or not address.valid:

@@ -13,6 +13,7 @@ from collections import OrderedDict
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from fastapi import HTTPException, Request, Response
@@ -173,7 +174,8 @@ class CommandRoutes:
         takeoffs, given = self._takeoffs(), self._given(body)
         sortie, names = names_of(body)
         override = _override(body, ALL)
-        seconds = await in_thread(self._threads, _begin, takeoffs, given, number, sortie, names, override)
+        begin = partial(_begin, takeoffs, given, number, sortie=sortie, names=names, override=override)
+        seconds = await in_thread(self._threads, begin)
         return JsonAnswer({"plan": number, "sortie": sortie, "takeoffs_in_s": seconds}, status_code=202)
 
     def _links(self) -> VehicleLinks:
@@ -191,6 +193,7 @@ def _begin(
     takeoffs: Takeoffs,
     given: Given,
     number: str,
+    *,
     sortie: int,
     names: dict[str, str],
     override: Mapping[str, Collection[str]],

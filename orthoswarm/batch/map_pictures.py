@@ -102,8 +102,8 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
     ):
         with _canvas(run, COARSE, coarse[0], coarse_ground, state) as first:
             layers = [
-                Layer(coarse[0], coarse_ground, first, state.gains),
-                Layer(fine[0], fine_ground, second, state.gains, seams=_seams(run, state)),
+                Layer(frames=coarse[0], terrain=coarse_ground, canvas=first, gains=state.gains),
+                Layer(frames=fine[0], terrain=fine_ground, canvas=second, gains=state.gains, seams=_seams(run, state)),
             ]
             drawn = partial(run.progress, "drawing orthoimage")
             stats = render_layers(layers, run=run.workers.map, progress=drawn)

@@ -67,7 +67,9 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
         raise InputError(f"the basemap {options.basemap} does not exist; check the path")
     override(options.config)
     with Workspace(out) as space:
-        context = RunContext(out, space, options, workers, progress, Clock(workers.usage))
+        context = RunContext(
+            out=out, space=space, options=options, workers=workers, progress=progress, clock=Clock(workers.usage)
+        )
         with context.clock.stage("load") as stage:
             state = _load(context, load)
             stage.items = len(state.ingest.frames) + len(state.ingest.rejected)

@@ -28,10 +28,10 @@ def write_products(
         _add_checkpoints(run, report, z)
         left_out = list(state.rejected.values())
         try:
-            report["against_map_m"] = write_page(run.out, report, stated, left_out, state.basemap)
+            report["against_map_m"] = write_page(run.out, report, stated, rejected=left_out, basemap=state.basemap)
         except InputError as error:  # a map may be damaged where only the report reads it
             report["warnings"].append(f"the report's pictures are without the map: {error}")
-            report["against_map_m"] = write_page(run.out, report, stated, left_out, None)
+            report["against_map_m"] = write_page(run.out, report, stated, rejected=left_out, basemap=None)
     wall, cpu, memory = run.clock.totals()
     report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
     report["stages"].append(stage_row(stage))

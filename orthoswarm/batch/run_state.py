@@ -44,7 +44,7 @@ PRODUCTS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
     """The options of a run.
 
@@ -75,7 +75,7 @@ class Options:
     config: Overrides = field(default_factory=dict)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class RunContext:
     """The environment of a run's stages.
 
@@ -92,7 +92,7 @@ class RunContext:
     clock: Clock
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class RunState:
     """The results of a run so far.
 

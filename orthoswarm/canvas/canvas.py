@@ -317,13 +317,13 @@ class Canvas:
     def read(self, row0: int, row1: int, col0: int, col1: int) -> Bytes:
         """Colours of a window, uint8 (row1 - row0, col1 - col0, 4); transparent where nothing was drawn."""
         out = np.zeros((max(0, row1 - row0), max(0, col1 - col0), 4), np.uint8)
-        self._gather(out, "rgba", row0, row1, col0, col1)
+        self._gather(out, "rgba", row0=row0, row1=row1, col0=col0, col1=col1)
         return out
 
     def read_plane(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
         """The auxiliary plane of a window, float32 or int32 (rows, columns); 0 where nothing was drawn."""
         out = np.zeros((max(0, row1 - row0), max(0, col1 - col0)), self._store.dtype)
-        self._gather(out, "plane", row0, row1, col0, col1)
+        self._gather(out, "plane", row0=row0, row1=row1, col0=col0, col1=col1)
         return out
 
     def read_reduced(self, factor: int, row0: int, row1: int, col0: int, col1: int) -> Bytes:
@@ -361,11 +361,16 @@ class Canvas:
         r0, c0, r1, c1 = r0 // factor, c0 // factor, -(-r1 // factor), -(-c1 // factor)
         step = self.grid.gsd_m * factor
         grid = GroundGrid(
-            self.grid.epsg, self.grid.west + c0 * step, self.grid.north - r0 * step, step, c1 - c0, r1 - r0
+            epsg=self.grid.epsg,
+            west=self.grid.west + c0 * step,
+            north=self.grid.north - r0 * step,
+            gsd_m=step,
+            width=c1 - c0,
+            height=r1 - r0,
         )
         return self.read_reduced(factor, r0, r1, c0, c1), grid
 
-    def _gather(self, out: NDArray[Any], part: str, row0: int, row1: int, col0: int, col1: int) -> None:
+    def _gather(self, out: NDArray[Any], part: str, *, row0: int, row1: int, col0: int, col1: int) -> None:
         self._follow()
         t = self.tile_px
         for tr in range(max(0, row0 // t), min(self.tile_rows, -(-row1 // t))):

@@ -32,7 +32,7 @@ Overrides = Mapping[str, Mapping[str, Any]]
 """Stage -> field -> value that differs from the default."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
     """The thresholds of all stages."""
 

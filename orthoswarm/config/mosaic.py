@@ -8,7 +8,7 @@ and every ground pixel.
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MosaicConfig:
     """What is drawn of a picture, the zero of heights, and the seam lines."""
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PaperConfig:
     """The paper's refiner. It gives no numbers for most of these; docs/method.md says what is read into it."""
 

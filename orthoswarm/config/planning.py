@@ -6,7 +6,7 @@ Prices are shares of flying time or seconds; limits of what a user may ask for s
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningConfig:
     """Planning: lines over an area, their order, sorties, and heights over ground."""
 

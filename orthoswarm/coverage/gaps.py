@@ -37,7 +37,7 @@ class PlannedFlight:
     fov_rad: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageGap:
     """A gap.
 
@@ -186,7 +186,16 @@ def _polygons(cover: CoverageGrid, explained: _Explained, vehicles: Sequence[str
         point = shapely.point_on_surface(polygon)
         c, r = np.round(grid.to_pixel([point.x, point.y])).astype(int)
         confidence = float(explained.confidence[min(max(r, 0), grid.height - 1), min(max(c, 0), grid.width - 1)])
-        gaps.append(CoverageGap(polygon, area, cause, detail, confidence, vehicles[vehicle - 1] if vehicle else ""))
+        gaps.append(
+            CoverageGap(
+                polygon=polygon,
+                area_m2=area,
+                cause=cause,
+                detail=detail,
+                confidence=confidence,
+                vehicle=vehicles[vehicle - 1] if vehicle else "",
+            )
+        )
     gaps.sort(key=lambda g: -g.area_m2)
     return Gaps(gaps, small, small_m2)
 

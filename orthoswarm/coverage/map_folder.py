@@ -22,7 +22,7 @@ from orthoswarm.raster.picture_file import PictureError, read_gray
 from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapFolder:
     """What a map says about its pictures.
 
@@ -69,7 +69,7 @@ def read_map(folder: Path) -> MapFolder:
     if unsure:
         warnings.append(f"{unsure} pictures have no known position error and count nowhere as well seen")
     root = Path(report["root"]) if report.get("root") else None
-    return MapFolder(grid.epsg, level, views, rejected, root, warnings)
+    return MapFolder(epsg=grid.epsg, ground_z_m=level, views=views, rejected=rejected, root=root, warnings=warnings)
 
 
 def _documents(folder: Path) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:

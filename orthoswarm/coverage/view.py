@@ -46,7 +46,7 @@ FLAW_NAMES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class View:
     """A picture as the coverage needs it.
 
@@ -79,7 +79,16 @@ class View:
         cls, camera: Camera, image: str, vehicle: str, sigma_m: float, time_s: float | None = None, **more: Any
     ) -> "View":
         """The view of a camera; `more` are further attributes."""
-        return cls(image, vehicle, time_s, camera.position, camera.rotation.T.copy(), camera.lens, sigma_m, **more)
+        return cls(
+            image=image,
+            vehicle=vehicle,
+            time_s=time_s,
+            position=camera.position,
+            to_camera=camera.rotation.T.copy(),
+            lens=camera.lens,
+            sigma_m=sigma_m,
+            **more,
+        )
 
     @classmethod
     def of_frame(
@@ -110,7 +119,7 @@ class View:
             position = np.array([*grid.to_grid(place["lat_deg"], place["lon_deg"]), place["height_m"]], float)
             homography = np.array(row["homography"], float).reshape(3, 3)
             lens = Lens(
-                width, height, focal_px(np.radians(row["fov_deg"]), width), row.get("k1", 0.0), row.get("k2", 0.0)
+                width, height, focal_px(np.radians(row["fov_deg"]), width), k1=row.get("k1", 0.0), k2=row.get("k2", 0.0)
             )
             sigma = float("nan") if row["sigma_m"] is None else float(row["sigma_m"])
             to_camera = _to_camera(homography, position, lens, ground_z_m)
@@ -122,9 +131,15 @@ class View:
         when = row.get("time")
         time_s = None if when is None else datetime.fromisoformat(when).timestamp()
         return cls(
-            str(row["image"]), str(row["vehicle"]), time_s, position, to_camera, lens, sigma,
+            image=str(row["image"]),
+            vehicle=str(row["vehicle"]),
+            time_s=time_s,
+            position=position,
+            to_camera=to_camera,
+            lens=lens,
+            sigma_m=sigma,
             placed=row["stage"] != "realtime",
-        )  # fmt: skip
+        )
 
     def moved_to(self, position: Array, image: str, time_s: float | None = None) -> "View":
         """The same camera somewhere else: a picture that was not taken, or has not arrived."""

@@ -339,7 +339,7 @@ class _Views:
         width, height = int(row["width"]), int(row["height"])
         mark.check_inside(width, height)
         focal = focal_px(math.radians(float(row["fov_deg"])), width)
-        lens = Lens(width, height, focal, float(row.get("k1", 0.0)), float(row.get("k2", 0.0)))
+        lens = Lens(width, height, focal, k1=float(row.get("k1", 0.0)), k2=float(row.get("k2", 0.0)))
         centre = np.array(lens.principal_point)
         pixel = lens.undistort((np.array([mark.column, mark.row]) - centre) / focal) * focal + centre
         h = np.array(row["homography"]) @ np.array([*pixel, 1.0])

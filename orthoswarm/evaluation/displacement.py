@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FieldSettings:
     """How displacements are measured.
 
@@ -150,6 +150,7 @@ def displacement_field(
     ortho_valid: Mask,
     reference: Floats,
     reference_valid: Mask,
+    *,
     settings: FieldSettings | None = None,
     offset: tuple[int, int] = (0, 0),
 ) -> Displacements:
@@ -226,7 +227,7 @@ def completeness(ortho_valid: Mask, reference_valid: Mask, gsd_m: float) -> Comp
     return Completeness(covered / max(float(ground.sum()), 1.0), float(ortho_valid.sum()) * gsd_m**2)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
     """The figures of an orthoimage against a reference; lengths in metres.
 

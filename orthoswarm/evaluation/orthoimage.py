@@ -3,8 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -76,7 +76,8 @@ def evaluate_ortho(
     return accuracy(Displacements.joined(parts), completeness(covered, ground, s.gsd_m * thin), float(step))
 
 
-class _Strip(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Strip:
     """Some rows of blocks: pictures with validity, and the validity of the rows that belong to this strip alone.
 
     The orthoimage is larger than the reference by the search radius on every side.

@@ -54,7 +54,7 @@ class Placement:
     sigma_m: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PoseErrors:
     """Errors of placed frames, arrays over the compared frames (NaN where not stated).
 

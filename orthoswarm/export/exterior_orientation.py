@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OrientedPicture:
     """A placed picture of a map.
 

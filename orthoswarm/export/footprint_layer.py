@@ -44,7 +44,14 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
     with gpkg_file(path) as part:
         batch = list(islice(shown, _AT_ONCE))
         while batch or not part.exists():
-            append_polygons(part, "footprints", _polygons([r for _, r in batch]), [v for v, _ in batch], _COLUMNS, epsg)
+            append_polygons(
+                part,
+                "footprints",
+                _polygons([r for _, r in batch]),
+                rows=[v for v, _ in batch],
+                columns=_COLUMNS,
+                epsg=epsg,
+            )
             batch = list(islice(shown, _AT_ONCE))
 
 
@@ -80,7 +87,7 @@ def _polygons(rings: Sequence[Array]) -> NDArray[Any]:
 
 
 def append_polygons(
-    part: Path, layer: str, shapes: NDArray[Any], rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Column],
+    part: Path, layer: str, shapes: NDArray[Any], *, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Column],
     epsg: int,
 ) -> None:  # fmt: skip
     """Append (multi)polygons of shapely to a layer of a GeoPackage, made if absent.

@@ -63,6 +63,7 @@ class _Pyramid:
         self,
         raster: Any,
         archive: zipfile.ZipFile,
+        *,
         box: tuple[float, float, float, float],
         width: int,
         height: int,

@@ -118,7 +118,7 @@ def simple_lens(lens: Lens) -> tuple[Lens, Array]:
     wanted = lens.undistort((pixels - np.array(lens.principal_point)) / lens.focal_px)
 
     def parts(p: Array) -> tuple[Lens, Array]:
-        guess = Lens(lens.width, lens.height, lens.focal_px, p[8], p[9])
+        guess = Lens(lens.width, lens.height, lens.focal_px, k1=p[8], k2=p[9])
         return guess, np.append(p[:8], 1.0).reshape(3, 3)
 
     def misfit(p: Array) -> Array:

@@ -44,7 +44,7 @@ def write_seamlines(path: Path, canvas: Canvas, describe: Sequence[Callable[[], 
     shapes = np.array([shapely.multipolygons(_pieces(shapely.union_all(parts[i]))) for i in frames], dtype=object)
     rows = [{**describe[i](), "area_m2": float(shapely.area(shape))} for i, shape in zip(frames, shapes)]
     with gpkg_file(path) as part:
-        append_polygons(part, "seamlines", shapes, rows, _COLUMNS, canvas.grid.epsg)
+        append_polygons(part, "seamlines", shapes, rows=rows, columns=_COLUMNS, epsg=canvas.grid.epsg)
 
 
 def _pieces(shape: Any) -> list[Any]:

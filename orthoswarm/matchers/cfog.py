@@ -78,7 +78,7 @@ def correlate(tile: Floats, window: Floats) -> Peak:
 
 
 def match_tiles(
-    patch: Floats, window: Floats, valid: Mask, predict: Array, centres: NDArray[np.int64], search: int
+    patch: Floats, window: Floats, valid: Mask, *, predict: Array, centres: NDArray[np.int64], search: int
 ) -> Matches:
     """Match tiles of a patch's features near where they are expected in a window's features.
 
@@ -154,5 +154,10 @@ class Cfog:
         centres = tile_centres(valid)
         wanted = centres + shift
         return match_tiles(
-            features(patch, valid), features(window, known), valid, wanted, centres, active().matchers.cfog_search_px
+            features(patch, valid),
+            features(window, known),
+            valid,
+            predict=wanted,
+            centres=centres,
+            search=active().matchers.cfog_search_px,
         )

@@ -39,6 +39,7 @@ def register(
     patch: Floats,
     valid: Mask,
     window: Floats,
+    *,
     known: Mask,
     reach: int,
     matcher: MapMatcher,
@@ -63,7 +64,9 @@ def register(
     tried = centres[inside]
     found = Matches.none()
     for search in config.tile_search_px:
-        found = cfog.match_tiles(own, other, valid, apply(fit, tried.astype(float)), tried, search)
+        found = cfog.match_tiles(
+            own, other, valid, predict=apply(fit, tried.astype(float)), centres=tried, search=search
+        )
         chosen = found if keep is None else found.take(keep(found, fit))
         better = magsac(chosen, config.agreement_px)
         if better is None or not plausible(better, patch.shape, reach):

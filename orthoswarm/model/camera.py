@@ -6,7 +6,7 @@ pitch -90 deg looks straight down and yaw is the azimuth of the picture's up dir
 Sign and axis conventions are defined only in this module.
 """
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +70,7 @@ class Lens:
     width: int
     height: int
     focal_px: float
+    _: KW_ONLY
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0

@@ -1,6 +1,6 @@
 """A frame: one picture with the recorded pose of its camera. Readers of telemetry yield frames."""
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
 
@@ -22,6 +22,7 @@ class Fix:
     lat_deg: float
     lon_deg: float
     height_m: float | None = None
+    _: KW_ONLY
     altitude_m: float | None = None
     yaw_rad: float | None = None
     pitch_rad: float | None = None
@@ -31,7 +32,7 @@ class Fix:
     height_is_ground: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
     """One picture and its fix.
 

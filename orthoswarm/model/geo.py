@@ -102,7 +102,7 @@ class LocalGrid:
         return np.asarray(np.arctan(np.tan(np.radians(dlon)) * np.sin(lat)), dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GroundGrid:
     """The grid of a north-up raster: location, pixel size and extent.
 
@@ -129,7 +129,7 @@ class GroundGrid:
         left, top = float(np.floor(west / gsd_m)), float(np.ceil(north / gsd_m))
         width = max(1, int(np.ceil(east / gsd_m) - left))
         height = max(1, int(top - np.floor(south / gsd_m)))
-        return cls(epsg, left * gsd_m, top * gsd_m, gsd_m, width, height)
+        return cls(epsg=epsg, west=left * gsd_m, north=top * gsd_m, gsd_m=gsd_m, width=width, height=height)
 
     @property
     def bounds(self) -> BoundingBox:

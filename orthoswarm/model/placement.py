@@ -36,7 +36,7 @@ class PlacedFrame:
     weak: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
     """A straight run of one vehicle's frames, and how well the map held it.
 
@@ -95,7 +95,7 @@ class Terrain:
         return np.asarray(low * (1 - fr) + high * fr)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Solution:
     """What a refiner made of one vehicle.
 

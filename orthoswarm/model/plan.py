@@ -11,7 +11,7 @@ from typing import Literal
 End = Literal["rtl", "land", "hover"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Waypoint:
     """A point that is flown to in a straight line from the one before.
 
@@ -35,7 +35,7 @@ class Waypoint:
     wait_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sortie:
     """One flight: from takeoff to the end on one battery.
 
@@ -129,7 +129,7 @@ class Gap:
     area_m2: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OverGround:
     """How a plan lies over a height model, metres above the ground straight below.
 
@@ -155,7 +155,7 @@ class OverGround:
     forward_overlap: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """Missions for a swarm over one area, or along given lines.
 

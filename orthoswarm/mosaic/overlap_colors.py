@@ -79,7 +79,7 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) ->
     boxes = footprint_boxes(cameras, float(terrain.z.min()), float(terrain.z.max()))
     boxes = boxes[boxes[:, 0] <= boxes[:, 2]]
     if len(boxes) == 0:
-        return np.zeros((1, 1), np.int32), GroundGrid(0, 0.0, 0.0, 1.0, 1, 1)
+        return np.zeros((1, 1), np.int32), GroundGrid(epsg=0, west=0.0, north=0.0, gsd_m=1.0, width=1, height=1)
     side = float(np.median(boxes[:, 2:] - boxes[:, :2]))
     box = BoundingBox.around(boxes)
     config = active().radiometry
@@ -90,7 +90,7 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) ->
         part = np.zeros((min(_TILE, grid.height - r), min(_TILE, grid.width - c)), np.int32)
         left, top = grid.west + c * cell, grid.north - r * cell
         lattice = heights(terrain, left, top, cell, _TILE)
-        label_tile(part, shots.take(ids), (ids + 1).astype(np.int32), lattice, left, top, cell)
+        label_tile(part, shots.take(ids), (ids + 1).astype(np.int32), lattice=lattice, west=left, north=top, gsd_m=cell)
         labels[r : r + part.shape[0], c : c + part.shape[1]] = part
     return labels, grid
 

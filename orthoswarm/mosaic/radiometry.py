@@ -82,7 +82,7 @@ def estimate_fields(
     of_frame = np.zeros((len(frames), _OWN, 3))
     of_frame[some] = of_known
     x, y = _nodes(shots.size)
-    log = _log_factors(of_vehicle[vehicle], of_frame, x, y, shots, terrain)
+    log = _log_factors(of_vehicle[vehicle], of_frame, x=x, y=y, shots=shots, terrain=terrain)
     if not fixed.any() and area.sum() > 0:
         middle = log[some].mean(1)
         log -= (area[:, None] * middle).sum(0) / area.sum()
@@ -232,7 +232,7 @@ def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
     return np.broadcast_to(x, y.shape), y
 
 
-def _log_factors(of_vehicle: Array, of_frame: Array, x: Array, y: Array, shots: Shots, terrain: Terrain) -> Array:
+def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shots: Shots, terrain: Terrain) -> Array:
     """Log factors (N, nodes, 3) of frames with their vehicles' unknowns (N, 11, 3) and their own (N, 3, 3)."""
     half = 0.5 * shots.size[:, :1]
     u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5

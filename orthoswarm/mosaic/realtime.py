@@ -136,7 +136,7 @@ class RealtimeMosaic:
         return int(won)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Shot:
     """A picture ready for `fuse`; planes and centre in canvas pixels, matrix about the nadir point.
 

@@ -70,7 +70,7 @@ class Place:
         return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Window:
     """Where in a tile a frame won: rows row0 to row1, columns col0 to col1, and how many pixels."""
 
@@ -81,8 +81,14 @@ class Window:
     col1: int
     pixels: int
 
+    @classmethod
+    def of(cls, key: Key, box: NDArray[np.integer]) -> "Window":
+        """The window of a row of `label_windows`."""
+        row0, row1, col0, col1, pixels = (int(value) for value in box)
+        return cls(key=key, row0=row0, row1=row1, col0=col0, col1=col1, pixels=pixels)
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LabelTask:
     """Label a tile.
 
@@ -107,6 +113,7 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
     """Label a tile in its file (frame index + 1); gives what each frame won, frames in order."""
     place, store = task.place, task.place.store()
     rows, cols = place.shape(task.key)
+    west, north = place.corner(task.key)
     local = np.zeros((rows, cols), np.int32)
     old = store.get(task.key) if len(task.again) else None
     if old is not None:
@@ -117,18 +124,26 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
         owner[lost] = 0
     elif task.seams is not None:
         local = seam_labels(
-            store, task.key, (rows, cols), *place.corner(task.key), place.grid.gsd_m, task.ids, task.shots, task.seams
+            store,
+            task.key,
+            (rows, cols),
+            west=west,
+            north=north,
+            gsd_m=place.grid.gsd_m,
+            ids=task.ids,
+            shots=task.shots,
+            seams=task.seams,
         )
     marks = np.arange(1, len(task.ids) + 1, dtype=np.int32)
     lattice = place.heights(task.key, task.terrain)
-    label_tile(local, task.shots, marks, lattice, *place.corner(task.key), place.grid.gsd_m)
+    label_tile(local, task.shots, marks, lattice=lattice, west=west, north=north, gsd_m=place.grid.gsd_m)
     boxes = label_windows(local, len(task.ids))
     won = np.nonzero(boxes[:, 4])[0]
     if len(won):
         tile = store.get(task.key, create=True)
         assert tile is not None
         write_labels(local, task.ids, tile.plane[:rows, :cols])
-    return [(int(task.ids[k]), Window(task.key, *map(int, boxes[k]))) for k in won]
+    return [(int(task.ids[k]), Window.of(task.key, boxes[k])) for k in won]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +175,7 @@ def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
     tile.plane[:rows, :cols] = other
     local = np.where(other > 0, np.searchsorted(wanted, other) + 1, 0).astype(np.int32)
     boxes = label_windows(local, len(wanted))
-    return [(int(mark) - 1, Window(task.key, *map(int, box))) for mark, box in zip(wanted, boxes)]
+    return [(int(mark) - 1, Window.of(task.key, box)) for mark, box in zip(wanted, boxes)]
 
 
 def mix_pass(task: FeatherTask) -> None:
@@ -188,7 +203,7 @@ def preview_pass(task: PreviewTask) -> None:
             write_preview(task.previews, row, task.read(path))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
     """A picture's share of a layer.
 

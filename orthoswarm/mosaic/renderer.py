@@ -105,7 +105,7 @@ class Seams:
     blend: Blend = "seam"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
     """One of the maps that are drawn together.
 
@@ -142,7 +142,9 @@ def render(
     progress: Progress | None = None,
 ) -> RenderStats:
     """Render frames onto a canvas: `render_layers` of a single layer, see there and `Layer`."""
-    layer = Layer(frames, terrain, canvas, gains or {}, bounds, seams, previews)
+    layer = Layer(
+        frames=frames, terrain=terrain, canvas=canvas, gains=gains or {}, bounds=bounds, seams=seams, previews=previews
+    )
     return render_layers([layer], read=read, run=run, progress=progress)[0]
 
 
@@ -300,7 +302,15 @@ class _Job:
                 if turn is None or (key[0] % 2, key[1] % 2) == turn:
                     good = ids[self.usable[ids]]
                     seams = None if turn is None else self.seam_cells(key, good)
-                    yield LabelTask(self.place, key, good, self.shots.take(good), self.local(key), again, seams)
+                    yield LabelTask(
+                        place=self.place,
+                        key=key,
+                        ids=good,
+                        shots=self.shots.take(good),
+                        terrain=self.local(key),
+                        again=again,
+                        seams=seams,
+                    )
 
         # Tiles of one turn do not touch; seams go on from the tiles of earlier turns, whoever works on them.
         turns = [(0, 0), (0, 1), (1, 0), (1, 1)] if self.seams is not None and not len(again) else [None]
@@ -369,7 +379,16 @@ class _Job:
         picture_gsd = float(frame.camera.position[2] - self.ground[i]) / frame.camera.lens.focal_px
         factor = reduction(self.canvas.grid.gsd_m, picture_gsd)
         to = None if self.previews is None else (self.previews.path, self.previews.row[frame.frame.image])
-        return Shot(number, row, i, field, factor, self.windows[i], self.near_seams.get(i, []), to)
+        return Shot(
+            layer=number,
+            row=row,
+            index=i,
+            field=field,
+            factor=factor,
+            windows=self.windows[i],
+            near_seams=self.near_seams.get(i, []),
+            preview=to,
+        )
 
     def layer_of(self, indices: list[int]) -> TaskLayer:
         """What a task has to know to draw some frames."""
@@ -401,12 +420,12 @@ class _Job:
         while factor < 64 and grid.width * grid.height > factor * factor * most:
             factor *= 2
         coarse = GroundGrid(
-            grid.epsg,
-            grid.west,
-            grid.north,
-            grid.gsd_m * factor,
-            max(1, (grid.width + factor // 2) // factor),  # cells whose centre lies in the grid
-            max(1, (grid.height + factor // 2) // factor),
+            epsg=grid.epsg,
+            west=grid.west,
+            north=grid.north,
+            gsd_m=grid.gsd_m * factor,
+            width=max(1, (grid.width + factor // 2) // factor),  # cells whose centre lies in the grid
+            height=max(1, (grid.height + factor // 2) // factor),
         )
         mask = coverage([f.camera for f, good in zip(self.frames, self.usable) if good], coarse, self.terrain)
         if self.keys is not None:

@@ -146,7 +146,7 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  #
 
 
 def label_tile(
-    label: Labels, shots: Shots, marks: Labels, lattice: Heights, west: float, north: float, gsd_m: float
+    label: Labels, shots: Shots, marks: Labels, *, lattice: Heights, west: float, north: float, gsd_m: float
 ) -> None:
     """Label the pixels of a tile that have none (0) with the mark of the nearest frame that sees them.
 

@@ -35,7 +35,7 @@ def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | Non
         label = np.zeros((r1 - r, c1 - c), np.int32)
         lattice = heights(ground, west, north, grid.gsd_m, _PART)
         marks = np.ones(len(ids), np.int32)
-        label_tile(label, shots.take(ids), marks, lattice, west, north, grid.gsd_m)
+        label_tile(label, shots.take(ids), marks, lattice=lattice, west=west, north=north, gsd_m=grid.gsd_m)
         mask[r:r1, c:c1] = label > 0
     return mask
 

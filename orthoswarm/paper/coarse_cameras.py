@@ -32,7 +32,7 @@ class CoarseOptions:
     matcher: str | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class CoarseVehicle:
     """One vehicle after III.C.
 
@@ -87,7 +87,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     found = None
     if records.has_height.any():
         matcher = picture_matcher(options.matcher)
-        found = estimate_fov(tasks, pictures.gray, rotation, pictures.size, start, matcher)
+        found = estimate_fov(tasks, pictures.gray, rotation, size=pictures.size, start_rad=start, matcher=matcher)
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are taken")
     fov = start if found is None else found.mean

@@ -136,6 +136,7 @@ def estimate_fov(
     tasks: list[ScaleTask],
     gray: Callable[[int], Gray],
     rotation: Array,
+    *,
     size: tuple[int, int],
     start_rad: float,
     matcher: PictureMatcher,

@@ -34,7 +34,7 @@ class PatchTask:
     cameras: CameraBlock
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PatchFit:
     """Where a leg's patch lies on the map.
 
@@ -90,7 +90,9 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
     homography = None
     if strip is not None:
         patch, valid, west, north = strip
-        own = GroundGrid(basemap.epsg, west, north, gsd, patch.shape[1], patch.shape[0])
+        own = GroundGrid(
+            epsg=basemap.epsg, west=west, north=north, gsd_m=gsd, width=patch.shape[1], height=patch.shape[0]
+        )
         for reach_m in config.patch_search_m:
             reach = min(int(np.ceil(reach_m / gsd)), config.patch_most_search_px)
             window, known, there = map_window(basemap, origin, own, reach)
@@ -98,7 +100,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
                 break
             consistent = HeightFilter(task.cameras, own, there)
             matcher = map_matcher(options.matcher)
-            found = register(patch, valid, window, known, reach, matcher, consistent)
+            found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
             if found is not None and found.share >= trust.trusted_share and len(found.matches) >= trust.least_tiles:
                 homography = in_metres(found.homography, own, there, centre)
                 break
@@ -138,7 +140,9 @@ def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -
     rows, cols = own.height + 2 * reach, own.width + 2 * reach
     pad = ((0, max(0, rows - gray.shape[0])), (0, max(0, cols - gray.shape[1])))
     gray, known = np.pad(gray, pad)[:rows, :cols], np.pad(known, pad)[:rows, :cols]
-    there = GroundGrid(basemap.epsg, grid.west - origin[0], grid.north - origin[1], gsd, cols, rows)
+    there = GroundGrid(
+        epsg=basemap.epsg, west=grid.west - origin[0], north=grid.north - origin[1], gsd_m=gsd, width=cols, height=rows
+    )
     return gray, known, there
 
 

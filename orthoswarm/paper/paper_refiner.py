@@ -69,7 +69,9 @@ class PaperRefiner:
 
         def solve(units: list[list[Frame]]) -> Solution:
             grid = LocalGrid(self.epsg)
-            return _refine(units, held, basemap, grid, self.origin, self.options, serial, None).fine[0]
+            return _refine(
+                units, held, basemap, grid=grid, origin=self.origin, options=self.options, run=serial, progress=None
+            ).fine[0]
 
         return refine_vehicle(frames, self.epsg, solve)
 
@@ -93,7 +95,9 @@ class PaperRefiner:
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner); the paper's ground is flat."""
         grid, units = LocalGrid(self.epsg), units_of_area(vehicles)
-        return _refine(units, [], basemap, grid, self.origin, self.options, run, progress)
+        return _refine(
+            units, [], basemap, grid=grid, origin=self.origin, options=self.options, run=run, progress=progress
+        )
 
 
 def _found(solution: Solution) -> list[tuple[Array, Array]]:
@@ -104,6 +108,7 @@ def _refine(
     units: Sequence[Sequence[Frame]],
     held: Sequence[tuple[Array, Array]],
     basemap: MapWindow | None,
+    *,
     grid: LocalGrid,
     origin: Array,
     options: Options,
@@ -132,9 +137,16 @@ def _refine(
                 progress("legs on the map", n + 1, len(tasks))
         parallel_s += perf_counter()
     everyone = [*held, *((f.centre, f.shift) for own in fits for f in own.values() if f.homography is not None)]
-    before = [_solution(v, {}, [], origin, "coarse", False) for v in coarse]
+    before = [_solution(v, {}, [], origin=origin, stage="coarse", had_map=False) for v in coarse]
     after = [
-        _solution(v, own, everyone, origin, "fine" if basemap is not None else "coarse", basemap is not None)
+        _solution(
+            v,
+            own,
+            everyone,
+            origin=origin,
+            stage="fine" if basemap is not None else "coarse",
+            had_map=basemap is not None,
+        )
         for v, own in zip(coarse, fits, strict=True)
     ]
     fine = merge_units(after)
@@ -176,6 +188,7 @@ def _solution(
     vehicle: CoarseVehicle,
     fits: Mapping[int, PatchFit],
     everyone: Sequence[tuple[Array, Array]],
+    *,
     origin: Array,
     stage: Stage,
     had_map: bool,
@@ -265,6 +278,13 @@ def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, ca
         how: LegState = "matched" if found else "carried" if carried else "failed"
         confidence = fit.share if fit is not None and found else 0.0
         out.append(
-            Leg(vehicle.vehicle, int(members[0]), int(members[-1]), how, confidence, float(np.median(sigma[members])))
+            Leg(
+                vehicle=vehicle.vehicle,
+                first=int(members[0]),
+                last=int(members[-1]),
+                state=how,
+                confidence=confidence,
+                sigma_m=float(np.median(sigma[members])),
+            )
         )
     return out

@@ -70,6 +70,7 @@ def plan_area(
     vehicles: int,
     altitude_m: float,
     foot: Footprint,
+    *,
     method: Method = "bcd",
     options: Options | None = None,
     progress: Progress = lambda _: None,
@@ -96,9 +97,17 @@ def plan_area(
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
-    crew = Crew(vehicles, over.heights, foot, area.grid, router, options)
+    crew = Crew(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
     progress("lines")
-    best = _best_work(area, crew, foot, method, options.motion, router, min(foot.reach_m, 2.0 * clearance))
+    best = _best_work(
+        area,
+        crew,
+        foot,
+        method=method,
+        motion=options.motion,
+        router=router,
+        reach_m=min(foot.reach_m, 2.0 * clearance),
+    )
     progress("separation")
     slots = crew.schedule(best)
     progress("coverage")
@@ -111,17 +120,21 @@ def plan_area(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
         )
-    return _plan(method, slots, over, area.grid, options, warnings, (area.size_m2, seen, gaps))
+    return _plan(
+        method, slots, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
+    )
 
 
 def _best_work(
-    area: Area, crew: Crew, foot: Footprint, method: Method, motion: Motion, router: Router, reach_m: float
+    area: Area, crew: Crew, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
 ) -> Work:
     """The fairest and shortest work among the method's candidates."""
     field = Field(area.ground, router.obstacles)
     best: Work | None = None
     most = 0
-    for candidate in candidates(field, crew.vehicles, foot, method, motion.turn_m, router, reach_m):
+    for candidate in candidates(
+        field, crew.vehicles, foot, method=method, turn_m=motion.turn_m, router=router, reach_m=reach_m
+    ):
         most = max(most, candidate.stretches)
         if candidate.stretches >= crew.vehicles:
             work = crew.share(candidate.legs, method != "columns")
@@ -141,6 +154,7 @@ def plan_gaps(
     vehicles: int,
     altitude_m: float,
     foot: Footprint,
+    *,
     options: Options | None = None,
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
@@ -171,7 +185,7 @@ def plan_gaps(
     if not len(legs):
         raise InputError("all of the gaps lie within the clearance of no-fly zones; reduce the clearance")
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
-    crew = Crew(min(vehicles, most), over.heights, foot, area.grid, router, options)
+    crew = Crew(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
     work = crew.share(shorten(legs, router, None if crew.starts is None else crew.starts[0]), True)
     progress("separation")
     slots = crew.schedule(work)
@@ -184,7 +198,9 @@ def plan_gaps(
     if gaps:
         warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
     share = 1.0 - float(left.area) / area.size_m2
-    return _plan("gaps", slots, over, area.grid, options, warnings, (area.size_m2, share, gaps))
+    return _plan(
+        "gaps", slots, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, share, gaps)
+    )
 
 
 def _gap_legs(piece: planned_coverage.Geometry, router: Router, foot: Footprint) -> Array:
@@ -202,6 +218,7 @@ def plan_lines(
     vehicles: int,
     altitude_m: float,
     foot: Footprint,
+    *,
     no_fly: Area | None = None,
     options: Options | None = None,
     progress: Progress = lambda _: None,
@@ -247,12 +264,12 @@ def plan_lines(
             f"{vehicles} vehicles are more than the {most} straight stretches; use at most {most} vehicles"
         )
     progress("lines")
-    crew = Crew(vehicles, over.heights, foot, grid, router, options)
+    crew = Crew(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
     work = crew.share(legs, reorder=False)
     progress("separation")
     slots = crew.schedule(work)
     warnings = _warnings(slots, work, foot, options)
-    return _plan("lines", slots, over, grid, options, warnings, (None, None, ()))
+    return _plan("lines", slots, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
 
 
 def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Options) -> list[str]:
@@ -293,13 +310,13 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
     places = grid.to_geographic(flight.points[:, :2])
     waypoints = tuple(
         Waypoint(
-            float(places[k, 0]),
-            float(places[k, 1]),
-            float(flight.points[k, 2] - flight.home_z_m),
-            marks[int(flight.camera[k])],
-            None if np.isnan(flight.above_m[k]) else float(flight.above_m[k]),
-            bool(flight.between[k]),
-            flight.wait_s if k == flight.last_leg_end else 0.0,
+            lat_deg=float(places[k, 0]),
+            lon_deg=float(places[k, 1]),
+            height_m=float(flight.points[k, 2] - flight.home_z_m),
+            camera=marks[int(flight.camera[k])],
+            above_ground_m=None if np.isnan(flight.above_m[k]) else float(flight.above_m[k]),
+            between=bool(flight.between[k]),
+            wait_s=flight.wait_s if k == flight.last_leg_end else 0.0,
         )
         for k in range(len(places))
     )
@@ -321,6 +338,7 @@ def _plan(
     method: str,
     slots: list[list[Slot]],
     over: _Over,
+    *,
     grid: LocalGrid,
     options: Options,
     warnings: list[str],

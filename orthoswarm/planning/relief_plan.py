@@ -37,6 +37,7 @@ def plan_over_relief(
     make: MakePlan,
     lens: Callable[[float], Footprint],
     ground: GroundBelow,
+    *,
     above_m: float,
     tolerance_m: float,
     relief: Relief = "auto",
@@ -81,7 +82,7 @@ def plan_over_relief(
                 f"{kept_above_m:g} m that must be kept; give a larger --altitude"
             )
         kept_m = min(tolerance_m, active().planning.by_vehicle_m) if by_vehicle else tolerance_m
-        heights = GroundHeights(ground.terrain, above_m, kept_m, by_vehicle=by_vehicle)
+        heights = GroundHeights(ground=ground.terrain, above_m=above_m, tolerance_m=kept_m, by_vehicle=by_vehicle)
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
         level = LevelHeights(level_m, ground.terrain, above_m)

@@ -209,7 +209,9 @@ class RasterMap:
         import cv2
 
         west, _, _, north = grid.bounds
-        fine = GroundGrid(grid.epsg, west, north, grid.gsd_m / 3, 3 * grid.width, 3 * grid.height)
+        fine = GroundGrid(
+            epsg=grid.epsg, west=west, north=north, gsd_m=grid.gsd_m / 3, width=3 * grid.width, height=3 * grid.height
+        )
         index, valid = self._warp(fine, nearest=True)
         assert self._palette is not None
         size = (grid.width, grid.height)

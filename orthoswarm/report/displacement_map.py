@@ -85,5 +85,5 @@ def _fields(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, settings: Fie
         around = slice(top, end + 2 * reach)
         yield displacement_field(
             wide_ortho[around].astype(np.float32), wide_seen[around], basemap[top:end].astype(np.float32),
-            valid[top:end], settings, (top, 0),
+            valid[top:end], settings=settings, offset=(top, 0),
         )  # fmt: skip

@@ -64,6 +64,7 @@ def write_page(
     out: Path,
     report: Mapping[str, Any],
     placed: Sequence[PlacedFrame],
+    *,
     rejected: Sequence[Rejection],
     basemap: Basemap | None,
     cells: bytes = b"",
@@ -107,7 +108,7 @@ def write_page(
         if basemap is not None and there is not None and not report.get("control"):  # which moved it off the map
             shifts = shifts_against_map(best, ortho, there, basemap, least)
             values["edges"] = _edge_crops(best, ortho, there, basemap)
-        values |= _pictures(out, ortho, report, placed, there, shifts)
+        values |= _pictures(out, ortho, report, placed=placed, there=there, shifts=shifts)
     values["verdict"] = _verdict(report, placed, shifts)
     values["facts"] = _facts(report, placed, shifts)
     values["fov"] = charts.fields_of_view(report["vehicles"])
@@ -149,7 +150,7 @@ def shifts_against_map(
     parts = []
     for i, j in itertools.product((1, 3, 5), repeat=2):
         x, y = west + i / 6 * (east - west), south + j / 6 * (north - south)
-        grid = GroundGrid(ortho.grid.epsg, x - half, y + half, gsd, part_px, part_px)
+        grid = GroundGrid(epsg=ortho.grid.epsg, west=x - half, north=y + half, gsd_m=gsd, width=part_px, height=part_px)
         part, its_map = product_picture(best, grid), MapView.read(basemap, grid)
         if its_map is not None and part.seen.any():
             parts.append(_moved(part, its_map))
@@ -166,6 +167,7 @@ def _pictures(
     out: Path,
     ortho: Picture,
     report: Mapping[str, Any],
+    *,
     placed: Sequence[PlacedFrame],
     there: MapView | None,
     shifts: Moved | None,

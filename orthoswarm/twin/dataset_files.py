@@ -99,7 +99,14 @@ def write_truth(spec: TwinSpec, stage: Stage, zones: dict[str, Zone], truth: Pat
         return
     s, g = stage.scene, stage.scene.grid
     size = spec.reference_gsd_m
-    grid = GroundGrid(g.epsg, g.west, g.north, size, round(g.width * TEXEL_M / size), round(g.height * TEXEL_M / size))
+    grid = GroundGrid(
+        epsg=g.epsg,
+        west=g.west,
+        north=g.north,
+        gsd_m=size,
+        width=round(g.width * TEXEL_M / size),
+        height=round(g.height * TEXEL_M / size),
+    )
     reference = cv2.resize(stage.levels[0], (grid.width, grid.height), interpolation=cv2.INTER_AREA)
     write_geotiff(truth / "reference.tif", np.asarray(reference), grid)
     write_geotiff(truth / "dsm.tif", s.dsm, s.cells)

@@ -79,7 +79,10 @@ def make_twin(
     _claim(truth / "manifest.json", spec)
     tell("city", 0, 1)
     site = Site.of(spec)
-    flights = [fly(spec.plan, spec.motion, site.center, v, spec.seed, spec.lens_k) for v in range(spec.plan.vehicles)]
+    flights = [
+        fly(spec.plan, spec.motion, site.center, vehicle=v, seed=spec.seed, lens_k=spec.lens_k)
+        for v in range(spec.plan.vehicles)
+    ]
     scene, slots = site.build(spec)
     if spec.follow_ground:
         flights = [raised(flight, scene.bare_ground()) for flight in flights]
@@ -95,7 +98,7 @@ def make_twin(
     write_frames(spec, site, flights, truth / "frames.csv")
     total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))
     shots = list(_missing(spec, flights, records, folder))[:only]
-    _render_all(spec, stage, site.grid, shots, workers, tell)
+    _render_all(spec, stage, site.grid, shots=shots, workers=workers, tell=tell)
     return TwinSet(folder, total, len(shots), spec.plan.vehicles)
 
 
@@ -128,7 +131,7 @@ def _missing(spec: TwinSpec, flights: list[Flight], records: list[Record], folde
 
 
 def _render_all(
-    spec: TwinSpec, stage: Stage, grid: LocalGrid, shots: list[_Shot], workers: int, tell: Progress
+    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shots: list[_Shot], workers: int, tell: Progress
 ) -> None:
     """Render and write all shots."""
     import cv2
@@ -139,7 +142,7 @@ def _render_all(
     tell("photos", 0, len(shots))
 
     def one(shot: _Shot) -> None:
-        write_whole(shot.path, _photo(spec, stage, grid, shot, rays[shot.vehicle], sensor))
+        write_whole(shot.path, _photo(spec, stage, grid, shot=shot, rays=rays[shot.vehicle], sensor=sensor))
 
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(one, shots), start=1):
@@ -147,7 +150,7 @@ def _render_all(
 
 
 def _photo(
-    spec: TwinSpec, stage: Stage, grid: LocalGrid, shot: _Shot, rays: NDArray[np.float32], sensor: Sensor
+    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shot: _Shot, rays: NDArray[np.float32], sensor: Sensor
 ) -> bytes:
     """One JPEG with its tags."""
     flight, i = shot.flight, shot.index
@@ -161,9 +164,14 @@ def _photo(
     lat, lon = (float(x) for x in grid.to_geographic(position[:2]))
     convergence = float(grid.convergence_rad(lat, lon))
     tags = PhotoTags(
-        float(flight.time_s[i]), lat, lon, float(position[2]) + SEA_LEVEL_M, float(position[2]),
-        _degrees(angles, convergence), _degrees(body, convergence),
-    )  # fmt: skip
+        time_s=float(flight.time_s[i]),
+        lat_deg=lat,
+        lon_deg=lon,
+        altitude_m=float(position[2]) + SEA_LEVEL_M,
+        height_m=float(position[2]),
+        gimbal_deg=_degrees(angles, convergence),
+        flight_deg=_degrees(body, convergence),
+    )
     return with_tags(sensor.encode(image, spec.quality), tags)
 
 

@@ -19,7 +19,7 @@ NOISES: dict[str, Noise] = {
 """The paper's noise; harder than it; a receiver's drift that the autopilot follows; none."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TwinSpec:
     """All that determines a set of data.
 

@@ -10,7 +10,7 @@ from orthoswarm.twin.true_flight import Flight
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
     """Errors of the record (all one sigma or half range, as said).
 

@@ -15,7 +15,7 @@ FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
 """The paper's cameras (IV.A)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
     """The swarm's task: blocks of parallel legs, one block a vehicle, in rows and columns.
 
@@ -80,7 +80,7 @@ class FlightPlan:
         return np.array(points)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Flight:
     """What one vehicle really did.
 
@@ -138,7 +138,7 @@ def _slew(heading: Array, seconds: float, rate_rad_s: float) -> Array:
     return out
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
     """How calmly the swarm flies.
 
@@ -163,6 +163,7 @@ def fly(
     plan: FlightPlan,
     motion: Motion,
     center: tuple[float, float],
+    *,
     vehicle: int,
     seed: int,
     lens_k: tuple[float, float] = (0.0, 0.0),
@@ -205,7 +206,17 @@ def fly(
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
     time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
-    return Flight(name, lens, (float(mount[0]), float(mount[1])), time, planned, position, velocity, angles, body)
+    return Flight(
+        vehicle=name,
+        lens=lens,
+        mount_rad=(float(mount[0]), float(mount[1])),
+        time_s=time,
+        planned=planned,
+        position=position,
+        velocity=velocity,
+        angles=angles,
+        body=body,
+    )
 
 
 def raised(flight: Flight, ground: Terrain) -> Flight:

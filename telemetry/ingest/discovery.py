@@ -22,7 +22,7 @@ _SIDECARS = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Folder:
     """One folder that contains usable files.
 
@@ -174,7 +174,7 @@ def _far_from_pictures(tops: Sequence[Path], folders: list[Folder]) -> frozenset
 
 def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None:
     suffix = file.suffix.lower()
-    folder = folders.get(file.parent) or Folder(file.parent, "")
+    folder = folders.get(file.parent) or Folder(path=file.parent, vehicle="")
     kinds = (
         (PICTURE_SUFFIXES | _UNREAD_PICTURES, folder.pictures),
         (VIDEO_SUFFIXES, folder.videos),

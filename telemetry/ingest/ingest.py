@@ -80,9 +80,17 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
         for folder in found.folders:
             if folder.pictures:
-                _photo_folder(folder, islice(tags, len(folder.pictures)), found, tables, logs, result, options.workers)
+                _photo_folder(
+                    folder,
+                    islice(tags, len(folder.pictures)),
+                    found,
+                    tables=tables,
+                    logs=logs,
+                    result=result,
+                    workers=options.workers,
+                )
             if folder.videos or folder.subtitles:
-                read_videos(folder, found, logs, options, progress, result)
+                read_videos(folder, found, logs, options=options, progress=progress, result=result)
     _check_vehicles(result)
     return result
 
@@ -109,7 +117,7 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
             else:
                 where = found.scope(path)
                 tables.append((where, kind, table))
-                source = SourceInfo(found.name(path), kind)
+                source = SourceInfo(path=found.name(path), kind=kind)
                 source.findings += _table_findings(path, where, table, found)
                 result.sources.append(source)
     return sorted(tables, key=lambda entry: len(entry[0].parts))
@@ -134,6 +142,7 @@ def _photo_folder(
     folder: Folder,
     tags: Iterable[PhotoTags | Unreadable | None],
     found: Discovery,
+    *,
     tables: Sequence[tuple[Path, str, PoseTable]],
     logs: Sequence[LogSource],
     result: Survey,
@@ -141,7 +150,7 @@ def _photo_folder(
 ) -> None:
     """Make one source from a folder's photos with these tags."""
     at_root = folder.path == found.root
-    source = SourceInfo(folder.path.name if at_root else found.name(folder.path), "photos")
+    source = SourceInfo(path=folder.path.name if at_root else found.name(folder.path), kind="photos")
     groups: dict[str, list[PhotoTags]] = {}
     seen = 0
     for path, photo in zip(folder.pictures, tags, strict=True):
@@ -156,7 +165,7 @@ def _photo_folder(
         groups.setdefault(vehicle, []).append(photo)
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
-        add_logs(photos, folder.path, vehicle, logs, source.findings, workers)
+        add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
         photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         frames = frames_of(photos, vehicle, found.name, source.findings)

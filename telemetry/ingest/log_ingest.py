@@ -33,7 +33,7 @@ _FAR_M = 60.0
 _NAME_BONUS = 0.05
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LogSource:
     """A log, the folder that it applies to, whether it was used, and what in it comes from a CAN log."""
 
@@ -64,13 +64,13 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
                 )
                 result.findings.append(Finding("not-a-log", f"{found.name(path)}: {vehicles}", note=foreign))
                 continue
-            source = SourceInfo(found.name(path), vehicles[0].kind)
+            source = SourceInfo(path=found.name(path), kind=vehicles[0].kind)
             result.sources.append(source)
             for log in vehicles:
                 source.findings += log.findings
                 source.tracks[log.vehicle] = [s for s in log.samples if s.has_position]
                 source.shown[log.vehicle] = 0
-                logs.append(LogSource(found.scope(path), log, source, log.timeline()))
+                logs.append(LogSource(folder=found.scope(path), log=log, source=source, timeline=log.timeline()))
     _count_once(logs)
     return _with_buses(logs)
 
@@ -136,6 +136,7 @@ def add_logs(
     photos: Sequence[PhotoTags],
     folder: Path,
     vehicle: str,
+    *,
     logs: Sequence[LogSource],
     findings: list[Finding],
     workers: int = 1,

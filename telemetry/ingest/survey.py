@@ -17,7 +17,7 @@ Progress = Callable[[str, int, int], None]
 """Called with what is being done, how many are done, how many there are."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
     """Options for reading inputs.
 
@@ -42,7 +42,7 @@ class LoadOptions:
     sei_layouts: tuple[Path, ...] = ()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class SourceInfo:
     """One source for `inspect`: a folder of photos, a video, a log or a table.
 

@@ -27,6 +27,7 @@ def read_videos(
     folder: Folder,
     found: Discovery,
     logs: Sequence[LogSource],
+    *,
     options: LoadOptions,
     progress: Progress | None,
     result: Survey,
@@ -40,7 +41,7 @@ def read_videos(
         if isinstance(scanned, Unreadable):
             result.rejected.append(Rejection(name, str(scanned), found.videos[path]))
             continue
-        source = SourceInfo(name, "video", Counter(frames=len(scanned.pictures)))
+        source = SourceInfo(path=name, kind="video", counts=Counter(frames=len(scanned.pictures)))
         source.counts["sei"] = scanned.sei_count
         source.counts["klv"] = len(scanned.klv_packets)
         result.sources.append(source)
@@ -57,7 +58,17 @@ def read_videos(
         if not poses.has_positions:
             poses.findings.append(Finding("no-position", f"{name}: {NO_POSITION}"))
         if options.decode:
-            _take(path, name, found.videos[path], scanned, poses, options, progress, source, result)
+            _take(
+                path,
+                name,
+                found.videos[path],
+                scanned=scanned,
+                poses=poses,
+                options=options,
+                progress=progress,
+                source=source,
+                result=result,
+            )
         else:
             _look(found.videos[path], scanned, poses, source)
     for path in beside.values():
@@ -74,6 +85,7 @@ def _take(
     path: Path,
     name: str,
     vehicle: str,
+    *,
     scanned: VideoScan,
     poses: Poses,
     options: LoadOptions,
@@ -130,7 +142,7 @@ def _subtitles(path: Path, name: str, findings: list[Finding]) -> srt.Subtitles 
 
 
 def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
-    source = SourceInfo(name, "srt")
+    source = SourceInfo(path=name, kind="srt")
     result.sources.append(source)
     cues = _subtitles(path, name, source.findings)
     if cues is None:

@@ -27,7 +27,7 @@ _KEPT_SAMPLES = 64
 _RETRY_S = (0.5, 1.0, 2.0, 5.0)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LivePicture:
     """One picture of a live stream.
 
@@ -167,13 +167,16 @@ def _read(
             for frame in frames:
                 index, reading = frame.opaque if isinstance(frame.opaque, tuple) else (None, None)
                 lost = damage.is_damaged(index, bool(frame.is_corrupt))
-                yield from _offer(frame, reading, lost, beside, picker, next(numbers), now_s, clock)
+                yield from _offer(
+                    frame, reading, lost, beside=beside, picker=picker, number=next(numbers), now_s=now_s, clock=clock
+                )
 
 
 def _offer(
     frame: Any,
     reading: sei.Reading | None,
     lost: bool,
+    *,
     beside: deque[Sample],
     picker: Picker | None,
     number: int,
@@ -187,17 +190,17 @@ def _offer(
         if held is not None:
             held = replace(held, time_s=None if sample is None else sample.time_s)
             sample, origin = (held if sample is None else held.merge(sample)), " + ".join(filter(None, ("KLV", origin)))
-    candidate = Candidate(number, frame, sample, seconds, origin, damaged=lost)
+    candidate = Candidate(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
     taken = [candidate] if picker is None else picker.push(candidate)
     for one in taken:
         stated = None if one.sample is None else one.sample.time_s
         yield LivePicture(
-            one.number,
-            to_rgb(one.frame),
-            one.sample,
-            one.origin,
-            clock() if stated is None else stated,
-            one.damaged,
+            number=one.number,
+            rgb=to_rgb(one.frame),
+            sample=one.sample,
+            origin=one.origin,
+            time_s=clock() if stated is None else stated,
+            damaged=one.damaged,
         )
 
 

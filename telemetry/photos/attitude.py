@@ -50,7 +50,7 @@ def decide(photos: Sequence[PhotoTags], course_deg: Array, vehicle: str) -> Deci
     findings: list[Finding] = []
     camera, flight = _drop_unfilled(camera, flight, findings, vehicle)
     _repair_upside_down(camera, findings, vehicle)
-    yaw, origin = _choose_yaw(camera[:, 0], flight[:, 0], course_deg, photos, findings, vehicle)
+    yaw, origin = _choose_yaw(camera[:, 0], flight[:, 0], course_deg, photos=photos, findings=findings, vehicle=vehicle)
     _note_oblique(camera[:, 1], findings, vehicle)
     angles: list[Angles] = [
         (_or_none(y), _or_none(p), _or_none(r)) for y, p, r in zip(wrap_deg(yaw), camera[:, 1], camera[:, 2])
@@ -102,6 +102,7 @@ def _choose_yaw(
     gimbal: Array,
     flight: Array,
     course: Array,
+    *,
     photos: Sequence[PhotoTags],
     findings: list[Finding],
     vehicle: str,

@@ -40,11 +40,17 @@ def frames_of(
         chosen.update((i, (angles, decided.yaw_origin)) for i, angles in zip(index, decided.angles, strict=True))
     yaw = np.array([math.nan if (y := chosen[i][0][0]) is None else y for i in range(len(photos))])
     findings += check_legs(yaw, straight_legs(ground, least_frames=4), vehicle)
-    return [_frame(photo, vehicle, name(photo.path), heights[i], *chosen[i]) for i, photo in enumerate(photos)]
+    frames = []
+    for i, photo in enumerate(photos):
+        angles, yaw_origin = chosen[i]
+        frames.append(
+            _frame(photo, vehicle, name(photo.path), height_m=heights[i], angles=angles, yaw_origin=yaw_origin)
+        )
+    return frames
 
 
 def _frame(
-    photo: PhotoTags, vehicle: str, image: str, height_m: float | None, angles: Angles, yaw_origin: str
+    photo: PhotoTags, vehicle: str, image: str, *, height_m: float | None, angles: Angles, yaw_origin: str
 ) -> Frame:
     origin = dict(photo.origin)
     if angles[0] is not None and yaw_origin:

@@ -27,7 +27,7 @@ _MAX_HEIGHT_M = 12_000.0
 _CHUNK = 64
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PhotoTags:
     """The tags of one photo.
 
@@ -115,7 +115,7 @@ def tags_of(path: Path, container: Container) -> PhotoTags:
     """The tags in a picture container."""
     tags = container.exif
     found = xmp.properties(container.xmp) if container.xmp else {}
-    photo = PhotoTags(path, container.width, container.height)
+    photo = PhotoTags(path=path, width=container.width, height=container.height)
     photo.make = exif.text(tags.main.get(exif.MAKE)) or found.get("tiff:Make", "")
     photo.model = exif.text(tags.main.get(exif.MODEL)) or found.get("tiff:Model", "")
     _position(photo, tags, found)
@@ -226,7 +226,7 @@ def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         key.append(f"zoom{zoom:.1f}")
     photo.camera = " ".join([*key, *filter(None, (sensor, photo.band))])
     photo.dewarp_k1 = _dewarp_k1(found)
-    for hint, source in _fov_hints(photo, found, tags, focal, focal_35, max(zoom, 1.0)):
+    for hint, source in _fov_hints(photo, found, tags, focal=focal, focal_35=focal_35, zoom=max(zoom, 1.0)):
         if hint is not None and math.radians(2.0) < hint < math.radians(150.0):
             photo.fov_hint_rad = hint
             photo.origin["fov_hint"] = source
@@ -245,7 +245,13 @@ def _dewarp_k1(found: xmp.Properties) -> float | None:
 
 
 def _fov_hints(
-    photo: PhotoTags, found: xmp.Properties, tags: exif.Exif, focal: float | None, focal_35: float | None, zoom: float
+    photo: PhotoTags,
+    found: xmp.Properties,
+    tags: exif.Exif,
+    *,
+    focal: float | None,
+    focal_35: float | None,
+    zoom: float,
 ) -> Iterator[tuple[float | None, str]]:
     """Horizontal field of view by several tags, the most trustworthy first."""
     calibrated, centre = (

@@ -75,16 +75,16 @@ def straight_legs(
             continue
         bend = wrap_deg(float(np.degrees(np.arctan2(step[i, 0], step[i, 1]) - np.arctan2(run[0], run[1]))))
         if abs(float(bend)) > bend_deg:
-            _close(legs, east_north, first, i, least_frames, least_length_m)
+            _close(legs, east_north, first, last=i, least_frames=least_frames, least_length_m=least_length_m)
             first = i if i - first < least_frames - 1 else i + 1
             if first == i:
                 first = i
-    _close(legs, east_north, first, count - 1, least_frames, least_length_m)
+    _close(legs, east_north, first, last=count - 1, least_frames=least_frames, least_length_m=least_length_m)
     return legs
 
 
 def _close(
-    legs: list[Straight], points: Array, first: int, last: int, least_frames: int, least_length_m: float
+    legs: list[Straight], points: Array, first: int, *, last: int, least_frames: int, least_length_m: float
 ) -> None:
     run = points[last] - points[first]
     if last - first + 1 >= least_frames and np.hypot(*run) >= least_length_m:

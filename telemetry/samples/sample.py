@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Sample:
     """Position and attitude of a camera at one time, degrees and metres; None where unknown.
 

@@ -25,7 +25,7 @@ JPEG_QUALITY = 95
 _ZOOM_STEP = 0.03
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Picture:
     """A picture extracted from a video.
 
@@ -46,7 +46,7 @@ class Picture:
     damaged: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Extraction:
     """The result of an extraction: photos by vehicle, findings, counts."""
 
@@ -171,7 +171,11 @@ def pictures(
         if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
             video_s = own
         sample, origin = (None, "") if pose is None else (pose.sample, pose.origin)
-        for chosen in picker.push(Candidate(number, frame, sample, video_s, origin, index, lost)):
+        for chosen in picker.push(
+            Candidate(
+                number=number, frame=frame, sample=sample, video_s=video_s, origin=origin, packet=index, damaged=lost
+            )
+        ):
             yield _picture(chosen)
     for chosen in picker.flush():
         yield _picture(chosen)
@@ -317,7 +321,7 @@ class _LensKey:
 
 
 def _photo(path: Path, picture: CachedPicture, pose: Pose | None, lens: _LensKey) -> PhotoTags:
-    photo = PhotoTags(path, picture.columns, picture.rows)
+    photo = PhotoTags(path=path, width=picture.columns, height=picture.rows)
     photo.damaged = picture.damaged
     photo.camera = lens.of(None if pose is None else pose.sample)
     if pose is None:

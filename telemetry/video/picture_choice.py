@@ -17,7 +17,7 @@ _EARLY, _LATE = 0.8, 1.2
 _MAX_CANDIDATES = 6
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Candidate:
     """A picture that may be selected.
 

@@ -38,7 +38,7 @@ class PictureNote:
     position: int | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class VideoScan:
     """All metadata of a video file.
 
@@ -127,7 +127,7 @@ def scan(path: Path) -> VideoScan:
     with open_video(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
-        result = VideoScan(path, context.name, context.width, context.height)
+        result = VideoScan(path=path, codec=context.name, width=context.width, height=context.height)
         result.rate = float(stream.average_rate) if stream.average_rate else None
         created = parse_time(str(container.metadata.get("creation_time", "")))
         result.created_s = created[0] if created is not None else None

@@ -54,9 +54,9 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
             if form is None:
                 raise InputError(f"{source.name} is neither H.264 nor H.265; SEI cannot be put into it")
             if target.suffix.lower() in _RAW:
-                written = _write_raw(reader, stream, form, order, pose_of, temporary)
+                written = _write_raw(reader, stream, form, order=order, pose_of=pose_of, target=temporary)
             else:
-                written = _write_container(reader, stream, form, order, pose_of, temporary)
+                written = _write_container(reader, stream, form, order=order, pose_of=pose_of, target=temporary)
         os.replace(temporary, target)
     except av.error.FFmpegError as error:
         raise InputError(f"{target.name} cannot be written ({error.strerror}); choose .mp4, .mkv or .ts") from None
@@ -107,7 +107,7 @@ def _packets(reader: Any, stream: Any, form: bitstream.StreamFormat, order: list
 
 
 def _write_raw(
-    reader: Any, stream: Any, form: bitstream.StreamFormat, order: list[int], pose_of: PoseOf, target: Path
+    reader: Any, stream: Any, form: bitstream.StreamFormat, *, order: list[int], pose_of: PoseOf, target: Path
 ) -> int:
     if form.prefix:
         raise InputError("an MP4 cannot become a raw stream here; choose .mp4, .mkv or .ts for the copy")
@@ -121,7 +121,7 @@ def _write_raw(
 
 
 def _write_container(
-    reader: Any, stream: Any, form: bitstream.StreamFormat, order: list[int], pose_of: PoseOf, target: Path
+    reader: Any, stream: Any, form: bitstream.StreamFormat, *, order: list[int], pose_of: PoseOf, target: Path
 ) -> int:
     import av
 

@@ -363,10 +363,10 @@ def test_the_command_prints_one_json_document(flight, tmp_path, capsys):
 def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone(flight, tmp_path, monkeypatch):
     _, _, folder = flight
 
-    def page(out, report, placed, rejected, basemap):
+    def page(out, report, placed, *, rejected, basemap):
         if basemap is not None:
             raise InputError("the basemap map.tif is damaged; copy or export it again")
-        write_page(out, report, placed, rejected, None)
+        write_page(out, report, placed, rejected=rejected, basemap=None)
 
     monkeypatch.setattr("orthoswarm.batch.run_report.write_page", page)
     photos, out = folder / "photos" / "b", tmp_path / "out"

@@ -21,7 +21,13 @@ def frame(i, east, north, vehicle="a", **other):
     lat, lon = GRID.to_geographic(np.add(MIDDLE, (east, north)))
     known = {"height_m": 100.0, "yaw_rad": 0.0, "pitch_rad": -np.pi / 2, "roll_rad": 0.0} | other
     return Frame(
-        f"{vehicle}/{i}.jpg", Path(f"{i}.jpg"), vehicle, float(i), Fix(float(lat), float(lon), **known), 400, 300
+        image=f"{vehicle}/{i}.jpg",
+        path=Path(f"{i}.jpg"),
+        vehicle=vehicle,
+        time_s=float(i),
+        fix=Fix(float(lat), float(lon), **known),
+        width=400,
+        height=300,
     )
 
 

@@ -17,7 +17,7 @@ from orthoswarm.report.displacement_map import moved
 from orthoswarm.report.report_pictures import Picture, draw_arrows, draw_lines, fill_polygons, scale_bar, view_grid
 from tests.kit.scene import Scene
 
-GRID = GroundGrid(32632, 465_000.0, 5_250_000.0, 0.5, 900, 700)
+GRID = GroundGrid(epsg=32632, west=465_000.0, north=5_250_000.0, gsd_m=0.5, width=900, height=700)
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])
@@ -120,7 +120,7 @@ def test_what_is_damaged_is_done_again(tmp_path):
 def test_a_run_is_known_by_its_pictures_and_options(tmp_path):
     path = tmp_path / "a.jpg"
     path.write_bytes(b"1")
-    frame = Frame("a.jpg", path, "v", 1.0, Fix(47.0, 8.0), 4, 3)
+    frame = Frame(image="a.jpg", path=path, vehicle="v", time_s=1.0, fix=Fix(47.0, 8.0), width=4, height=3)
     first = run_key([frame], "options")
     assert first == run_key([frame], "options") != run_key([frame], "others")
     path.write_bytes(b"22")

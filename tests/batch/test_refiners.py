@@ -17,7 +17,15 @@ def hovering(count=12):
     spot = [Fix(lat_deg=47.4, lon_deg=8.54, height_m=80.0, yaw_rad=0.0) for _ in range(count)]
     away = Fix(lat_deg=49.4, lon_deg=8.54, height_m=80.0, yaw_rad=0.0)
     return [
-        Frame(f"{i}.jpg", Path(f"missing/{i}.jpg"), "v", 1000.0 + i, fix, 640, 480)
+        Frame(
+            image=f"{i}.jpg",
+            path=Path(f"missing/{i}.jpg"),
+            vehicle="v",
+            time_s=1000.0 + i,
+            fix=fix,
+            width=640,
+            height=480,
+        )
         for i, fix in enumerate([*spot, away])
     ]
 

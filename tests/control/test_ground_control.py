@@ -17,7 +17,7 @@ from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, T
 
 GRID = LocalGrid(32632)
 MIDDLE = np.array([690_000.0, 5_330_000.0])
-LENS = Lens(1600, 1200, 1300.0, -0.12, 0.03)
+LENS = Lens(1600, 1200, 1300.0, k1=-0.12, k2=0.03)
 TURN, SCALE, SHIFT = 0.01, 1.004, np.array([6.0, -4.0])
 NADIRS = MIDDLE + np.array([[e, n] for e in (-60.0, 0.0, 60.0) for n in (-60.0, 0.0, 60.0)])
 
@@ -93,7 +93,15 @@ def block(stage="fine", move=distorted) -> tuple[dict[str, Camera], Refinement]:
         c, s = np.cos(TURN), np.sin(TURN)
         about_up = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
         moved = Camera(np.array([*move(nadir), 90.0 * SCALE]), about_up @ rotation, LENS)
-        frame = Frame(f"a/{k}.jpg", Path("x"), "a", None, Fix(48.0, 11.0), LENS.width, LENS.height)
+        frame = Frame(
+            image=f"a/{k}.jpg",
+            path=Path("x"),
+            vehicle="a",
+            time_s=None,
+            fix=Fix(48.0, 11.0),
+            width=LENS.width,
+            height=LENS.height,
+        )
         placed.append(PlacedFrame(frame, moved, stage, 0.1))
     step = 10.0
     e, n = np.meshgrid(np.arange(-300, 301, step), np.arange(-300, 301, step))
@@ -101,7 +109,19 @@ def block(stage="fine", move=distorted) -> tuple[dict[str, Camera], Refinement]:
     slope = SCALE * 0.02 * ((np.stack([e, n], -1) @ np.array([np.cos(TURN), np.sin(TURN)])) / SCALE)
     terrain = Terrain(float(west), float(south), step, slope.astype(np.float32))
     return cameras, Refinement(
-        [], [Solution("a", placed, {}, [Leg("a", 0, 8, "matched", 1.0, 0.1)], 63.0, 0.1, None)], terrain
+        [],
+        [
+            Solution(
+                vehicle="a",
+                placed=placed,
+                dropped={},
+                legs=[Leg(vehicle="a", first=0, last=8, state="matched", confidence=1.0, sigma_m=0.1)],
+                fov_deg=63.0,
+                fov_sigma_deg=0.1,
+                terrain=None,
+            )
+        ],
+        terrain,
     )
 
 

@@ -215,7 +215,11 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
     def program(code, packages=()):
         product = lambda job: (job.out / "map.tif", 7)  # noqa: E731
         return peers.Program(
-            "a | b", packages, lambda job, _: [*python(code), str(job.out), str(job.flat)], product, "yes"
+            title="a | b",
+            packages=packages,
+            command=lambda job, _: [*python(code), str(job.out), str(job.flat)],
+            product=product,
+            georeferenced="yes",
         )
 
     copy = f"import shutil, sys; shutil.copy({str(truth)!r}, sys.argv[1] + '/map.tif')"

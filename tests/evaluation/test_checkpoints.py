@@ -18,7 +18,7 @@ from orthoswarm.model.placement import PlacedFrame
 EPSG = 32632
 EAST, NORTH = 690_000.0, 5_330_000.0
 GROUND = 1.5
-LENS = Lens(1600, 1200, 1300.0, -0.12, 0.03, cx=4.0, cy=-3.0)
+LENS = Lens(1600, 1200, 1300.0, k1=-0.12, k2=0.03, cx=4.0, cy=-3.0)
 
 
 def cameras() -> dict[str, Camera]:
@@ -44,7 +44,15 @@ def product(folder: Path, shift: tuple[float, float] = (0.0, 0.0)) -> Path:
     by = np.array([*shift, 0.0])
     placed = []
     for image, camera in cameras().items():
-        frame = Frame(image, Path(image), image.split("/")[0], None, Fix(48.0, 11.0), LENS.width, LENS.height)
+        frame = Frame(
+            image=image,
+            path=Path(image),
+            vehicle=image.split("/")[0],
+            time_s=None,
+            fix=Fix(48.0, 11.0),
+            width=LENS.width,
+            height=LENS.height,
+        )
         placed.append(PlacedFrame(frame, Camera(camera.position + by, camera.rotation, LENS), "fine", 0.1))
     write_frames(folder, placed, [], LocalGrid(EPSG), GROUND)
     (folder / "report.json").write_text(json.dumps({"ground_z_m": GROUND}))

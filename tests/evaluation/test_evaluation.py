@@ -36,7 +36,7 @@ ALL = np.ones(SHAPE, bool)
 @given(st.floats(-4, 4), st.floats(-4, 4), st.integers(0, 50))
 def test_a_known_shift_is_measured(east, north, seed):
     image = texture(seed)
-    field = displacement_field(shifted(image, east, north), ALL, shifted(image, 0, 0), ALL, SETTINGS)
+    field = displacement_field(shifted(image, east, north), ALL, shifted(image, 0, 0), ALL, settings=SETTINGS)
     assert field.matched.mean() > 0.9
     np.testing.assert_allclose(np.median(field.shift_m[field.matched], axis=0), [east, north], atol=0.04)
     assert np.percentile(np.hypot(*(field.shift_m[field.matched] - [east, north]).T), 95) < 0.1
@@ -45,14 +45,14 @@ def test_a_known_shift_is_measured(east, north, seed):
 def test_light_and_contrast_do_not_matter():
     image = texture()
     other = 30 + 0.4 * shifted(image, 1.0, -0.5) + np.linspace(0, 80, SHAPE[1])[None, :]
-    field = displacement_field(other.astype(np.float32), ALL, shifted(image, 0, 0), ALL, SETTINGS)
+    field = displacement_field(other.astype(np.float32), ALL, shifted(image, 0, 0), ALL, settings=SETTINGS)
     np.testing.assert_allclose(np.median(field.shift_m[field.matched], axis=0), [1.0, -0.5], atol=0.05)
     assert np.median(field.contrast[field.matched]) == pytest.approx(0.4, rel=0.1)
 
 
 def test_other_ground_is_not_matched():
     for other in (shifted(texture(2), 0, 0), np.full(SHAPE, 90, np.float32)):
-        field = displacement_field(other, ALL, shifted(texture(1), 0, 0), ALL, SETTINGS)
+        field = displacement_field(other, ALL, shifted(texture(1), 0, 0), ALL, settings=SETTINGS)
         assert len(field.matched) == 20
         assert field.matched.mean() < 0.15
     measured = accuracy(field, completeness(ALL, ALL, 0.5), 40.0)
@@ -62,7 +62,7 @@ def test_other_ground_is_not_matched():
 
 def test_stripes_have_no_place_along_themselves():
     rows = np.tile(128 + 60 * np.sin(np.arange(SHAPE[1]) * 2 * np.pi / 10), (SHAPE[0], 1)).astype(np.float32)
-    assert displacement_field(rows, ALL, rows, ALL, SETTINGS).matched.mean() < 0.1
+    assert displacement_field(rows, ALL, rows, ALL, settings=SETTINGS).matched.mean() < 0.1
 
 
 def test_masked_ground_takes_no_part():
@@ -72,7 +72,7 @@ def test_masked_ground_takes_no_part():
     stripes = (np.arange(SHAPE[1]) // 20) % 2 == 0
     mixed = np.where(stripes[None, :], fixed, moved).astype(np.float32)
     mask = np.tile(stripes, (SHAPE[0], 1))
-    field = displacement_field(mixed, ALL, fixed, mask, SETTINGS)
+    field = displacement_field(mixed, ALL, fixed, mask, settings=SETTINGS)
     assert field.matched.mean() > 0.8
     np.testing.assert_allclose(np.median(field.shift_m[field.matched], axis=0), [0, 0], atol=0.06)
 
@@ -81,8 +81,8 @@ def test_blocks_that_the_orthoimage_does_not_cover_do_not_count():
     image = shifted(texture(), 0, 0)
     half = ALL.copy()
     half[:, SHAPE[1] // 2 :] = False
-    field = displacement_field(image, half, image, ALL, SETTINGS)
-    whole = displacement_field(image, ALL, image, ALL, SETTINGS)
+    field = displacement_field(image, half, image, ALL, settings=SETTINGS)
+    whole = displacement_field(image, ALL, image, ALL, settings=SETTINGS)
     assert 0 < len(field.matched) < 0.75 * len(whole.matched)
     assert field.position[:, 0].max() < SHAPE[1] // 2 + 20
 

@@ -78,7 +78,9 @@ def test_the_pictures_that_show_a_place_come_best_first():
     down = rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0)
 
     def placed(name, east, height=60.0):
-        frame = Frame(name, None, "v1", 0.0, Fix(47.0, 8.0, height), None, (400, 300))
+        frame = Frame(
+            image=name, path=None, vehicle="v1", time_s=0.0, fix=Fix(47.0, 8.0, height), width=None, height=(400, 300)
+        )
         return PlacedFrame(frame, Camera(np.array([east, 0.0, height]), down, lens), "fine", 0.1)
 
     frames = [placed("far", 30.0), placed("near", 2.0), placed("out", 80.0), placed("below", 0.0, -5.0)]

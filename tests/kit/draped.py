@@ -16,7 +16,7 @@ def texture(seed=0, size=1100):
     return np.clip(120 + t, 0, 255).astype(np.float32)
 
 
-def rig_of(legs=2, per_leg=12, spacing=18.0, tilt_deg=3.0, k1=0.0, seed=0, height=100.0):
+def rig_of(legs=2, *, per_leg=12, spacing=18.0, tilt_deg=3.0, k1=0.0, seed=0, height=100.0):
     """Legs 60 m apart, the second one flown back, with the wobble of a real flight."""
     rng = np.random.default_rng(seed)
     position, rotation, leg = [], [], []

@@ -18,7 +18,7 @@ STEP_M = 12.0
 HEIGHT_M = 80.0
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FlownArea:
     """Lines of the swarm over a rectangle, 400 x 300 m: lines run north, 50 m apart, and are shared out in turn."""
 
@@ -68,7 +68,7 @@ class FlownArea:
         name = f"{vehicle}/DJI_{number:04d}.JPG"
         lat, lon = self.grid.to_geographic(at)
         fix = Fix(float(lat), float(lon), HEIGHT_M)
-        frame = Frame(name, Path(name), vehicle, time_s, fix, 1600, 1200)
+        frame = Frame(image=name, path=Path(name), vehicle=vehicle, time_s=time_s, fix=fix, width=1600, height=1200)
         return PlacedFrame(frame, Camera(np.array([*at, HEIGHT_M]), rotation, lens), "fine", self.sigma_m)
 
     def write(self, out: Path, rejected: list[Rejection] | None = None) -> Path:

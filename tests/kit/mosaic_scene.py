@@ -62,7 +62,7 @@ def picture_of(camera: Camera, height: Callable = level, gain=1.0):
 
 
 def camera(
-    east=0.0, north=0.0, height=100.0, yaw_deg=0.0, pitch_deg=-90.0, roll_deg=0.0, lens: Lens | None = None
+    east=0.0, north=0.0, height=100.0, *, yaw_deg=0.0, pitch_deg=-90.0, roll_deg=0.0, lens: Lens | None = None
 ) -> Camera:
     angles = np.radians([yaw_deg, pitch_deg, roll_deg])
     return Camera(np.array([EAST + east, NORTH + north, height]), rotation_from_angles(*angles), lens or small_lens())
@@ -87,7 +87,15 @@ class Flight:
 
     def take(self, camera: Camera, height: Callable = level, *, vehicle="uav1", weak=False, gain=1.0) -> "Flight":
         name = f"{vehicle}_{len(self.frames):04d}.jpg"
-        frame = Frame(name, Path(name), vehicle, None, Fix(0, 0), camera.lens.width, camera.lens.height)
+        frame = Frame(
+            image=name,
+            path=Path(name),
+            vehicle=vehicle,
+            time_s=None,
+            fix=Fix(0, 0),
+            width=camera.lens.width,
+            height=camera.lens.height,
+        )
         self.frames.append(PlacedFrame(frame, camera, "fine", 0.1, weak))
         self.pictures[name] = picture_of(camera, height, gain)
         return self

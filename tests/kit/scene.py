@@ -1,6 +1,6 @@
 """A made-up flat ground, photos of it with a drone's tags or parts of them, and a map of it; all in milliseconds."""
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,6 +23,7 @@ class Shot:
 
     east: float
     north: float
+    _: KW_ONLY
     height: float = 80.0
     yaw: float = 0.0
     pitch: float = -90.0
@@ -42,7 +43,14 @@ class Scene:
         self.lat, self.lon = lat, lon
         self.middle = np.round(self.grid.to_grid(lat, lon))
         n = int(SIDE / GSD)
-        self.ground = GroundGrid(self.grid.epsg, self.middle[0] - SIDE / 2, self.middle[1] + SIDE / 2, GSD, n, n)
+        self.ground = GroundGrid(
+            epsg=self.grid.epsg,
+            west=self.middle[0] - SIDE / 2,
+            north=self.middle[1] + SIDE / 2,
+            gsd_m=GSD,
+            width=n,
+            height=n,
+        )
         self.rgb = _texture(n, seed)
 
     def camera(self, shot: Shot) -> Camera:
@@ -66,7 +74,15 @@ class Scene:
         lat, lon = self.grid.to_geographic(here)
         if shot.tags == "all":
             angles = (shot.yaw, shot.pitch, shot.roll)
-            tags = PhotoTags(shot.time_s, lat, lon, 500 + shot.height, shot.height, angles, (shot.yaw, 0.0, 0.0))
+            tags = PhotoTags(
+                time_s=shot.time_s,
+                lat_deg=lat,
+                lon_deg=lon,
+                altitude_m=500 + shot.height,
+                height_m=shot.height,
+                gimbal_deg=angles,
+                flight_deg=(shot.yaw, 0.0, 0.0),
+            )
             path.write_bytes(with_tags(jpeg, tags))
         elif shot.tags == "position":
             path.write_bytes(jpeg)

@@ -81,7 +81,16 @@ def make_world(
         index = np.flatnonzero(ok)
         noisy = (uv[index] + rng.normal(0, noise_px, (len(index), 2))).astype(np.float32)
         nothing = np.zeros((len(index), 128), np.uint8)
-        features.append(Features(noisy, nothing, np.full(len(index), 0.5, np.float32), w, h, w / 480))
+        features.append(
+            Features(
+                uv=noisy,
+                descriptor=nothing,
+                sigma_px=np.full(len(index), 0.5, np.float32),
+                width=w,
+                height=h,
+                step_px=w / 480,
+            )
+        )
         seen.append(index)
     pairs = []
     for i in range(n):
@@ -107,7 +116,17 @@ def _frames(xy: np.ndarray, z: np.ndarray, yaw: np.ndarray, size: tuple[int, int
             pitch_rad=-np.pi / 2,
             roll_rad=0.0,
         )
-        frames.append(Frame(f"p{k:03d}.jpg", Path(f"p{k:03d}.jpg"), "v", 5.0 * k, fix, *size))
+        frames.append(
+            Frame(
+                image=f"p{k:03d}.jpg",
+                path=Path(f"p{k:03d}.jpg"),
+                vehicle="v",
+                time_s=5.0 * k,
+                fix=fix,
+                width=size[0],
+                height=size[1],
+            )
+        )
     return frames
 
 

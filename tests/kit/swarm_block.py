@@ -10,7 +10,7 @@ from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.bundle.rotation_vectors import exp_rotation
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Block:
     true: CameraBlock
     points: np.ndarray
@@ -21,7 +21,7 @@ class Block:
 
 
 def make_block(
-    seed=0, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_s=0.0, focal_start=330.0, lean_deg=0.0
+    seed=0, *, per_leg=30, legs=3, k1=-0.05, k2=0.01, noise_px=0.3, lag_s=0.0, focal_start=330.0, lean_deg=0.0
 ) -> Block:
     """Pictures over flat ground; `lean_deg`: how far the airframe leans at most, and its fixed camera with it."""
     rng = np.random.default_rng(seed)
@@ -61,15 +61,15 @@ def make_block(
     fixes = position + np.c_[rng.normal(0, 0.6, (n, 2)), np.zeros(n)] - lag_s * np.c_[velocity, np.zeros(n)]
     fixes[:, :2] += np.outer(np.arange(n), [0.05, -0.03])
     priors = Priors(
-        fixes,
-        np.tile([1.0, 1.0, 0.1], (n, 1)),
-        recorded,
-        np.full((n, 3), np.radians(0.1)),
-        velocity,
-        zero,
-        (GroupPriors(height_sigma=0.3),),
-        np.array([[np.log(focal_start), 0, 0, 0, 0, 0]]),
-        np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
+        position=fixes,
+        position_sigma=np.tile([1.0, 1.0, 0.1], (n, 1)),
+        rotation=recorded,
+        rotation_sigma=np.full((n, 3), np.radians(0.1)),
+        velocity=velocity,
+        group=zero,
+        models=(GroupPriors(height_sigma=0.3),),
+        lens=np.array([[np.log(focal_start), 0, 0, 0, 0, 0]]),
+        lens_sigma=np.array([[0.3, 0.1, 0.03, 0, 0, 0]]),
     )
     start = CameraBlock(fixes.copy(), recorded.copy(), zero, np.array([[focal_start, 0, 0, 0, 0, 0, 640.0, 480.0]]))
-    return Block(true, points[used], tracks, start, priors, bias)
+    return Block(true=true, points=points[used], tracks=tracks, start=start, priors=priors, bias=bias)

@@ -88,7 +88,7 @@ def test_registration_survives_destroyed_ground_and_finds_the_homography(ground,
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(patch, true, patch.shape[::-1], flags=flags)
     seen = cv2.warpPerspective(np.ones(patch.shape, np.uint8), true, patch.shape[::-1], flags=flags) > 0
-    found = register(warped, seen, window, known, REACH, matcher)
+    found = register(warped, seen, window, known=known, reach=REACH, matcher=matcher)
     assert found.share > 0.35
     corners = np.array([[20.0, 20], [340, 30], [330, 340], [25, 330]])
     expected = apply(true, corners) + np.array([9 + REACH, -13 + REACH])
@@ -97,11 +97,14 @@ def test_registration_survives_destroyed_ground_and_finds_the_homography(ground,
 
 def test_the_second_opinion_tells_the_shift_or_nothing(ground):
     for matcher in (None, Cfog()):
-        assert second_opinion(*case(ground[0]), REACH, matcher) == pytest.approx((9, -13), abs=0.5)
+        patch, valid, window, known = case(ground[0])
+        assert second_opinion(patch, valid, window, known=known, reach=REACH, matcher=matcher) == pytest.approx(
+            (9, -13), abs=0.5
+        )
         patch, valid, _, _ = case(ground[0])
         _, _, window, known = case(ground[1])
-        assert second_opinion(patch, valid, window, known, REACH, matcher) is None
-        assert second_opinion(patch, valid, window * 0, known & False, REACH, matcher) is None
+        assert second_opinion(patch, valid, window, known=known, reach=REACH, matcher=matcher) is None
+        assert second_opinion(patch, valid, window * 0, known=known & False, reach=REACH, matcher=matcher) is None
 
 
 def test_no_model_is_none_and_not_an_error():

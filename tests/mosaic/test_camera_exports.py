@@ -35,7 +35,15 @@ def flight(tmp_path):
         position = np.append(centre + rng.uniform(-200, 200, 2), rng.uniform(90, 150))
         camera = Camera(position, rotation_from_angles(*angles), lens)
         name = f"uav/{i}.jpg"
-        frame = Frame(name, tmp_path / name, "uav", None, Fix(0, 0), lens.width, lens.height)
+        frame = Frame(
+            image=name,
+            path=tmp_path / name,
+            vehicle="uav",
+            time_s=None,
+            fix=Fix(0, 0),
+            width=lens.width,
+            height=lens.height,
+        )
         cameras.append(camera)
         rows.append(frame_row(PlacedFrame(frame, camera, "fine", 0.1), GRID, 0.0))
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -32,7 +32,11 @@ def paint(canvas, key, value=200):
 
 @pytest.fixture
 def canvas(tmp_path):
-    with Canvas.create(tmp_path / "canvas", GroundGrid(32648, 0.0, 1000.0, 1.0, 1000, 700), tile_px=128) as canvas:
+    with Canvas.create(
+        tmp_path / "canvas",
+        GroundGrid(epsg=32648, west=0.0, north=1000.0, gsd_m=1.0, width=1000, height=700),
+        tile_px=128,
+    ) as canvas:
         yield canvas
 
 
@@ -52,7 +56,7 @@ def test_what_is_drawn_is_read_back_across_tiles(canvas):
 
 
 def test_hundred_square_kilometres_at_a_decimetre_just_work(tmp_path):
-    grid = GroundGrid(32648, 300000.0, 4000000.0, 0.1, 100_000, 100_000)
+    grid = GroundGrid(epsg=32648, west=300000.0, north=4000000.0, gsd_m=0.1, width=100_000, height=100_000)
     with Canvas.create(tmp_path / "big", grid, memory_mb=20.0) as canvas:
         for key in [(0, 0), (97, 100), (195, 195)]:
             paint(canvas, key)
@@ -66,7 +70,7 @@ def test_hundred_square_kilometres_at_a_decimetre_just_work(tmp_path):
 
 
 def test_memory_stays_within_the_bound(tmp_path):
-    grid = GroundGrid(32648, 0.0, 0.0, 1.0, 128 * 20, 128 * 20)
+    grid = GroundGrid(epsg=32648, west=0.0, north=0.0, gsd_m=1.0, width=128 * 20, height=128 * 20)
     with Canvas.create(tmp_path / "c", grid, tile_px=128, memory_mb=1.0) as canvas:
         for r in range(20):
             for c in range(20):
@@ -98,7 +102,7 @@ def test_begun_but_unchanged_tile_is_not_reported(canvas):
 
 
 def test_canvas_opens_again_as_it_was_left(tmp_path):
-    grid = GroundGrid(32648, 0.0, 1000.0, 0.5, 300, 300)
+    grid = GroundGrid(epsg=32648, west=0.0, north=1000.0, gsd_m=0.5, width=300, height=300)
     with Canvas.create(tmp_path / "c", grid, plane="frame", tile_px=64) as canvas:
         paint(canvas, (1, 2))
         version = canvas.version
@@ -111,11 +115,17 @@ def test_canvas_opens_again_as_it_was_left(tmp_path):
     with Canvas.at(tmp_path / "c", grid, plane="frame") as same:
         assert same.version > version
     with pytest.raises(InputError, match="another grid"):
-        Canvas.at(tmp_path / "c", GroundGrid(32648, 0.0, 1000.0, 1.0, 300, 300), plane="frame")
+        Canvas.at(
+            tmp_path / "c",
+            GroundGrid(epsg=32648, west=0.0, north=1000.0, gsd_m=1.0, width=300, height=300),
+            plane="frame",
+        )
 
 
 def test_lost_index_is_made_anew_from_the_tiles(tmp_path):
-    with Canvas.create(tmp_path / "c", GroundGrid(32648, 0.0, 0.0, 1.0, 300, 300), tile_px=64) as canvas:
+    with Canvas.create(
+        tmp_path / "c", GroundGrid(epsg=32648, west=0.0, north=0.0, gsd_m=1.0, width=300, height=300), tile_px=64
+    ) as canvas:
         paint(canvas, (1, 2))
     (tmp_path / "c" / "versions.u64").unlink()
     with Canvas.open(tmp_path / "c") as again:
@@ -203,7 +213,7 @@ def test_read_ground_covers_what_is_asked_at_the_asked_pixel(shared_canvas, west
 
 @pytest.fixture(scope="module")
 def shared_canvas(tmp_path_factory):
-    grid = GroundGrid(32648, 0.0, 1000.0, 1.0, 1000, 700)
+    grid = GroundGrid(epsg=32648, west=0.0, north=1000.0, gsd_m=1.0, width=1000, height=700)
     with Canvas.create(tmp_path_factory.mktemp("shared") / "c", grid, tile_px=128) as canvas:
         paint(canvas, (1, 1))
         yield canvas

@@ -36,7 +36,7 @@ class Raster:
 
     def __init__(self, rgba):
         self.rgba = rgba
-        self.grid = GroundGrid(EPSG, WEST, NORTH, STEP, rgba.shape[1], rgba.shape[0])
+        self.grid = GroundGrid(epsg=EPSG, west=WEST, north=NORTH, gsd_m=STEP, width=rgba.shape[1], height=rgba.shape[0])
         self.largest = 0
 
     def read_reduced(self, factor, row0, row1, col0, col1):
@@ -291,7 +291,7 @@ def test_names_for_odm_are_plain_and_different():
 
 
 def test_a_fuller_lens_is_stated_in_the_simple_form():
-    lens = Lens(1600, 1300, 1913.0, -0.42, 0.27, -0.1, 14.0, -9.0)
+    lens = Lens(1600, 1300, 1913.0, k1=-0.42, k2=0.27, k3=-0.1, cx=14.0, cy=-9.0)
     simple, matrix = simple_lens(lens)
     assert (simple.cx, simple.cy, simple.k3) == (0, 0, 0) and simple.focal_px == lens.focal_px
     pixels = np.array([[0.0, 0], [1599, 1299], [800, 650], [300, 1200], [1599, 0]])

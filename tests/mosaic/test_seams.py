@@ -31,7 +31,7 @@ def side_by_side(apart_m=40.0):
     return flight.take(scene.camera(east=-apart_m / 2)).take(scene.camera(east=apart_m / 2))
 
 
-def car_in(flight, frame, east, north, half_m=6.0, level=255):
+def car_in(flight, frame, east, north, *, half_m=6.0, level=255):
     """A square thing on the ground that only one picture shows; where it is in the mosaic."""
     camera, name = flight.cameras[frame], flight.frames[frame].frame.image
     picture = flight.pictures[name].copy()

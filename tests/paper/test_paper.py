@@ -64,7 +64,16 @@ def records_of(xy, yaw):
     position = np.column_stack([xy, np.full(n, 80.0)])
     level = np.full(n, -np.pi / 2)
     return FlightRecords(
-        position, yaw, level, np.zeros(n), np.arange(n) * 2.0, flags, flags, flags, np.full(n, np.nan), True
+        position=position,
+        yaw=yaw,
+        pitch=level,
+        roll=np.zeros(n),
+        time_s=np.arange(n) * 2.0,
+        has_height=flags,
+        has_yaw=flags,
+        has_tilt=flags,
+        position_sigma=np.full(n, np.nan),
+        timed=True,
     )
 
 
@@ -163,7 +172,7 @@ def test_matches_on_towers_are_rejected():
     cameras = CameraBlock(
         position, np.repeat(rotation_from_angles(0.0, -np.pi / 2, 0.0)[None], 5, 0), np.zeros(5, np.int32), lens
     )
-    grid = GroundGrid(32632, -50.0, 60.0, 0.5, 440, 240)
+    grid = GroundGrid(epsg=32632, west=-50.0, north=60.0, gsd_m=0.5, width=440, height=240)
     ground = np.column_stack([rng.uniform(-40, 160, 300), rng.uniform(-55, 55, 300)])
     tower = np.arange(300) < 40
     nearest = position[np.argmin(np.abs(ground[:, :1] - position[:, 0]), axis=1), :2]

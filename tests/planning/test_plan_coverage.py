@@ -84,8 +84,8 @@ def test_any_area_is_seen_without_crossing_holes_and_shared_evenly(shape, method
             vehicles,
             height * radius,
             foot,
-            method,
-            Options(end=end, starts=starts),
+            method=method,
+            options=Options(end=end, starts=starts),
         )
     except InputError as error:
         assert "lines" in str(error) and vehicles > 1
@@ -108,7 +108,7 @@ def test_any_area_is_seen_without_crossing_holes_and_shared_evenly(shape, method
 @pytest.mark.parametrize("vehicles", [1, 8])
 def test_a_concave_area_with_a_hole_is_done_by_every_method(method, vehicles):
     foot = footprint(60.0, np.radians(60.0))
-    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 60.0, foot, method)
+    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 60.0, foot, method=method)
     assert plan.covered_share >= 0.999 and not plan.warnings
     assert covered(plan, CONCAVE, [HOLE], foot) >= 0.999
     assert plan.balance <= 1.2
@@ -125,7 +125,7 @@ def test_pictures_lie_across_legs_at_the_planned_overlap():
     foot = footprint(100.0, np.radians(60.0), aspect=1.5, side=0.3, forward=0.7)
     assert foot.width_m == pytest.approx(2 * 100 * np.tan(np.radians(30)))
     assert foot.height_m == pytest.approx(foot.width_m / 1.5)
-    plan = plan_area(make_area([on_globe([(0, 0), (600, 0), (600, 500), (0, 500)])]), 1, 100.0, foot, "columns")
+    plan = plan_area(make_area([on_globe([(0, 0), (600, 0), (600, 500), (0, 500)])]), 1, 100.0, foot, method="columns")
     (mission,) = flown(plan).values()
     assert set(np.round(mission.distances, 4)) == {round(0.3 * foot.height_m, 4)}
     at = sorted(leg[0][0] for leg in mission.legs)
@@ -145,7 +145,7 @@ def test_little_forward_overlap_lengthens_legs_so_that_their_ends_are_seen():
 def test_a_small_area_gets_one_short_leg(method):
     shell = [(0, 0), (12, 0), (12, 9), (0, 9)]
     foot = footprint(80.0, np.radians(60.0))
-    plan = plan_area(make_area([on_globe(shell)]), 1, 80.0, foot, method)
+    plan = plan_area(make_area([on_globe(shell)]), 1, 80.0, foot, method=method)
     (mission,) = flown(plan).values()
     assert len(mission.legs) == 1 and covered(plan, shell, [], foot) == pytest.approx(1.0)
 
@@ -154,7 +154,7 @@ def test_parts_of_an_area_are_all_flown():
     left, right = [(0, 0), (200, 0), (200, 300), (0, 300)], [(500, 100), (700, 100), (700, 400), (500, 400)]
     foot = footprint(60.0, np.radians(60.0))
     for method in METHODS:
-        plan = plan_area(make_area([on_globe(left), on_globe(right)]), 3, 60.0, foot, method)
+        plan = plan_area(make_area([on_globe(left), on_globe(right)]), 3, 60.0, foot, method=method)
         for shell in (left, right):
             assert covered(plan, shell, [], foot) >= 0.999
 
@@ -178,7 +178,7 @@ def test_sorties_keep_within_the_endurance_and_resume_where_the_last_one_stopped
     foot, motion = footprint(60.0, np.radians(60.0)), Motion()
     start = start_at(-50.0, -50.0)
     options = Options(starts=[start], endurance_s=9 * 60.0)
-    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), 2, 60.0, foot, "columns", options)
+    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), 2, 60.0, foot, method="columns", options=options)
     assert covered(plan, CONCAVE, [HOLE], foot) >= 0.999
     for vehicle in plan.vehicles:
         assert len(vehicle.sorties) > 1
@@ -206,7 +206,7 @@ def test_a_mission_never_holds_more_items_than_the_autopilot():
     foot = footprint(10.0, np.radians(50.0))
     shell = [(0, 0), (700, 0), (700, 60), (0, 60)]
     options = Options(most_items=60)
-    plan = plan_area(make_area([on_globe(shell)]), 1, 10.0, foot, "columns", options)
+    plan = plan_area(make_area([on_globe(shell)]), 1, 10.0, foot, method="columns", options=options)
     assert len(plan.vehicles[0].sorties) > 1 and any("60 items" in w for w in plan.warnings)
     for text in mission_files(plan, "ardupilot").values():
         if text.startswith("QGC"):
@@ -231,7 +231,7 @@ def positions(plan, sortie, motion, step=0.25):
 def test_vehicles_stay_apart_even_off_schedule(method, vehicles, start):
     foot, apart = footprint(60.0, np.radians(60.0)), Separation(distance_m=12.0, height_m=4.0, slack_s=2.0)
     options = Options(starts=[start_at(-60.0, 200.0)] if start else [], separation=apart)
-    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 60.0, foot, method, options)
+    plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 60.0, foot, method=method, options=options)
     tracks = [positions(plan, v.sorties[0], options.motion) for v in plan.vehicles]
     met = 0
     for (a, b), late in itertools.product(itertools.combinations(range(vehicles), 2), (-2.0, 0.0, 2.0)):
@@ -328,7 +328,7 @@ def test_a_line_through_a_no_fly_zone_is_refused():
     line = GRID.to_geographic(ORIGIN + np.array([(0, 400), (900, 400)], float))
     area = make_area([on_globe(CONCAVE, [HOLE])])
     with pytest.raises(InputError, match="crosses a no-fly zone"):
-        plan_lines([line], 1, 60.0, footprint(60.0, np.radians(60.0)), area)
+        plan_lines([line], 1, 60.0, footprint(60.0, np.radians(60.0)), no_fly=area)
 
 
 @settings(max_examples=40, deadline=None)
@@ -365,6 +365,6 @@ def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep
     area = make_area([on_globe([(0, 0), (800, 0), (800, 800), (0, 800)], holes)])
     start = tuple(on_globe([(-50.0, -50.0)]).shell[0])
     options = Options(starts=[start], endurance_s=660.0, clearance_m=10.0)
-    plan = plan_area(area, 4, 40.0, footprint(40.0, np.radians(60.0)), "columns", options)
+    plan = plan_area(area, 4, 40.0, footprint(40.0, np.radians(60.0)), method="columns", options=options)
     assert plan.covered_share >= 0.999
     assert max(sortie.time_s for vehicle in plan.vehicles for sortie in vehicle.sorties) <= 660.0

@@ -88,16 +88,39 @@ PLAN = {
 
 def small_plan(end="rtl"):
     points = (
-        Waypoint(47.001, 9.0, 65.0),
-        Waypoint(47.001, 9.001, 60.0, True),
-        Waypoint(47.002, 9.001, 60.0, False),
-        Waypoint(47.002, 9.002, 60.0, True),
-        Waypoint(47.001, 9.002, 60.0, False),
-        *([] if end == "hover" else [Waypoint(47.0, 9.0, 60.0)]),
+        Waypoint(lat_deg=47.001, lon_deg=9.0, height_m=65.0),
+        Waypoint(lat_deg=47.001, lon_deg=9.001, height_m=60.0, camera=True),
+        Waypoint(lat_deg=47.002, lon_deg=9.001, height_m=60.0, camera=False),
+        Waypoint(lat_deg=47.002, lon_deg=9.002, height_m=60.0, camera=True),
+        Waypoint(lat_deg=47.001, lon_deg=9.002, height_m=60.0, camera=False),
+        *([] if end == "hover" else [Waypoint(lat_deg=47.0, lon_deg=9.0, height_m=60.0)]),
     )
-    sortie = Sortie(47.0, 9.0, 65.0, points, 0.0, 100.0, 500.0, 4, 24)
+    sortie = Sortie(
+        home_lat_deg=47.0,
+        home_lon_deg=9.0,
+        takeoff_height_m=65.0,
+        waypoints=points,
+        start_s=0.0,
+        time_s=100.0,
+        length_m=500.0,
+        turns=4,
+        photos=24,
+    )
     return Plan(
-        *("bcd", (VehiclePlan(1, (sortie,)),), 60.0, 8.0, 10.0, 40.0, (70.0, 50.0), end, 32632, 1e4, 1.0, (), "", ())
+        method="bcd",
+        vehicles=(VehiclePlan(1, (sortie,)),),
+        altitude_m=60.0,
+        speed_m_s=8.0,
+        trigger_m=10.0,
+        spacing_m=40.0,
+        footprint_m=(70.0, 50.0),
+        end=end,
+        epsg=32632,
+        area_m2=1e4,
+        covered_share=1.0,
+        gaps=(),
+        separation="",
+        warnings=(),
     )
 
 
@@ -148,14 +171,18 @@ def test_waypoint_files_begin_with_home_and_have_twelve_columns():
 
 positions = st.tuples(st.floats(-89, 89), st.floats(-179, 179)).filter(lambda p: abs(p[0]) + abs(p[1]) > 0.01)
 flown_items = st.builds(
-    lambda command, place, height, p1: MissionItem(command, 3, (p1, 0.0, 0.0, 0.0), *place, height),
+    lambda command, place, height, p1: MissionItem(
+        command=command, frame=3, params=(p1, 0.0, 0.0, 0.0), lat_deg=place[0], lon_deg=place[1], alt_m=height
+    ),
     st.sampled_from([NAV_WAYPOINT, NAV_TAKEOFF, NAV_LAND]),
     positions,
     st.floats(0, 500),
     st.floats(0, 100),
 )
 do_items = st.builds(
-    lambda command, p1: MissionItem(command, 2, (p1, 0.0, 1.0, 0.0)), st.sampled_from([178, 206]), st.floats(0, 99)
+    lambda command, p1: MissionItem(command=command, frame=2, params=(p1, 0.0, 1.0, 0.0)),
+    st.sampled_from([178, 206]),
+    st.floats(0, 99),
 )
 
 

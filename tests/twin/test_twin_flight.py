@@ -14,7 +14,7 @@ CENTER = (400000.0, 3400000.0)
 
 
 def flights(plan=PLAN, motion=None, seed=3):
-    return [fly(plan, motion or Motion(), CENTER, v, seed) for v in range(plan.vehicles)]
+    return [fly(plan, motion or Motion(), CENTER, vehicle=v, seed=seed) for v in range(plan.vehicles)]
 
 
 def test_presets_have_the_papers_numbers_of_pictures():

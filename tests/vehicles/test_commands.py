@@ -40,7 +40,7 @@ def make_world():
 
 
 def give(world, verb, system, given_s=None):
-    return world.fleet.order(Order(verb, system, world.clock.now if given_s is None else given_s))
+    return world.fleet.order(Order(verb=verb, system=system, given_s=world.clock.now if given_s is None else given_s))
 
 
 def end_of(world, order, limit_s=30.0):
@@ -49,7 +49,7 @@ def end_of(world, order, limit_s=30.0):
 
 
 def flying(make_world, autopilot, **faults):
-    world = make_world(SimVehicle(1, autopilot), **faults)
+    world = make_world(SimVehicle(system=1, autopilot=autopilot), **faults)
     world.meet()
     assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
     assert end_of(world, give(world, "start", 1)).outcome is Verdict.DONE
@@ -77,7 +77,7 @@ def test_an_acknowledged_command_is_done(make_world, autopilot, verb):
 
 @BOTH
 def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world, autopilot):
-    world = make_world(SimVehicle(1, autopilot))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     good = mission(autopilot, END)
     no_takeoff = type(good)(autopilot, tuple(item for item in good.items if item.command != TAKEOFF))
@@ -89,7 +89,7 @@ def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world
 
 @BOTH
 def test_a_pause_on_the_ground_is_refused(make_world, autopilot):
-    world = make_world(SimVehicle(1, autopilot))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     sent = sent_by(world)
     result = end_of(world, give(world, "pause", 1))
@@ -140,7 +140,7 @@ def test_a_lost_vehicle_is_commanded_all_the_same(make_world, verb):
 def test_rtl_gets_through_a_third_of_all_packets_lost(make_world):
     for seed in range(8):
         faults = {"up": Faults(loss=0.33, seed=seed), "down": Faults(loss=0.33, seed=seed + 50)}
-        world = make_world(SimVehicle(1, AP), **faults)
+        world = make_world(SimVehicle(system=1, autopilot=AP), **faults)
         world.meet()
         world.vehicles[1].flight.armed = True
         assert end_of(world, give(world, "rtl", 1)).outcome is Verdict.DONE
@@ -148,7 +148,7 @@ def test_rtl_gets_through_a_third_of_all_packets_lost(make_world):
 
 def test_a_start_that_is_under_way_is_carried_through(make_world):
     """Once armed a vehicle is not left standing with its motors on because five seconds are over."""
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, END)))
     order = give(world, "start", 1, world.clock.now - 4.9)
@@ -188,7 +188,7 @@ class TwoLinks:
             self.fleet.poll(0.0)
 
     def give(self, verb, system=1):
-        order = self.fleet.order(Order(verb, system, self.clock.now))
+        order = self.fleet.order(Order(verb=verb, system=system, given_s=self.clock.now))
         self.wait(8.0)
         return order.result()
 
@@ -197,7 +197,7 @@ class Mirror(SimVehicle):
     """The second radio of a vehicle: the same clock and state, a link of its own."""
 
     def __init__(self, other):
-        super().__init__(other.system, other.autopilot)
+        super().__init__(system=other.system, autopilot=other.autopilot)
         self.flight, self.store = other.flight, other.store
 
     def advance(self, now):
@@ -207,7 +207,7 @@ class Mirror(SimVehicle):
 
 
 def test_one_vehicle_on_two_links_is_one_vehicle_and_either_link_carries_its_commands():
-    vehicle = SimVehicle(1, AP)
+    vehicle = SimVehicle(system=1, autopilot=AP)
     world = TwoLinks(
         [vehicle, Mirror(vehicle)], [Faults(silent=((20.0, 40.0),)), Faults(silent=((0.0, 5.0), (60.0, 1e9)))]
     )
@@ -227,14 +227,14 @@ def test_one_vehicle_on_two_links_is_one_vehicle_and_either_link_carries_its_com
 
 
 def test_the_link_that_loses_less_carries_the_commands():
-    vehicle = SimVehicle(1, AP)
+    vehicle = SimVehicle(system=1, autopilot=AP)
     world = TwoLinks([vehicle, Mirror(vehicle)], [Faults(loss=0.5, seed=4), Faults()])
     world.wait(30.0)
     assert world.fleet.vehicles[1].route.address.startswith("link1")
 
 
 def test_a_text_on_two_links_is_said_once():
-    vehicle = SimVehicle(1, AP)
+    vehicle = SimVehicle(system=1, autopilot=AP)
     world = TwoLinks([vehicle, Mirror(vehicle)], [Faults(), Faults()])
     world.wait(5.0)
     text = dialect.MAVLink_statustext_message(4, b"PreArm: compass")
@@ -245,8 +245,8 @@ def test_a_text_on_two_links_is_said_once():
 
 
 def two_claimants():
-    late = SimVehicle(1, AP)
-    world = TwoLinks([SimVehicle(1, AP), late], [Faults(), Faults()])
+    late = SimVehicle(system=1, autopilot=AP)
+    world = TwoLinks([SimVehicle(system=1, autopilot=AP), late], [Faults(), Faults()])
     world.wait(20.0)
     late.reboot(world.clock.now, 1.0)
     world.wait(10.0)
@@ -275,7 +275,7 @@ def test_claimants_are_named_and_the_verdict_expires():
 
 
 def test_three_restarts_in_nine_seconds_hold_nothing_back(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.wait(60.0)
     for _ in range(3):
         world.vehicles[1].reboot(world.clock.now, 0.5)
@@ -304,7 +304,7 @@ def impossible():
 
 @pytest.mark.parametrize("number", range(len(impossible())))
 def test_impossible_values_do_not_leave_the_fleet(make_world, number):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     vehicle, seen = world.fleet.vehicles[1], []
     before = vehicle.summary(world.clock.now)
@@ -370,7 +370,7 @@ def test_a_packet_that_waits_for_a_stalled_line_is_thrown_away_once_it_is_late()
 
 @BOTH
 def test_a_flight_in_words(make_world, autopilot):
-    world = make_world(SimVehicle(1, autopilot))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     vehicle = world.fleet.vehicles[1]
     assert flight_state(vehicle).text == "on ground"
@@ -400,7 +400,7 @@ def test_a_flight_in_words(make_world, autopilot):
 
 
 def test_px4_is_returning_and_not_complete_while_it_flies_home(make_world):
-    world = make_world(SimVehicle(1, PX4))
+    world = make_world(SimVehicle(system=1, autopilot=PX4))
     world.meet()
     world.finish(world.fleet.upload(1, mission(PX4, END)))
     end_of(world, give(world, "start", 1))
@@ -437,7 +437,7 @@ def test_a_silent_vehicle_is_lost_in_words(make_world):
 
 
 def test_a_wait_that_the_mission_asks_for_is_no_pause(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     hold = MissionItem.do(dialect.MAV_CMD_NAV_DELAY, 30.0)
     world.finish(world.fleet.upload(1, mission(AP, hold, END)))
@@ -454,7 +454,7 @@ def test_a_wait_that_the_mission_asks_for_is_no_pause(make_world):
     ("kind", "word"), [(dialect.MAV_TYPE_FIXED_WING, "fixed wing"), (dialect.MAV_TYPE_GROUND_ROVER, "ground rover")]
 )
 def test_a_vehicle_that_does_not_hover_gets_no_mission_and_is_brought_home_all_the_same(make_world, kind, word):
-    world = make_world(SimVehicle(1, AP, kind=int(kind)))
+    world = make_world(SimVehicle(system=1, autopilot=AP, kind=int(kind)))
     world.meet()
     with pytest.raises(OrthoSwarmError, match=rf"vehicle 1 is not a multirotor \({word}\)"):
         world.fleet.upload(1, mission(AP, END))
@@ -469,7 +469,7 @@ def test_a_vehicle_that_does_not_hover_gets_no_mission_and_is_brought_home_all_t
 
 
 def test_a_station_without_the_key_is_told_that_it_needs_one(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     world.fleet.vehicles[1].signs = True
     world.link.up.faults = Faults(loss=1.0)

@@ -39,7 +39,7 @@ def landed(state):
 
 def mission(autopilot, *commands):
     home = [MissionItem.at(WAYPOINT, 47.0, 8.0, 0.0)] if autopilot is AP else []
-    return Mission(autopilot, (*home, *(MissionItem(c) for c in commands)))
+    return Mission(autopilot, (*home, *(MissionItem(command=c) for c in commands)))
 
 
 # Missions of the table: what is flown, by the last item.
@@ -92,7 +92,7 @@ def run(detector, messages):
 
 
 def fly(autopilot, ending, known=True, state=True):
-    detector = CompletionDetector(autopilot)
+    detector = CompletionDetector(autopilot=autopilot)
     commands = BODIES["rtl" if ending == "abort" else ending]
     detector.uploaded(mission(autopilot, *commands) if known else None)
     return detector, run(detector, flight(autopilot, ending, state))
@@ -134,7 +134,7 @@ def test_a_stale_complete_after_clear_and_upload_is_not_a_flight(autopilot, endi
 
 
 def test_joining_a_vehicle_that_has_completed_says_nothing():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     assert run(detector, [heartbeat(True), current(4, COMPLETE, 4), heartbeat(True), current(4, COMPLETE, 4)]) == []
 
 
@@ -161,7 +161,7 @@ def test_an_upload_in_the_air_is_not_started_by_a_late_packet_of_the_old_mission
 
 
 def test_pause_and_resume_are_one_flight():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["rtl"]))
     start = [heartbeat(True), current(2, ACTIVE), heartbeat(True, auto=False), current(2, NOT_STARTED)]
     end = [heartbeat(True), current(2, ACTIVE), current(4, ACTIVE), heartbeat(False), current(0, COMPLETE)]
@@ -172,7 +172,7 @@ def test_pause_and_resume_are_one_flight():
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 def test_the_end_of_a_landing_may_arrive_in_any_order(order):
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["land"]))
     run(detector, [heartbeat(True), current(3, ACTIVE), current(4, ACTIVE), current(4, ACTIVE)])
     last_words = [heartbeat(False), current(1, ACTIVE), landed(1)]
@@ -181,7 +181,7 @@ def test_the_end_of_a_landing_may_arrive_in_any_order(order):
 
 
 def test_a_lost_disarming_after_a_landing_starts_nothing():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["land"]))
     run(detector, [heartbeat(True), landed(2), current(3, ACTIVE), current(4, ACTIVE), landed(4)])
     assert run(detector, [landed(1), *[current(1, ACTIVE)] * 5, heartbeat(False)]) == [MissionEvent.COMPLETE]
@@ -195,7 +195,7 @@ def test_a_late_heartbeat_of_the_flight_starts_nothing(ending):
 
 
 def test_a_mission_set_back_during_the_landing_has_not_completed():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["land"]))
     run(detector, [heartbeat(True), current(4, ACTIVE), current(1, ACTIVE), heartbeat(True), heartbeat(True)])
     assert run(detector, [heartbeat(False), *[current(1, ACTIVE)] * 4]) == [MissionEvent.ABORTED]
@@ -203,7 +203,7 @@ def test_a_mission_set_back_during_the_landing_has_not_completed():
 
 @pytest.mark.parametrize("ending", ["rtl", "land", "waypoint", "loiter"])
 def test_a_crash_on_the_way_is_no_completion(ending):
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES[ending]))
     run(detector, [heartbeat(True), current(2, ACTIVE), current(3, ACTIVE)])
     crash = dialect.MAVLink_statustext_message(0, b"Crash: Disarming: AngErr=99>30")
@@ -212,7 +212,7 @@ def test_a_crash_on_the_way_is_no_completion(ending):
 
 @pytest.mark.parametrize("ending", ["rtl", "waypoint", "loiter"])
 def test_disarming_at_the_last_item_completes_only_a_landing(ending):
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES[ending]))
     run(detector, [heartbeat(True), current(4, ACTIVE)])
     assert run(detector, [heartbeat(False), *[current(1, ACTIVE)] * 4]) == [MissionEvent.ABORTED]
@@ -221,7 +221,7 @@ def test_disarming_at_the_last_item_completes_only_a_landing(ending):
 @pytest.mark.parametrize("ending", ["rtl", "land", "waypoint", "do"])
 @pytest.mark.parametrize("autopilot", [AP, PX4])
 def test_a_mission_that_somebody_else_uploaded_completes_too(autopilot, ending):
-    detector = CompletionDetector(autopilot)
+    detector = CompletionDetector(autopilot=autopilot)
     total = 4
     messages = [
         current(m.seq, m.mission_state, total) if m.get_type() == "MISSION_CURRENT" else m
@@ -231,7 +231,7 @@ def test_a_mission_that_somebody_else_uploaded_completes_too(autopilot, ending):
 
 
 def test_a_mission_replaced_by_another_ground_station_is_forgotten():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["rtl"]))
     run(detector, [heartbeat(True), current(2, ACTIVE, 4)])
     request = dialect.MAVLink_mission_request_message(254, 190, 0, 0)
@@ -249,7 +249,7 @@ def test_firmware_without_mission_state_is_judged_by_what_it_reaches(ending):
 
 
 def test_a_reboot_in_flight_aborts():
-    detector = CompletionDetector(PX4)
+    detector = CompletionDetector(autopilot=PX4)
     detector.uploaded(mission(PX4, *BODIES["rtl"]))
     run(detector, [heartbeat(True, PX4), current(1, ACTIVE)])
     assert detector.rebooted() == [MissionEvent.ABORTED]
@@ -257,7 +257,7 @@ def test_a_reboot_in_flight_aborts():
 
 
 def test_heartbeats_of_other_components_do_not_disarm():
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     detector.uploaded(mission(AP, *BODIES["land"]))
     run(detector, [heartbeat(True), current(4, ACTIVE)])
     camera = dialect.MAVLink_heartbeat_message(30, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
@@ -280,7 +280,7 @@ def lossy(messages, random, loss, copies):
 )
 @settings(max_examples=150, deadline=None)
 def test_no_pattern_of_loss_gives_a_false_or_second_completion(ending, autopilot, random, loss):
-    detector = CompletionDetector(autopilot)
+    detector = CompletionDetector(autopilot=autopilot)
     detector.uploaded(mission(autopilot, *BODIES["rtl" if ending == "abort" else ending]))
     events = run(detector, lossy(flight(autopilot, ending), random, loss, copies=2))
     assert events.count(MissionEvent.COMPLETE) <= (0 if ending in ("loiter", "abort") else 1)
@@ -290,7 +290,7 @@ def test_no_pattern_of_loss_gives_a_false_or_second_completion(ending, autopilot
 @pytest.mark.parametrize("autopilot", [AP, PX4])
 def test_a_loss_of_thirty_percent_hides_no_completion(autopilot, ending):
     for seed in range(30):
-        detector = CompletionDetector(autopilot)
+        detector = CompletionDetector(autopilot=autopilot)
         detector.uploaded(mission(autopilot, *BODIES["rtl" if ending == "abort" else ending]))
         events = run(detector, lossy(flight(autopilot, ending), Random(seed), 0.3, copies=10))
         assert events.count(MissionEvent.COMPLETE) == (0 if ending in ("loiter", "abort") else 1)
@@ -301,7 +301,7 @@ def test_a_loss_of_thirty_percent_hides_no_completion(autopilot, ending):
 def test_a_restarted_program_goes_on_where_it_stopped(cut, ending, autopilot):
     body = mission(autopilot, *BODIES["rtl" if ending == "abort" else ending])
     messages = list(flight(autopilot, ending))
-    first = CompletionDetector(autopilot)
+    first = CompletionDetector(autopilot=autopilot)
     first.uploaded(body)
     events = run(first, messages[:cut])
     second = CompletionDetector.from_state(json.loads(json.dumps(first.state())))
@@ -311,7 +311,7 @@ def test_a_restarted_program_goes_on_where_it_stopped(cut, ending, autopilot):
 
 @pytest.mark.parametrize("log", ["copter_cam_rtl_1x", "swarm_v1", "swarm_v2", "swarm_v3"])
 def test_recorded_flights_complete_exactly_once(real_data, log):
-    detector = CompletionDetector(AP)
+    detector = CompletionDetector(autopilot=AP)
     events, end = [], None
     packets = list(read_tlog(real_data("sitl_logs") / f"{log}.tlog"))
     for time_s, packet in packets:

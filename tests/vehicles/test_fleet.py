@@ -58,7 +58,7 @@ def kinds(events):
 
 
 def test_streams_run_at_the_rates_asked_for_on_both_autopilots(make_world):
-    world = make_world(SimVehicle(1, AP), SimVehicle(2, PX4))
+    world = make_world(SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=PX4))
     world.meet()
     counts = {}
     world.fleet.subscribe(
@@ -74,7 +74,7 @@ def test_streams_run_at_the_rates_asked_for_on_both_autopilots(make_world):
 
 
 def test_streams_that_stop_are_asked_for_again(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     world.vehicles[1]._stream(33, 0.0)  # another ground station switched it off
     world.wait(3.5)
@@ -85,7 +85,9 @@ def test_streams_that_stop_are_asked_for_again(make_world):
 
 def test_streams_are_asked_for_through_heavy_loss(make_world):
     for seed in range(4):
-        world = make_world(SimVehicle(1, AP), up=Faults(loss=0.5, seed=seed), down=Faults(loss=0.5, seed=seed + 9))
+        world = make_world(
+            SimVehicle(system=1, autopilot=AP), up=Faults(loss=0.5, seed=seed), down=Faults(loss=0.5, seed=seed + 9)
+        )
         world.wait(30.0)
         vehicle = world.fleet.vehicles[1]
         received = vehicle.received
@@ -95,7 +97,9 @@ def test_streams_are_asked_for_through_heavy_loss(make_world):
 
 
 def test_a_silent_vehicle_is_lost_and_found_again(make_world):
-    world = make_world(SimVehicle(1, AP), down=Faults(silent=((10.0, 20.0),)), up=Faults(silent=((10.0, 20.0),)))
+    world = make_world(
+        SimVehicle(system=1, autopilot=AP), down=Faults(silent=((10.0, 20.0),)), up=Faults(silent=((10.0, 20.0),))
+    )
     world.wait(8.0)
     assert kinds(world.events) == ["found"]
     world.wait(9.0)
@@ -109,7 +113,7 @@ def test_a_silent_vehicle_is_lost_and_found_again(make_world):
 
 @BOTH
 def test_a_restart_is_noticed_and_streams_run_again(make_world, autopilot):
-    world = make_world(SimVehicle(1, autopilot))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     world.wait(20.0)
     world.vehicles[1].reboot(world.clock.now, 2.0)
@@ -123,7 +127,7 @@ def test_a_restart_is_noticed_and_streams_run_again(make_world, autopilot):
 @BOTH
 def test_an_upload_survives_a_restart_in_its_middle(make_world, autopilot):
     delay = Faults(delay_s=(0.05, 0.06))
-    world = make_world(SimVehicle(1, autopilot), up=delay, down=delay)
+    world = make_world(SimVehicle(system=1, autopilot=autopilot), up=delay, down=delay)
     world.meet()
     world.wait(20.0)
     loaded = mission(autopilot, END)
@@ -138,7 +142,7 @@ def test_an_upload_survives_a_restart_in_its_middle(make_world, autopilot):
 def test_a_whole_flight_over_a_link_that_loses_thirty_percent(make_world, autopilot):
     for seed in range(3):
         bad = [Faults(loss=0.3, duplicate=0.1, delay_s=(0.0, 0.2), seed=seed + k) for k in (0, 50)]
-        world = make_world(SimVehicle(1, autopilot), up=bad[0], down=bad[1])
+        world = make_world(SimVehicle(system=1, autopilot=autopilot), up=bad[0], down=bad[1])
         world.until(lambda w=world: 1 in w.fleet.vehicles, 30.0)
         world.wait(5.0)
         assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
@@ -150,7 +154,7 @@ def test_a_whole_flight_over_a_link_that_loses_thirty_percent(make_world, autopi
 
 
 def test_nothing_that_moves_a_vehicle_is_sent_unasked(make_world):
-    world = make_world(SimVehicle(1, AP), SimVehicle(2, PX4))
+    world = make_world(SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=PX4))
     sent = sent_by(world)
     world.meet()
     world.wait(30.0)
@@ -168,7 +172,7 @@ def test_nothing_that_moves_a_vehicle_is_sent_unasked(make_world):
 
 
 def test_commands_go_to_one_vehicle_only(make_world):
-    world = make_world(*[SimVehicle(system, AP) for system in (1, 2, 3)])
+    world = make_world(*[SimVehicle(system=system, autopilot=AP) for system in (1, 2, 3)])
     world.meet()
     sent = sent_by(world)
     world.finish(world.fleet.rtl(2))
@@ -178,7 +182,7 @@ def test_commands_go_to_one_vehicle_only(make_world):
 
 
 def test_what_cannot_be_done_is_said(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     fleet = world.fleet
     with pytest.raises(OrthoSwarmError, match="not on the links \\(heard: 1\\)"):
@@ -199,7 +203,7 @@ def test_what_cannot_be_done_is_said(make_world):
 
 
 def test_rtl_goes_before_a_start_under_way(make_world):
-    world = make_world(SimVehicle(1, AP, ready_s=1e9))
+    world = make_world(SimVehicle(system=1, autopilot=AP, ready_s=1e9))
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, END)))
     start = world.fleet.start(1)
@@ -213,7 +217,9 @@ def test_rtl_goes_before_a_start_under_way(make_world):
 
 def test_the_swarm_flies_and_each_vehicle_completes_once(make_world):
     autopilots = [AP, PX4] * 4
-    world = make_world(*[SimVehicle(number + 1, autopilot) for number, autopilot in enumerate(autopilots)])
+    world = make_world(
+        *[SimVehicle(system=number + 1, autopilot=autopilot) for number, autopilot in enumerate(autopilots)]
+    )
     world.meet()
     fleet = world.fleet
     uploads = [fleet.upload(s, mission(v.autopilot, END, legs=1)) for s, v in fleet.vehicles.items()]
@@ -226,8 +232,8 @@ def test_the_swarm_flies_and_each_vehicle_completes_once(make_world):
 
 
 def test_two_vehicles_with_one_system_id_are_named_and_not_started(make_world):
-    late = SimVehicle(1, AP)
-    world = make_world(SimVehicle(1, AP), late)
+    late = SimVehicle(system=1, autopilot=AP)
+    world = make_world(SimVehicle(system=1, autopilot=AP), late)
     world.wait(20.0)
     late.reboot(world.clock.now, 1.0)  # now their clocks differ, as those of two vehicles do
     world.wait(10.0)
@@ -262,7 +268,7 @@ def test_a_restart_that_comes_back_on_another_connection_is_noticed():
 
 
 def test_an_unsigned_world_is_not_believed(make_world):
-    world = make_world(SimVehicle(1, AP), key=bytes(32))
+    world = make_world(SimVehicle(system=1, autopilot=AP), key=bytes(32))
     world.wait(10.0)
     assert not world.fleet.vehicles and world.fleet.hub.rejected >= 9
 
@@ -270,7 +276,7 @@ def test_an_unsigned_world_is_not_believed(make_world):
 @pytest.mark.parametrize("gone_s", [5.0, 120.0])
 @BOTH
 def test_a_restarted_station_misses_and_doubles_no_completion(make_world, autopilot, gone_s):
-    world = make_world(SimVehicle(1, autopilot))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     world.finish(world.fleet.upload(1, mission(autopilot, END)))
     world.finish(world.fleet.start(1))
@@ -293,7 +299,7 @@ def test_a_restarted_station_misses_and_doubles_no_completion(make_world, autopi
 
 def test_no_message_of_any_content_breaks_the_fleet(make_world):
     """Links are open to everybody: each message of the dialect with random content, under a vehicle's name."""
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     random = Random(4)
     upload = world.fleet.upload(1, mission(AP, END))
@@ -311,7 +317,7 @@ def test_no_message_of_any_content_breaks_the_fleet(make_world):
 
 
 def test_a_ground_station_beside_us_is_no_vehicle(make_world):
-    world = make_world(SimVehicle(1, AP), own=Address(250, 190))
+    world = make_world(SimVehicle(system=1, autopilot=AP), own=Address(250, 190))
     world.meet()
     other = dialect.MAVLink(None, 255, 190)
     raw = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(other)
@@ -321,7 +327,7 @@ def test_a_ground_station_beside_us_is_no_vehicle(make_world):
 
 
 def test_pictures_are_counted_once_though_reported_twice(make_world):
-    world = make_world(SimVehicle(1, AP), down=Faults(duplicate=1.0, seed=1))
+    world = make_world(SimVehicle(system=1, autopilot=AP), down=Faults(duplicate=1.0, seed=1))
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, END, legs=1)))
     world.finish(world.fleet.start(1))
@@ -331,7 +337,7 @@ def test_pictures_are_counted_once_though_reported_twice(make_world):
 
 
 def test_a_long_text_is_said_as_one(make_world):
-    world = make_world(SimVehicle(1, PX4))
+    world = make_world(SimVehicle(system=1, autopilot=PX4))
     world.meet()
     long = "RTL: start return at 575 m (75 m above destination)"
     exact = "x" * 100
@@ -343,7 +349,7 @@ def test_a_long_text_is_said_as_one(make_world):
 
 
 def test_a_long_text_whose_end_is_lost_is_said_as_far_as_it_is_known(make_world):
-    world = make_world(SimVehicle(1, PX4))
+    world = make_world(SimVehicle(system=1, autopilot=PX4))
     world.meet()
     packer = dialect.MAVLink(None, 1, 1)
     for text, number, part in (("a" * 50, 7, 0), ("next", 0, 0)):

@@ -253,7 +253,7 @@ def test_the_mosaic_lies_right_on_the_real_maps_picture():
     rgba[..., 0] = 200
     rgba[256:320, 128:192] = (0, 0, 250, 255)  # a mark
     rgba[:128] = 0  # nothing there
-    sent = Mosaic(rgba, _lat(y, n), _lon(x, n), _lat(y + 2, n), _lon(x + 3, n), 7)
+    sent = Mosaic(rgba, north=_lat(y, n), west=_lon(x, n), south=_lat(y + 2, n), east=_lon(x + 3, n), version=7)
     mosaic = pickle.loads(pickle.dumps(sent))  # as it travels to the map's process
     assert isinstance(mosaic, SlipObject)
     assert mosaic.layer < "1"
@@ -286,7 +286,7 @@ def test_a_mosaic_off_the_view_or_tiny_draws_nothing_wrong(lat, ground_width):
     from gcs_plugin.mavproxy.map_overlay import Mosaic
 
     tiles = mp_tile.MPTile(download=False)
-    mosaic = Mosaic(np.full((256, 256, 4), 255, np.uint8), 48.01, 11.0, 48.0, 11.015, 1)
+    mosaic = Mosaic(np.full((256, 256, 4), 255, np.uint8), north=48.01, west=11.0, south=48.0, east=11.015, version=1)
     image = np.zeros((300, 400, 3), np.uint8)
     mosaic.draw(image, lambda p: tiles.coord_to_pixel(lat, 10.0, 400, ground_width, *p), None)
     assert (image > 0).sum() < 100

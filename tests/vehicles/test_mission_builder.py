@@ -32,15 +32,38 @@ BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 
 def make_plan(end="rtl"):
     points = (
-        Waypoint(47.398, 8.5456, 60.0, True),
-        Waypoint(47.400, 8.5456, 60.0, False),
-        Waypoint(47.400, 8.5460, 60.0, True),
-        Waypoint(47.398, 8.5460, 60.0, False),
-        Waypoint(47.3977, 8.5456, 65.0),
+        Waypoint(lat_deg=47.398, lon_deg=8.5456, height_m=60.0, camera=True),
+        Waypoint(lat_deg=47.400, lon_deg=8.5456, height_m=60.0, camera=False),
+        Waypoint(lat_deg=47.400, lon_deg=8.5460, height_m=60.0, camera=True),
+        Waypoint(lat_deg=47.398, lon_deg=8.5460, height_m=60.0, camera=False),
+        Waypoint(lat_deg=47.3977, lon_deg=8.5456, height_m=65.0),
     )
-    sortie = Sortie(47.3977, 8.5456, 65.0, points, 0.0, 100.0, 600.0, 3, 40)
+    sortie = Sortie(
+        home_lat_deg=47.3977,
+        home_lon_deg=8.5456,
+        takeoff_height_m=65.0,
+        waypoints=points,
+        start_s=0.0,
+        time_s=100.0,
+        length_m=600.0,
+        turns=3,
+        photos=40,
+    )
     return Plan(
-        "columns", (VehiclePlan(1, (sortie,)),), 60.0, 8.0, 12.5, 30.0, (60.0, 45.0), end, 32632, 1e4, 1.0, (), "", ()
+        method="columns",
+        vehicles=(VehiclePlan(1, (sortie,)),),
+        altitude_m=60.0,
+        speed_m_s=8.0,
+        trigger_m=12.5,
+        spacing_m=30.0,
+        footprint_m=(60.0, 45.0),
+        end=end,
+        epsg=32632,
+        area_m2=1e4,
+        covered_share=1.0,
+        gaps=(),
+        separation="",
+        warnings=(),
     )
 
 
@@ -87,10 +110,18 @@ def test_endings_are_known(autopilot, end, ending):
 
 
 def test_the_last_nav_item_decides_the_ending():
-    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(LAND), MissionItem(TRIGGER_DISTANCE))).ending is Ending.LAND
-    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(LOITER_UNLIM))).ending is Ending.NEVER
-    assert Mission(AP, (MissionItem(WAYPOINT),)).final_seq is None
-    assert Mission(PX4, (MissionItem(TAKEOFF), MissionItem(WAYPOINT), MissionItem(206))).final_seq == 1
+    assert (
+        Mission(
+            PX4, (MissionItem(command=TAKEOFF), MissionItem(command=LAND), MissionItem(command=TRIGGER_DISTANCE))
+        ).ending
+        is Ending.LAND
+    )
+    assert Mission(PX4, (MissionItem(command=TAKEOFF), MissionItem(command=LOITER_UNLIM))).ending is Ending.NEVER
+    assert Mission(AP, (MissionItem(command=WAYPOINT),)).final_seq is None
+    assert (
+        Mission(PX4, (MissionItem(command=TAKEOFF), MissionItem(command=WAYPOINT), MissionItem(command=206))).final_seq
+        == 1
+    )
 
 
 @pytest.mark.parametrize("suffix", [".plan", ".waypoints"])
@@ -115,7 +146,7 @@ def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, wri
 def test_a_vehicle_stores_what_is_built(autopilot):
     plan = make_plan()
     mission = sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
-    store = MissionStore(autopilot, MissionItem(WAYPOINT))
+    store = MissionStore(autopilot=autopilot, home=MissionItem(command=WAYPOINT))
     assert all(store._check(item, len(mission)) == 0 for item in mission.items)
 
 
@@ -124,12 +155,14 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_sent(tmp_path):
     with pytest.raises(InputError, match="no items"):
         build_mission(PX4, [], name="empty.plan")
     with pytest.raises(InputError, match="not a place"):
-        build_mission(PX4, [item(WAYPOINT, 3, lat_deg=95.0, lon_deg=8.0, alt_m=20.0)])
+        build_mission(PX4, [item(command=WAYPOINT, frame=3, lat_deg=95.0, lon_deg=8.0, alt_m=20.0)])
     with pytest.raises(InputError, match="height"):
-        build_mission(AP, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=2e6)])
+        build_mission(AP, [item(command=WAYPOINT, frame=3, lat_deg=45.0, lon_deg=8.0, alt_m=2e6)])
     with pytest.raises(InputError, match="650"):
-        build_mission(AP, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)
-    assert len(build_mission(PX4, [item(WAYPOINT, 3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)) == 700
+        build_mission(AP, [item(command=WAYPOINT, frame=3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)
+    assert (
+        len(build_mission(PX4, [item(command=WAYPOINT, frame=3, lat_deg=45.0, lon_deg=8.0, alt_m=20.0)] * 700)) == 700
+    )
     with pytest.raises(InputError, match="cannot be read"):
         read_mission(tmp_path / "absent.plan", AP)
     junk = tmp_path / "junk.plan"
@@ -151,7 +184,7 @@ finite = st.floats(-1e4, 1e4, width=32)
 )
 @settings(max_examples=150, deadline=None)
 def test_an_item_survives_the_wire(command, frame, params, x, y, z):
-    item = MissionItem(command, frame, params, x, y, z)
+    item = MissionItem(command=command, frame=frame, params=params, x=x, y=y, z=z)
     raw = item.message(5, 1, 1).pack(dialect.MAVLink(None, 255, 190))
     (packet,) = Framer().feed(raw)
     assert packet.message.seq == 5

@@ -58,7 +58,7 @@ def line(autopilot, east, length, *, home_east=0.0, height=30.0, north=0.0):
 
 @BOTH
 def test_a_vehicle_that_becomes_ready_turns_green_item_by_item(make_world, autopilot):
-    world = make_world(SimVehicle(1, autopilot, ready_s=40.0))
+    world = make_world(SimVehicle(system=1, autopilot=autopilot, ready_s=40.0))
     world.wait(8.0)
     state, why = levels(world)
     assert tuple(state) == ITEMS
@@ -75,7 +75,7 @@ def test_a_vehicle_that_becomes_ready_turns_green_item_by_item(make_world, autop
 
 
 def test_each_item_turns_red_for_its_own_reason(make_world):
-    world = make_world(SimVehicle(1, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     held = mission(AP, MissionItem.do(RTL))
     world.finish(world.fleet.upload(1, held))
@@ -108,7 +108,7 @@ def test_each_item_turns_red_for_its_own_reason(make_world):
 
 
 def test_missions_that_cross_without_a_plan_are_red(make_world):
-    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP))
+    world = make_world(SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP))
     world.wait(8.0)
     missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0)}
     checks = preflight_all(dict(world.fleet.vehicles), {}, missions, {}, world.clock.now)
@@ -244,7 +244,9 @@ def test_the_list_fits_a_terminal_of_80_columns(folder, capsys, monkeypatch):  #
 
 
 def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
-    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP, home=(*CHART.to_degrees(0, 80.0), 488.0)))
+    world = make_world(
+        SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP, home=(*CHART.to_degrees(0, 80.0), 488.0))
+    )
     world.meet()
     fleet_ = world.fleet
     for system, home_east in ((1, 0.0), (2, 80.0)):
@@ -259,7 +261,9 @@ def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
 
 
 def test_neighbours_that_take_off_side_by_side_raise_no_alarm(make_world):
-    world = make_world(SimVehicle(1, AP), SimVehicle(2, AP, home=(*CHART.to_degrees(0, 5.0), 488.0)))
+    world = make_world(
+        SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP, home=(*CHART.to_degrees(0, 5.0), 488.0))
+    )
     world.meet()
     for system, north in ((1, 30.0), (2, -90.0)):
         world.finish(world.fleet.upload(system, line(AP, 5.0 * system, 60, home_east=5.0 * (system - 1), north=north)))

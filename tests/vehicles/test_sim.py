@@ -58,7 +58,7 @@ def listen(world, name):
 
 def at(command, north, east, height=20.0, autopilot=AP):
     yaw = 0.0 if autopilot is AP else math.nan
-    return MissionItem.at(command, *CHART.to_degrees(north, east), height, (0.0, 0.0, 0.0, yaw))
+    return MissionItem.at(command, *CHART.to_degrees(north, east), height, params=(0.0, 0.0, 0.0, yaw))
 
 
 def mission(autopilot, *last, legs=2, length=60.0):
@@ -73,7 +73,7 @@ def mission(autopilot, *last, legs=2, length=60.0):
 
 def airborne(autopilot, *last, **options):
     """A world in which one vehicle has taken off with a mission."""
-    world = make_world([SimVehicle(1, autopilot)])
+    world = make_world([SimVehicle(system=1, autopilot=autopilot)])
     world.meet()
     loaded = mission(autopilot, *last, **options)
     assert world.finish(world.fleet.upload(1, loaded))[0].ok
@@ -167,10 +167,12 @@ def test_arducopter_pauses_by_braking_where_it_cannot_pause():
 
 def test_a_list_without_home_loses_arducopters_takeoff():
     """Acknowledged, but MISSION_START would fail: `start` says so before it arms."""
-    world = make_world([SimVehicle(1, AP)])
+    world = make_world([SimVehicle(system=1, autopilot=AP)])
     world.meet()
     px4_style = Mission(AP, mission(PX4, *ENDINGS["rtl"]).items)
-    nan_free = tuple(MissionItem(i.command, i.frame, (0, 0, 0, 0), i.x, i.y, i.z) for i in px4_style.items)
+    nan_free = tuple(
+        MissionItem(command=i.command, frame=i.frame, params=(0, 0, 0, 0), x=i.x, y=i.y, z=i.z) for i in px4_style.items
+    )
     assert world.finish(world.fleet.upload(1, Mission(AP, nan_free)))[0].ok
     world.fleet.vehicles[1].mission = None  # another program uploaded it
     (outcome,) = world.finish(world.fleet.start(1))
@@ -179,7 +181,7 @@ def test_a_list_without_home_loses_arducopters_takeoff():
 
 
 def test_a_home_first_list_is_refused_by_px4_at_the_start():
-    world = make_world([SimVehicle(1, PX4)])
+    world = make_world([SimVehicle(system=1, autopilot=PX4)])
     world.meet()
     assert world.finish(world.fleet.upload(1, Mission(PX4, mission(AP, *ENDINGS["rtl"]).items)))[0].ok
     (outcome,) = world.finish(world.fleet.start(1))
@@ -187,14 +189,14 @@ def test_a_home_first_list_is_refused_by_px4_at_the_start():
 
 
 def test_a_vehicle_that_is_not_ready_refuses_to_arm_and_says_why():
-    world = make_world([SimVehicle(1, AP, ready_s=20.0)])
+    world = make_world([SimVehicle(system=1, autopilot=AP, ready_s=20.0)])
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, *ENDINGS["rtl"])))
     (outcome,) = world.finish(world.fleet.start(1))
     assert not outcome.ok and "Arm: Need Position Estimate" in outcome.text
     world.wait(20.0)
     assert world.finish(world.fleet.start(1))[0].ok
-    never = make_world([SimVehicle(1, PX4, ready_s=1e9)])
+    never = make_world([SimVehicle(system=1, autopilot=PX4, ready_s=1e9)])
     never.meet()
     never.finish(never.fleet.upload(1, mission(PX4, *ENDINGS["rtl"])))
     (outcome,) = never.finish(never.fleet.start(1))
@@ -213,7 +215,7 @@ def test_a_jump_is_flown_as_often_as_it_says():
 def test_arducopter_is_silent_until_asked_and_px4_is_not():
     said = {}
     for autopilot in (AP, PX4):
-        vehicle = SimVehicle(1, autopilot)
+        vehicle = SimVehicle(system=1, autopilot=autopilot)
         vehicle.handle(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), GROUND_STATION, 0.0)
         said[autopilot] = [m.get_type() for t in range(100) for m in vehicle.advance(0.02 * t)]
     assert set(said[AP]) == {"HEARTBEAT"}
@@ -256,7 +258,7 @@ def _place(sim, time_s):
 
 
 def test_a_wandering_receiver_moves_the_aircraft_not_the_record():
-    sim = SimVehicle(1, PX4, airframe=Airframe(gps_sigma_m=1.5, gps_tau_s=30.0), seed=3)
+    sim = SimVehicle(system=1, autopilot=PX4, airframe=Airframe(gps_sigma_m=1.5, gps_tau_s=30.0), seed=3)
     world = make_world([sim])
     world.meet()
     world.finish(world.fleet.upload(1, mission(PX4, *ENDINGS["rtl"], legs=2, length=200.0)))
@@ -272,7 +274,7 @@ def test_a_wandering_receiver_moves_the_aircraft_not_the_record():
 def test_the_same_seed_gives_the_same_flight():
     flights = []
     for _ in range(2):
-        sim = SimVehicle(1, AP, airframe=Airframe(gps_sigma_m=1.0), seed=5)
+        sim = SimVehicle(system=1, autopilot=AP, airframe=Airframe(gps_sigma_m=1.0), seed=5)
         world = make_world([sim], Faults(loss=0.2, seed=1), Faults(loss=0.2, seed=2))
         world.meet()
         world.finish(world.fleet.upload(1, mission(AP, *ENDINGS["rtl"], legs=1)))
@@ -302,7 +304,7 @@ def test_pictures_are_reported_by_each_dialect_in_its_way():
 
 
 def test_a_second_station_is_denied_while_one_uploads():
-    vehicle = SimVehicle(1, AP)
+    vehicle = SimVehicle(system=1, autopilot=AP)
     count = dialect.MAVLink_mission_count_message(1, 1, 5, 0)
     assert vehicle.handle(count, GROUND_STATION, 0.0)[0].get_type() == "MISSION_REQUEST"
     assert vehicle.handle(count, Address(254, 190), 0.1)[0].type == dialect.MAV_MISSION_DENIED
@@ -312,7 +314,7 @@ def test_a_second_station_is_denied_while_one_uploads():
 
 
 def test_arducopter_stands_in_brake_when_disarmed_and_does_not_arm_there():
-    world = make_world([SimVehicle(1, AP)])
+    world = make_world([SimVehicle(system=1, autopilot=AP)])
     world.meet()
     texts = listen(world, "STATUSTEXT")
     pilot = world.fleet.vehicles[1].pilot
@@ -327,7 +329,7 @@ def test_arducopter_stands_in_brake_when_disarmed_and_does_not_arm_there():
 
 @pytest.mark.parametrize("wipes", [True, False])
 def test_a_mission_may_be_lost_with_a_reboot(wipes):
-    world = make_world([SimVehicle(1, AP, wipes=wipes)])
+    world = make_world([SimVehicle(system=1, autopilot=AP, wipes=wipes)])
     world.meet()
     assert world.finish(world.fleet.upload(1, mission(AP, MissionItem.do(RTL))))[0].ok
     world.wait(20.0)
@@ -339,7 +341,7 @@ def test_a_mission_may_be_lost_with_a_reboot(wipes):
 
 
 def test_px4_refuses_a_start_right_after_an_upload_and_is_asked_again():
-    world = make_world([SimVehicle(1, PX4)])
+    world = make_world([SimVehicle(system=1, autopilot=PX4)])
     world.meet()
     acks = listen(world, "COMMAND_ACK")
     assert world.finish(world.fleet.upload(1, mission(PX4, MissionItem.do(RTL))))[0].ok
@@ -351,7 +353,7 @@ def test_px4_refuses_a_start_right_after_an_upload_and_is_asked_again():
 
 @BOTH
 def test_streams_that_starve_cost_no_heartbeat_and_no_completion(autopilot):
-    world = make_world([SimVehicle(1, autopilot, tx_bytes_s=250.0)])
+    world = make_world([SimVehicle(system=1, autopilot=autopilot, tx_bytes_s=250.0)])
     world.meet()
     positions, beats = listen(world, "GLOBAL_POSITION_INT"), listen(world, "HEARTBEAT")
     asked = []
@@ -370,7 +372,7 @@ def test_streams_that_starve_cost_no_heartbeat_and_no_completion(autopilot):
 @BOTH
 def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(autopilot):
     faults = [Faults(loss=0.05, delay_s=(0.02, 0.08), bytes_s=5760.0, seed=seed) for seed in (1, 2)]
-    world = make_world([SimVehicle(1, autopilot)], *faults)
+    world = make_world([SimVehicle(system=1, autopilot=autopilot)], *faults)
     world.meet()
     positions = listen(world, "GLOBAL_POSITION_INT")
     assert world.finish(world.fleet.upload(1, mission(autopilot, MissionItem.do(RTL))))[0].ok
@@ -383,7 +385,7 @@ def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(au
 
 
 def test_a_radio_carries_no_more_than_its_rate():
-    radio = Channel(Faults(bytes_s=1000.0))
+    radio = Channel(faults=Faults(bytes_s=1000.0))
     for _ in range(30):
         radio.put("packet", 0.0, 100)  # three seconds' worth at once: what would wait longer than one is lost
     assert len(radio.take(0.55)) == 5 and radio.lost == 19

@@ -38,14 +38,14 @@ def make_mission(autopilot, legs=3, height=60.0):
     yaw = 0.0 if autopilot is AP else nan
     items = [HOME] if autopilot is AP else []
     items += [
-        MissionItem.at(TAKEOFF, 47.3977, 8.5456, height, (0.0, 0.0, 0.0, yaw)),
+        MissionItem.at(TAKEOFF, 47.3977, 8.5456, height, params=(0.0, 0.0, 0.0, yaw)),
         MissionItem.do(CHANGE_SPEED, 1, 8),
     ]
     for leg in range(legs):
         lon = 8.5456 + 1e-4 * leg
-        items.append(MissionItem.at(WAYPOINT, 47.398, lon, height, (0.0, 0.0, 0.0, yaw)))
+        items.append(MissionItem.at(WAYPOINT, 47.398, lon, height, params=(0.0, 0.0, 0.0, yaw)))
         items.append(MissionItem.do(TRIGGER_DISTANCE, 12.5, 0, 1))
-        items.append(MissionItem.at(WAYPOINT, 47.399, lon, height, (0.0, 0.0, 0.0, yaw)))
+        items.append(MissionItem.at(WAYPOINT, 47.399, lon, height, params=(0.0, 0.0, 0.0, yaw)))
         items.append(MissionItem.do(TRIGGER_DISTANCE, 0.0))
     return Mission(autopilot, (*items, MissionItem.do(RTL)))
 
@@ -55,8 +55,8 @@ class Rig:
 
     def __init__(self, autopilot, up=None, down=None, pace=1.0):
         self.pace = pace  # seconds of the vehicle's clock in one of the station's
-        self.store = MissionStore(autopilot, HOME, [HOME] if autopilot is AP else [])
-        self.up, self.down = Channel(up or Faults()), Channel(down or Faults())
+        self.store = MissionStore(autopilot=autopilot, home=HOME, items=[HOME] if autopilot is AP else [])
+        self.up, self.down = Channel(faults=up or Faults()), Channel(faults=down or Faults())
         self.now = 100.0
         self.stations = {}
         self.reboots = []
@@ -298,7 +298,7 @@ def test_a_mixed_store_is_never_a_success():
     rig, old, new = Rig(AP), make_mission(AP, height=30.0), make_mission(AP, height=60.0)
     (outcome,) = rig.run(upload(rig, old))
     assert outcome.ok
-    rig.store = Forgetful(AP, HOME, list(rig.store.items))
+    rig.store = Forgetful(autopilot=AP, home=HOME, items=list(rig.store.items))
     (outcome,) = rig.run(upload(rig, new))
     assert not outcome.ok
     assert rig.acks.count(0) > 1
@@ -311,7 +311,7 @@ def test_an_acknowledged_upload_that_cannot_be_read_back_is_no_success():
     uploading = upload(rig, mission, patience_s=5.0)
     while not rig.acks:
         rig.step()
-    rig.down = Channel(Faults(loss=1.0))
+    rig.down = Channel(faults=Faults(loss=1.0))
     (outcome,) = rig.run(uploading)
     assert not outcome.ok
     assert outcome.verdict is Verdict.UNKNOWN
@@ -325,7 +325,7 @@ def test_a_mission_that_cannot_be_read_back_is_cleared(autopilot):
     uploading = upload(rig, mission, patience_s=5.0)
     while not rig.acks:
         rig.step()
-    rig.down = Channel(Faults(silent=((0.0, rig.now + 8.0),)))
+    rig.down = Channel(faults=Faults(silent=((0.0, rig.now + 8.0),)))
     (outcome,) = rig.run(uploading)
     assert outcome.verdict is Verdict.UNKNOWN and "was cleared" in outcome.text
     assert len(rig.store.items) == mission.first_seq
@@ -357,7 +357,7 @@ def test_the_last_item_sent_twice_is_an_error_and_yet_a_success():
     while not rig.acks:
         rig.step()
     last = len(mission) - 1
-    rig.down = Channel(Faults())  # the acknowledgement is lost
+    rig.down = Channel(faults=Faults())  # the acknowledgement is lost
     rig.answer([dialect.MAVLink_mission_ack_message(255, 190, 1, 0)])
     (outcome,) = rig.run(uploading)
     assert outcome.ok and holds(rig, mission)

@@ -51,7 +51,7 @@ def open_links(tmp_path):
         swarm = SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=speed, key=key)
         swarm.__enter__()
         opened.append(swarm)
-        settings = Settings(tmp_path, links=tuple(swarm.addresses), vehicles=named)
+        settings = Settings(workspace=tmp_path, links=tuple(swarm.addresses), vehicles=named)
         journal = Journal(tmp_path / "journal.sqlite")
         links = VehicleLinks(settings, journal, Events(), NoJobs())
         links.start()

@@ -17,7 +17,7 @@ _IDLE_S: Final = 60.0
 _MISSION_OVER: Final = ("complete", "aborted")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FlownLegs:
     """Tracks vehicles along the legs of a plan.
 

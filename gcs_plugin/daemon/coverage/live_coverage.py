@@ -48,7 +48,7 @@ _FACT: Final = "coverage"
 _log = logging.getLogger(__name__)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Followed:
     """The area being covered.
 
@@ -106,6 +106,7 @@ class LiveCoverage:
         self,
         journal: Journal,
         events: Events,
+        *,
         views: PictureViews,
         source: Callable[[], AreaSource | None],
         epsg: Callable[[], int | None],
@@ -226,8 +227,11 @@ class LiveCoverage:
             _log.warning("no coverage: %s", error)
             return None
         flight = covered.flight
-        legs = FlownLegs(covered.legs, *((0.0, 0.0) if flight is None else (0.25 * flight.width_m, flight.height_m)))
-        here = _Followed(source, covered, legs, CoverageGrid(cells), CoverageGrid(cells))
+        reach_m, ahead_m = (0.0, 0.0) if flight is None else (0.25 * flight.width_m, flight.height_m)
+        legs = FlownLegs(legs=covered.legs, reach_m=reach_m, ahead_m=ahead_m)
+        here = _Followed(
+            source=source, covered=covered, legs=legs, cover=CoverageGrid(cells), recorded=CoverageGrid(cells)
+        )
         stored = self._journal.fact(_FACT) or {}
         if stored.get("plan") == covered.plan and covered.plan is not None:
             here.legs.resume(stored)

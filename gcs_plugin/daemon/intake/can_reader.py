@@ -58,6 +58,7 @@ class CanReader:
         self,
         vehicle: str,
         bus: str,
+        *,
         poses: LivePoses,
         tell: Callable[[str], None],
         fleet: "Fleet | None",

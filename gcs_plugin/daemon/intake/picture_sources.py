@@ -46,7 +46,7 @@ class Source:
     """
 
     def __init__(
-        self, vehicle: str, where: str, take: Take, pose_at: PoseAt, tell: Callable[[str], None], cache: Path,
+        self, vehicle: str, where: str, *, take: Take, pose_at: PoseAt, tell: Callable[[str], None], cache: Path,
         link_log: LinkLog = lambda vehicle, out: False, settled: Callable[[str], None] = lambda vehicle: None,
     ) -> None:  # fmt: skip
         self.vehicle, self.where = vehicle, where

@@ -62,7 +62,7 @@ class _File:
     told: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PictureIntake:
     """The callbacks and folders that a folder's reader needs.
 

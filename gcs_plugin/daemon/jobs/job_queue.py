@@ -31,7 +31,7 @@ _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Job:
     """One job.
 
@@ -59,9 +59,19 @@ class Job:
         """The job of a journal's row."""
         vehicle = None if row["vehicle"] is None else unpacked(row["vehicle"])
         return cls(
-            row["id"], row["kind"], vehicle, row["sortie"], row["state"], row["progress"], row["message"],
-            row["created"], row["started"], row["ended"], row["attempts"], json.loads(row["detail"]),
-        )  # fmt: skip
+            id=row["id"],
+            kind=row["kind"],
+            vehicle=vehicle,
+            sortie=row["sortie"],
+            state=row["state"],
+            progress=row["progress"],
+            message=row["message"],
+            created=row["created"],
+            started=row["started"],
+            ended=row["ended"],
+            attempts=row["attempts"],
+            detail=json.loads(row["detail"]),
+        )
 
     def document(self) -> dict[str, Any]:
         """As JSON values."""

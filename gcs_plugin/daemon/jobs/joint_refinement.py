@@ -33,7 +33,7 @@ def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable
     return [new_job("together", vehicle, sortie, {}) for vehicle, sortie in again]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class JointRefinement:
     """Does the jobs `together`.
 
@@ -88,7 +88,14 @@ class JointRefinement:
             return _note(job, "it has no neighbours")
         tell(0.05, f"solving again beside {len(others)} neighbour{'s' * (len(others) > 1)}")
         area = self.publisher.area()
-        task = JointTask(self.publisher.solutions / row["path"], others, target, area.epsg, area.origin, self.basemap)
+        task = JointTask(
+            before=self.publisher.solutions / row["path"],
+            neighbours=others,
+            target=target,
+            epsg=area.epsg,
+            origin=area.origin,
+            basemap=self.basemap,
+        )
         found = self.workers.run(refine_jointly, task)
         if found is None:
             return _note(job, "nothing of it is to be solved again")
@@ -114,7 +121,7 @@ class JointRefinement:
             return refined_change(job, solved, rejected, target.name, before | detail_of(solved, solved.legs))
 
         job.detail["version_before"], job.detail["version"] = self.publisher.publish(
-            "fine", self.workers, (str(job.vehicle), job.sortie), target, solved.changed, change
+            "fine", self.workers, (str(job.vehicle), job.sortie), target=target, changed=solved.changed, change=change
         )
 
 

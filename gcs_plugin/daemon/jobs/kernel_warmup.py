@@ -42,7 +42,7 @@ def refine_something() -> None:
         terrain = second.terrain
         if terrain is None:
             return
-        grid = GroundGrid(_EPSG, _EAST - 200.0, _NORTH + 200.0, 0.5, 800, 800)
+        grid = GroundGrid(epsg=_EPSG, west=_EAST - 200.0, north=_NORTH + 200.0, gsd_m=0.5, width=800, height=800)
         with Canvas.create(place / "canvas", grid, plane="frame") as canvas:
             stats = render(second.placed, terrain, canvas)
             estimate_fields(second.placed, stats.thumbnails, terrain)

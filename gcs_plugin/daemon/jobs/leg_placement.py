@@ -37,7 +37,7 @@ _REACH_M: Final = 100.0
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LegPlacement:
     """Does the jobs `coarse`.
 
@@ -192,7 +192,7 @@ class LegPlacement:
             if self._aside or ("after" not in job.detail and self._is_refined(job)):
                 raise OrthoSwarmError("a refinement takes its place")
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(
-                "coarse", self.workers, (str(job.vehicle), job.sortie), target, changed, change
+                "coarse", self.workers, (str(job.vehicle), job.sortie), target=target, changed=changed, change=change
             )
         if old is not None:
             self.publisher.retire(self.publisher.solutions / old["path"])

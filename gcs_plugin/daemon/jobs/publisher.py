@@ -125,7 +125,9 @@ class Publisher:
                     continue  # refined, or drawn again, meanwhile
                 tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
                 whose = (unpacked(vehicle), sortie)
-                self.publish(layer, workers, whose, row[0], row[1], lambda rejected: lambda db: None)
+                self.publish(
+                    layer, workers, whose, target=row[0], changed=row[1], change=lambda rejected: lambda db: None
+                )
         return fact_change("lost", [])
 
     def sweep(self) -> None:
@@ -164,6 +166,7 @@ class Publisher:
         layer: str,
         workers: WorkerPool,
         sortie: tuple[str, int | None],
+        *,
         target: Path,
         changed: BoundingBox,
         change: Callable[[dict[str, str]], Change],
@@ -219,7 +222,14 @@ class Publisher:
         others = [path for key, (path, box) in self.shown(layer).items() if key != mine and box.overlaps(changed)]
         canvas = self.layers[layer].canvas
         old = None if canvas is None else canvas.path
-        return DrawTask(old, self.folder / name, self.area().grid, [*others, target], target, changed)
+        return DrawTask(
+            old=old,
+            new=self.folder / name,
+            grid=self.area().grid,
+            solutions=[*others, target],
+            changed=target,
+            bounds=changed,
+        )
 
     def _rows(self, table: str) -> list[Any]:
         return self.journal.rows(f"SELECT * FROM {table} ORDER BY vehicle, sortie")

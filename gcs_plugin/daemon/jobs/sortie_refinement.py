@@ -32,7 +32,7 @@ _AGAIN: Final = 10
 """With so many late pictures a vehicle is refined again; fewer are registered to its refined ones."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class SortieRefinement:
     """Does the jobs `refine`.
 
@@ -116,9 +116,15 @@ class SortieRefinement:
             if before is None and shown is not None:  # its old ground changes, too
                 changed = BoundingBox.around([changed, shown[1]])
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(
-                layer, self.workers, (vehicle, job.sortie), target, changed,
-                lambda rejected: self._publish(job, layer, target, solved, rejected, before),
-            )  # fmt: skip
+                layer,
+                self.workers,
+                (vehicle, job.sortie),
+                target=target,
+                changed=changed,
+                change=lambda rejected: self._publish(
+                    job, layer, target, solved=solved, rejected=rejected, before=before
+                ),
+            )
         job.detail["published_s"] = time.time()
         self.on_published(layer, job)
 
@@ -161,7 +167,7 @@ class SortieRefinement:
         return [self.publisher.solutions / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
 
     def _publish(
-        self, job: Job, layer: str, target: Path, solved: SortieResult, rejected: dict[str, str], before: Any
+        self, job: Job, layer: str, target: Path, *, solved: SortieResult, rejected: dict[str, str], before: Any
     ) -> Change:
         if before is None:
             count = len(solved.stages) - len(rejected)

@@ -34,7 +34,7 @@ from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SolveTask:
     """One vehicle's sortie, or the part that has arrived.
 
@@ -55,7 +55,7 @@ class SolveTask:
     before: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SortieResult:
     """The result of a task.
 
@@ -149,7 +149,7 @@ def without_strays(solution: Solution) -> Solution:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class JointTask:
     """A refined sortie, to be refined again together with neighbours.
 
@@ -283,7 +283,7 @@ def _leg(leg: Leg, frames: Sequence[Frame]) -> dict[str, Any]:
     return values
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DrawTask:
     """The next generation of a refined layer.
 

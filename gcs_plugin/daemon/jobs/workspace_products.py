@@ -28,7 +28,7 @@ FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm", *FORMS)
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ExportTask:
     """An export.
 
@@ -83,7 +83,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
-    report["against_map_m"] = write_page(out, report, placed, rejected, basemap, task.cells)
+    report["against_map_m"] = write_page(out, report, placed, rejected=rejected, basemap=basemap, cells=task.cells)
     write_json(out / "report.json", report)
     place_files.write_geojson(task.places, out / place_files.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
@@ -247,6 +247,7 @@ def facts_of(
     jobs: list[dict[str, Any]],
     completions: list[dict[str, Any]],
     wall_s: float,
+    *,
     cpu_s: float,
     others: Sequence[Usage],
     rss_mb: float,

@@ -327,7 +327,9 @@ def _warm_up(folder: Path) -> None:
     try:
         lens = Lens(32, 24, 30.0)
         camera = Camera(np.array([16.0, 16.0, 30.0]), rotation_from_angles(0.0, NADIR_PITCH_RAD, 0.0), lens)
-        with Canvas.create(path, GroundGrid(32631, 0.0, 64.0, 1.0, 64, 64), tile_px=64) as canvas:
+        with Canvas.create(
+            path, GroundGrid(epsg=32631, west=0.0, north=64.0, gsd_m=1.0, width=64, height=64), tile_px=64
+        ) as canvas:
             RealtimeMosaic(canvas).add(np.full((24, 32, 4), 255, np.uint8), camera)
         picture_quality(np.zeros((24, 32, 4), np.uint8))
     except OrthoSwarmError as error:  # a full disk is told when there is something to draw

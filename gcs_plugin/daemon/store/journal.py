@@ -230,6 +230,7 @@ def add_frame(
     key: bytes,
     vehicle: str,
     image: str,
+    *,
     time_s: float | None,
     path: str,
     size: tuple[int, int],

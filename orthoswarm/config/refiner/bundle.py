@@ -6,7 +6,7 @@ Robust scales `_c` are those of the Geman-McClure kernel e^2 / (1 + e^2 / c), e 
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BundleConfig:
     """Bundle adjustment: priors, robust weights, steps, covariance."""
 

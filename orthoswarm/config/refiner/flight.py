@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightConfig:
     """One vehicle's relative block: what is solved at once, its priors, and pictures that cannot be solved."""
 

@@ -6,7 +6,7 @@ Robust schedules are scales c (squared sigmas) of successive solutions, from far
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InitialConfig:
     """Start values without a map."""
 

@@ -6,7 +6,7 @@ Pixels are those of a picture that was reduced to the working width.
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LateConfig:
     """Pictures that come after their vehicle was refined."""
 

@@ -6,7 +6,7 @@ Scales named robust are those of the Geman-McClure kernel, squared, of normalise
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationConfig:
     """Registration onto the map and onto neighbours."""
 

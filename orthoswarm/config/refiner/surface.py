@@ -6,7 +6,7 @@ Lengths that scale with the flying height are stated for `reference_height_m` ab
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceConfig:
     """Terrain, dense ground points, height models, tall surfaces."""
 

@@ -31,7 +31,7 @@ _STEP_MM: Final = 30.0
 _INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Frame:
     """The map's frame on the page.
 
@@ -79,7 +79,7 @@ def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str
                 rgba = vrt.read().transpose(1, 2, 0)
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
-    page = _page(frame, rgba, epsg, cog.parent, places, title)
+    page = _page(frame, rgba, epsg, folder=cog.parent, places=places, title=title)
     with written_whole(path) as part:
         _save(page, frame, epsg, part, title)
 
@@ -111,14 +111,16 @@ def _frame(bounds: BoundingBox) -> _Frame:
         west = 0.5 * (bounds.west + bounds.east) - 0.5 * (box[2] - box[0]) * metres
         north = 0.5 * (bounds.north + bounds.south) + 0.5 * (box[3] - box[1]) * metres
         page = round(width_mm * _MM), round(height_mm * _MM)
-        frame = _Frame(page, (box[0], box[1], box[2], box[3]), scale, west, north, metres)
+        frame = _Frame(
+            page=page, box=(box[0], box[1], box[2], box[3]), scale=scale, west=west, north=north, metres=metres
+        )
         if best is None or frame.scale < best.scale:
             best = frame
     assert best is not None
     return best
 
 
-def _page(frame: _Frame, rgba: Any, epsg: int, folder: Path, places: Sequence[Place], title: str) -> Any:
+def _page(frame: _Frame, rgba: Any, epsg: int, *, folder: Path, places: Sequence[Place], title: str) -> Any:
     from PIL import Image, ImageDraw
 
     sheet = Image.new("RGB", frame.page, "white")
@@ -132,7 +134,7 @@ def _page(frame: _Frame, rgba: Any, epsg: int, folder: Path, places: Sequence[Pl
         east, north = (float(v) for v in grid.to_grid(place.lat_deg, place.lon_deg))
         _mark(draw, frame.pixel(east, north), place.name, frame)
     draw.rectangle(frame.box, outline=_INK, width=3)
-    _foot(draw, frame, grid, folder, len(finds), step, title)
+    _foot(draw, frame, grid, folder=folder, finds=len(finds), step=step, title=title)
     return sheet
 
 
@@ -170,7 +172,9 @@ def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) 
         )
 
 
-def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, folder: Path, finds: int, step: float, title: str) -> None:
+def _foot(
+    draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, folder: Path, finds: int, step: float, title: str
+) -> None:
     left, _, right, bottom = frame.box
     lat, lon = (float(v) for v in grid.to_geographic([frame.west, frame.north]))
     zone = utm_zone(grid.epsg)

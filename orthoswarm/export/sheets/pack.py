@@ -98,7 +98,7 @@ def _zip(database: sqlite3.Connection, folder: Path, path: Path, places: Sequenc
             names.append(name)
             archive.writestr(f"{top}/tiles/{name}.webp", data, zipfile.ZIP_STORED)
         page = _PAGE.read_text(encoding="utf-8").replace(
-            "/*PACK*/null", _script(_document(folder, about, names, files, places, title))
+            "/*PACK*/null", _script(_document(folder, about, names, files=files, places=places, title=title))
         )
         archive.writestr(f"{top}/index.html", page)
         for name in files:
@@ -113,7 +113,7 @@ def _tiles(database: sqlite3.Connection) -> Iterator[tuple[str, bytes]]:
 
 
 def _document(
-    folder: Path, about: dict[str, str], tiles: list[str], files: list[str], places: Sequence[Place], title: str
+    folder: Path, about: dict[str, str], tiles: list[str], *, files: list[str], places: Sequence[Place], title: str
 ) -> dict[str, Any]:
     first, last = picture_times(folder)
     stated = stated_accuracy(folder)

@@ -43,7 +43,7 @@ class Cells:
     texture: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
     """A square of cells on the ground.
 

@@ -48,7 +48,7 @@ def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
 
 
 def seam_labels(
-    store: TileStore, key: Key, shape: tuple[int, int], west: float, north: float, gsd_m: float,
+    store: TileStore, key: Key, shape: tuple[int, int], *, west: float, north: float, gsd_m: float,
     ids: Ints, shots: Shots, seams: SeamCells,
 ) -> Ints:  # fmt: skip
     """Labels of a tile's pixels (place in `ids` plus 1, 0 where no cell has a candidate), int32 of a shape.
@@ -66,7 +66,7 @@ def seam_labels(
     side_px = store.tile_px + 2 * border
     left, top = west - border * gsd_m, north + border * gsd_m
     lattice = heights(seams.terrain, left, top, gsd_m, side_px)
-    region = Region(left, top, gsd_m, cell, side_px // cell, lattice)
+    region = Region(west=left, north=top, gsd_m=gsd_m, cell_px=cell, side=side_px // cell, lattice=lattice)
     cells = cell_candidates(region, shots, seams.tone, read_previews(seams.previews, seams.rows))
     label = relax(cells, _settled(store, key, cell, ids), _standing(seams.terrain, region))
     to_pixels(label, cells.candidate, cell, border // cell, pixels)

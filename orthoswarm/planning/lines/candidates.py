@@ -38,7 +38,7 @@ class Candidate:
 
 
 def candidates(
-    field: Field, vehicles: int, foot: Footprint, method: Method, turn_m: float, router: Router, reach_m: float
+    field: Field, vehicles: int, foot: Footprint, *, method: Method, turn_m: float, router: Router, reach_m: float
 ) -> Iterator[Candidate]:
     """Ways to lay lines, the most promising directions first; none where the area is all within obstacles.
 
@@ -59,7 +59,7 @@ def candidates(
     for number, angle in enumerate(angles):
         if number >= (active().planning.tries_if_few if few else _TRIES[method]):
             return
-        legs = _lay(field, angle, foot, method, router, 1)
+        legs = _lay(field, angle, foot, method=method, router=router, multiple=1)
         if not len(legs):
             continue
         count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
@@ -68,13 +68,15 @@ def candidates(
         least = min(least, rough)
         if not few and rough > active().planning.hopeless * least:
             continue
-        yield from _finished(field, legs, count, angle, foot, method, router, reach_m)
+        yield from _finished(field, legs, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m)
         if len(legs) > active().planning.many_legs:  # directions hardly differ then, and each takes its time
             return
         if method != "tmstc" and vehicles <= len(legs) < 4 * vehicles:
-            denser = _lay(field, angle, foot, method, router, vehicles)
+            denser = _lay(field, angle, foot, method=method, router=router, multiple=vehicles)
             if len(legs) < len(denser) <= active().planning.denser * len(legs):
-                yield from _finished(field, denser, count, angle, foot, method, router, reach_m)
+                yield from _finished(
+                    field, denser, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m
+                )
 
 
 def _rough_cost(legs: Array, turn_m: float) -> float:
@@ -83,7 +85,7 @@ def _rough_cost(legs: Array, turn_m: float) -> float:
     return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + turn_m * len(legs))
 
 
-def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Router, multiple: int) -> Array:
+def _lay(field: Field, angle: float, foot: Footprint, *, method: Method, router: Router, multiple: int) -> Array:
     if method == "columns":
         return column_legs(field, angle, foot, multiple)
     if method == "bcd":
@@ -92,10 +94,18 @@ def _lay(field: Field, angle: float, foot: Footprint, method: Method, router: Ro
 
 
 def _finished(
-    field: Field, legs: Array, count: int, angle: float, foot: Footprint, method: Method, router: Router, reach_m: float
+    field: Field,
+    legs: Array,
+    count: int,
+    *,
+    angle: float,
+    foot: Footprint,
+    method: Method,
+    router: Router,
+    reach_m: float,
 ) -> Iterator[Candidate]:
     """The legs without gaps, in the method's own order, and in the order of a local search."""
-    mended = planned_coverage.mend(field, legs, foot, router, reach_m, angle)
+    mended = planned_coverage.mend(field, legs, foot, router=router, reach_m=reach_m, angle_rad=angle)
     yield Candidate(mended, count)
     if method != "columns":
         yield Candidate(shorten(mended, router), count)

@@ -60,7 +60,7 @@ def prune(field: Field, legs: Array, foot: Footprint) -> Array:
     return legs[keep] if keep.any() else legs
 
 
-def mend(field: Field, legs: Array, foot: Footprint, router: Router, reach_m: float, angle_rad: float) -> Array:
+def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m: float, angle_rad: float) -> Array:
     """Legs with more put in, each where it costs the least detour, until hardly anything is missed.
 
     Gaps arise beside obstacles with slanted walls, where a line must stop although its band's edge could go on.

@@ -43,7 +43,7 @@ def tmstc_legs(field: Field, angle_rad: float, foot: Footprint) -> list[Array]:
     cells = np.asarray(filled.reshape(filled.shape[0] // 2, 2, filled.shape[1] // 2, 2).any((1, 3)), bool)
     loops = circumnavigate(cells, spanning_edges(cells, *joins(cells)))
     both = (local, local.swapped())
-    found = [_loop_legs(loop, filled, both, (x0, y0), size, foot) for loop in loops]
+    found = [_loop_legs(loop, filled, both, origin=(x0, y0), size=size, foot=foot) for loop in loops]
     return [frame.to_grid(np.array(legs)) for legs in found if legs]
 
 
@@ -77,6 +77,7 @@ def _loop_legs(
     loop: Loop,
     filled: NDArray[np.bool_],
     fields: tuple[Field, Field],
+    *,
     origin: tuple[float, float],
     size: tuple[float, float],
     foot: Footprint,

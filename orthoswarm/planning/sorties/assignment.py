@@ -31,7 +31,7 @@ _LONGEST_WAIT_S = 3600.0
 _MOST_WIND = 0.8  # of the speed through the air
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Options:
     """Everything about the flights that has a good default.
 
@@ -134,7 +134,14 @@ class Crew:
     """
 
     def __init__(
-        self, vehicles: int, heights: FlightHeights, foot: Footprint, grid: LocalGrid, router: Router, options: Options
+        self,
+        vehicles: int,
+        heights: FlightHeights,
+        *,
+        foot: Footprint,
+        grid: LocalGrid,
+        router: Router,
+        options: Options,
     ) -> None:
         if not 1 <= vehicles <= MOST_VEHICLES:
             raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")
@@ -192,8 +199,10 @@ class Crew:
 
     def _shared(self, legs: Array, reorder: bool, motion: Motion) -> Work:
         options, router = self._options, self._router
-        row = cut(legs, router, motion, self.vehicles, self._least_leg_m)
-        pieces = share(row, self.vehicles, self.starts, self._returns, router, motion, self._limits)
+        row = cut(legs, router, motion, shares=self.vehicles, least_m=self._least_leg_m)
+        pieces = share(
+            row, self.vehicles, self.starts, returns=self._returns, router=router, motion=motion, limits=self._limits
+        )
         if pieces is None:
             raise self._too_short(row, self.starts, float(self._endurances_s.min()))
         homes, work, lengths, times = [], [], [], []
@@ -228,7 +237,16 @@ class Crew:
 
     def _flight(self, legs: Array, home: Array, out_m: float, home_m: float, wait_s: float = 0.0) -> Flight:
         run_in = self._options.run_in_m
-        flight = make_flight(legs, home, self._heights, self._router, self._returns, out_m, home_m, run_in)
+        flight = make_flight(
+            legs,
+            home,
+            self._heights,
+            router=self._router,
+            returns=self._returns,
+            out_m=out_m,
+            home_m=home_m,
+            run_in_m=run_in,
+        )
         return replace(flight, wait_s=wait_s) if wait_s else flight
 
     @property
@@ -245,8 +263,8 @@ class Crew:
             if np.isfinite(within_s):
                 step = min(max(within_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
             total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
-            row = cut(legs, self._router, options.motion, 1, step, max(step, total / 2000.0))
-            found = sorties(row, home, self._returns, self._router, options.motion, limits)
+            row = cut(legs, self._router, options.motion, shares=1, least_m=step, step_m=max(step, total / 2000.0))
+            found = sorties(row, home, self._returns, router=self._router, motion=options.motion, limits=limits)
             if found is None:
                 raise self._too_short(row, home[None], endurance_s)
             result = [row.legs(a, b) for a, b in found]

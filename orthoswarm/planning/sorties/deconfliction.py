@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
     """How far apart vehicles stay.
 

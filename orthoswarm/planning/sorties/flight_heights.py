@@ -51,7 +51,7 @@ class LevelHeights:
         return np.array([[*end, self.at(end, more_m)]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GroundHeights:
     """A constant height above the ground within a tolerance, on straight pieces as long as that allows.
 

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 _SAME_M = 0.05
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Flight:
     """The path of one sortie.
 
@@ -86,6 +86,7 @@ def make_flight(
     legs: Array,
     home: Array,
     heights: FlightHeights,
+    *,
     router: Router,
     returns: bool,
     out_m: float = 0.0,
@@ -154,15 +155,15 @@ def _raised(flat: list[tuple[Array, float, int]], start: Array, heights: FlightH
     above = np.array(mores) + heights.above_m if heights.follows else np.full(len(points), np.nan)
     home = start[:2]
     return Flight(
-        home,
-        float(start[2]),
-        np.array(points),
-        np.array(camera, np.int8),
-        returns,
-        heights.ground_at(home),
-        above,
-        np.array(between, bool),
-        heights.by_vehicle,
+        home=home,
+        climb_m=float(start[2]),
+        points=np.array(points),
+        camera=np.array(camera, np.int8),
+        returns=returns,
+        home_z_m=heights.ground_at(home),
+        above_m=above,
+        between=np.array(between, bool),
+        ground_by_vehicle=heights.by_vehicle,
     )
 
 

@@ -44,7 +44,9 @@ class Row:
         return np.stack([self.parts[begin:end][first, 0], self.parts[begin:end][last, 1]], axis=1)
 
 
-def cut(legs: Array, router: Router, motion: Motion, shares: int, least_m: float, step_m: float | None = None) -> Row:
+def cut(
+    legs: Array, router: Router, motion: Motion, *, shares: int, least_m: float, step_m: float | None = None
+) -> Row:
     """A row of legs with places to cut.
 
     Args:
@@ -184,7 +186,7 @@ def _pairs(cuts: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 def share(
-    row: Row, vehicles: int, starts: Array | None, returns: bool, router: Router, motion: Motion, limits: Limits
+    row: Row, vehicles: int, starts: Array | None, *, returns: bool, router: Router, motion: Motion, limits: Limits
 ) -> list[tuple[int, int]] | None:
     """Which parts each vehicle flies: begin and end (exclusive) per vehicle; None where the limits allow no way.
 
@@ -225,7 +227,7 @@ def share(
 
 
 def sorties(
-    row: Row, start: Array, returns: bool, router: Router, motion: Motion, limits: Limits
+    row: Row, start: Array, returns: bool, *, router: Router, motion: Motion, limits: Limits
 ) -> list[tuple[int, int]] | None:
     """Fewest flights from one start that fly a whole row within the limits, evenly cut; None where there is no way.
 

@@ -57,7 +57,7 @@ class HeightPrior:
     c: float = field(default_factory=lambda: active().bundle.height_robust_c)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Adjustment:
     """State of a bundle adjustment; `step` improves it in place.
 

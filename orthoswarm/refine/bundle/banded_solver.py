@@ -17,7 +17,7 @@ _BLOCK_COLUMNS, _NARROW_ROWS = 64, 600
 """Sizes for the processor's cache; they change the speed, not the result."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BandedSystem:
     """Reduced normal equations: banded cameras, a border of common unknowns, and the blocks for the back substitution.
 

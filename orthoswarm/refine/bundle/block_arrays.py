@@ -48,7 +48,16 @@ class CameraBlock:
     def camera(self, i: int, origin: Array) -> Camera:
         """Camera i in grid coordinates; origin (2,) or (3,): the local frame's origin."""
         row = self.lens[self.lens_id[i]]
-        lens = Lens(int(row[WIDTH]), int(row[HEIGHT]), *(float(row[j]) for j in (F, K1, K2, K3, CX, CY)))
+        lens = Lens(
+            int(row[WIDTH]),
+            int(row[HEIGHT]),
+            float(row[F]),
+            k1=float(row[K1]),
+            k2=float(row[K2]),
+            k3=float(row[K3]),
+            cx=float(row[CX]),
+            cy=float(row[CY]),
+        )
         offset = np.zeros(3)
         offset[: len(origin)] = origin
         return Camera(self.position[i] + offset, self.rotation[i].copy(), lens)

@@ -16,7 +16,7 @@ _MEDIAN_SIGMA = 1.25
 
 
 def frame_sigmas(
-    adjustment: Adjustment, c: float, heights: HeightPrior, ties: MapTies | None, tie_c: float, floor_m: float
+    adjustment: Adjustment, c: float, heights: HeightPrior, *, ties: MapTies | None, tie_c: float, floor_m: float
 ) -> tuple[Array, float]:
     """Stated error of the ground point at each picture's centre, and sigma of the field of view.
 

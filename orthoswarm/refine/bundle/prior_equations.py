@@ -37,9 +37,9 @@ def add_priors(
     system.corner[diagonal, diagonal] += weight
     system.rhs_common[: layout.lens_columns] -= weight * common[: layout.lens_columns]
     index = np.flatnonzero(free)
-    _add_attitudes(system, cameras, priors, layout, common, index, 6 * slot[index])
+    _add_attitudes(system, cameras, priors, layout=layout, common=common, index=index, at=6 * slot[index])
     residual = position_residuals(cameras, priors, layout, common)[index]
-    _add_positions(system, priors, layout, residual, index, 6 * slot[index])
+    _add_positions(system, priors, layout, residual=residual, index=index, at=6 * slot[index])
     for g, model in enumerate(priors.models):
         o, k = layout.offset[g], layout.knots[g]
         sigma = np.array([*model.bias_sigma, model.height_sigma, model.lag_sigma])
@@ -48,7 +48,7 @@ def add_priors(
         system.corner[d, d] += weight
         system.rhs_common[d] -= weight * common[d]
         if k:
-            _add_drift(system, common, o + 5, k, model.drift_sigma, model.drift_bend)
+            _add_drift(system, common, o + 5, knots=k, sigma=model.drift_sigma, bend=model.drift_bend)
 
 
 def position_residuals(cameras: CameraBlock, priors: Priors, layout: Layout, common: Array) -> Array:
@@ -78,6 +78,7 @@ def _add_attitudes(
     system: BandedSystem,
     cameras: CameraBlock,
     priors: Priors,
+    *,
     layout: Layout,
     common: Array,
     index: NDArray[np.intp],
@@ -106,7 +107,7 @@ def _add_attitudes(
 
 
 def _add_positions(
-    system: BandedSystem, priors: Priors, layout: Layout, residual: Array, index: NDArray[np.intp], at: Ints
+    system: BandedSystem, priors: Priors, layout: Layout, *, residual: Array, index: NDArray[np.intp], at: Ints
 ) -> None:
     """Position priors: recorded positions with lag and drift, heights with their offset."""
     base = np.asarray(layout.offset)[priors.group[index]]
@@ -145,7 +146,7 @@ def _weights(sigma: Array) -> Array:
     return np.where(np.isfinite(sigma), 1.0 / np.maximum(sigma, 1e-9) ** 2, 0.0)
 
 
-def _add_drift(system: BandedSystem, common: Array, at: int, knots: int, sigma: float, bend: float) -> None:
+def _add_drift(system: BandedSystem, common: Array, at: int, *, knots: int, sigma: float, bend: float) -> None:
     """Drift priors: knots are near zero (sigma) and their second differences small (sigma `bend`)."""
     precision = np.eye(knots) / sigma**2
     if knots > 2:

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GroupPriors:
     """Sigmas of the errors common to all frames of a group (a vehicle's sortie); SI units and radians.
 
@@ -33,7 +33,7 @@ class GroupPriors:
     knot_every: int = field(default_factory=lambda: active().bundle.drift_knot_photos)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
     """Records of N cameras in G groups, and of L lenses.
 
@@ -59,7 +59,7 @@ class Priors:
     position_c: float = field(default_factory=lambda: active().bundle.position_robust_c)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """Columns of the common unknowns: lenses, then for each group bias (3), height, lag, drift knots (east, north).
 
@@ -94,7 +94,14 @@ class Layout:
             offset.append(at)
             knots.append(k)
             at += 5 + 2 * k
-        return cls(columns, tuple(offset), tuple(knots), at, left, fraction)
+        return cls(
+            lens_columns=columns,
+            offset=tuple(offset),
+            knots=tuple(knots),
+            size=at,
+            knot_left=left,
+            knot_fraction=fraction,
+        )
 
     def drift(self, common: Array, group: Ints) -> Array:
         """Drift (N, 2) of each camera for the common unknowns (size,)."""

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """Focal length and headings of one vehicle from the pictures' flow.
 
@@ -73,13 +73,26 @@ def calibrate(
     for k, members in enumerate(legs):
         for a, b in _pairs(records, members, f0 / h0, size[1], per_leg):
             ratio = _flow_ratio(
-                gray(a), gray(b), rotation[a], rotation[b], records.position[b] - records.position[a], f0, h0
+                gray(a),
+                gray(b),
+                rotation[a],
+                rotation[b],
+                move=records.position[b] - records.position[a],
+                focal=f0,
+                height=h0,
             )
             if ratio is not None:
                 ratios.append(ratio)
                 owners.append(k)
     if len(ratios) < 2:
-        return Calibration(f0, h0, np.zeros(len(leg)), usable, len(ratios), [])
+        return Calibration(
+            focal_px=f0,
+            height_m=h0,
+            yaw_offset=np.zeros(len(leg)),
+            trusted_height=usable,
+            pairs=len(ratios),
+            warnings=[],
+        )
     r, owner = np.array(ratios), np.array(owners)
     offset, warnings = _heading(records, leg, r, owner)
     factor = np.abs(r)
@@ -95,13 +108,17 @@ def _with_scale(
     focal = f0 * scale
     narrowest, widest = np.radians(active().features.calibration_fov_deg)
     if usable and narrowest < fov_rad(focal, width) < widest:
-        return Calibration(focal, h0, offset, True, pairs, warnings)
+        return Calibration(
+            focal_px=focal, height_m=h0, yaw_offset=offset, trusted_height=True, pairs=pairs, warnings=warnings
+        )
     height = h0 / scale
     if usable:
         warnings.append(
             f"the recorded height of {h0:.0f} m contradicts the pictures and the path; {height:.0f} m is assumed"
         )
-    return Calibration(f0, height, offset, False, pairs, warnings)
+    return Calibration(
+        focal_px=f0, height_m=height, yaw_offset=offset, trusted_height=False, pairs=pairs, warnings=warnings
+    )
 
 
 def _heading(
@@ -172,7 +189,7 @@ def _pairs(
 
 
 def _flow_ratio(
-    first: Gray, second: Gray, ra: Array, rb: Array, move: Array, focal: float, height: float
+    first: Gray, second: Gray, ra: Array, rb: Array, *, move: Array, focal: float, height: float
 ) -> complex | None:
     """Measured flow divided by predicted flow, complex (scale and rotation); None without agreement."""
     config = active().features

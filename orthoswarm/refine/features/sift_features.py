@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Features:
     """Features of one photo.
 
@@ -41,7 +41,14 @@ class Features:
     def none(cls, width: int, height: int) -> "Features":
         """An empty set for a picture of this size."""
         empty = np.zeros((0, 2), np.float32)
-        return cls(empty, np.zeros((0, 128), np.uint8), empty[:, 0], width, height, 1.0)
+        return cls(
+            uv=empty,
+            descriptor=np.zeros((0, 128), np.uint8),
+            sigma_px=empty[:, 0],
+            width=width,
+            height=height,
+            step_px=1.0,
+        )
 
     def same_point(self) -> NDArray[np.int32]:
         """For each feature the index of the first one at the same place, int32 (n,).
@@ -89,7 +96,9 @@ def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = No
     keep = spread(xy, response, reduced.shape[1], reduced.shape[0])
     uv = (xy[keep] + np.float32(0.5)) * np.float32(step) - np.float32(0.5)
     sigma = np.float32(step) * localisation_sigma(size[keep])
-    return Features(uv, descriptors[keep].astype(np.uint8), sigma, width, height, step)
+    return Features(
+        uv=uv, descriptor=descriptors[keep].astype(np.uint8), sigma_px=sigma, width=width, height=height, step_px=step
+    )
 
 
 def localisation_sigma(size: Floats) -> Floats:

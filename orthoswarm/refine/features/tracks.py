@@ -41,7 +41,7 @@ class _Live:
         return _Live(self.uv[keep], self.ident[keep], self.age[keep], self.anchor[keep], self.anchor_uv[keep])
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Tracker:
     """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
 
@@ -329,7 +329,7 @@ def follow(
     Returns:
         The tracks, and the share of them that survived into each picture, float64 (count,).
     """
-    tracker = Tracker(scale) if cell_px is None else Tracker(scale, cell_px)
+    tracker = Tracker(scale=scale) if cell_px is None else Tracker(scale=scale, cell_px=cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))

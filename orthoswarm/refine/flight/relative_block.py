@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Flight:
     """A vehicle's frames and their present solution.
 

@@ -30,6 +30,7 @@ def open_sparse_flight(
     grid: LocalGrid,
     origin: Array,
     read: ReadGray,
+    *,
     run: Run = serial,
     progress: Progress | None = None,
 ) -> Flight:
@@ -91,12 +92,12 @@ def make_flight(
     yaw = wrap_rad(start.plane.yaw[rows])
     mine = list(warnings)
     calibration = Calibration(
-        float(adjustment.cameras.lens[0, F]),
-        float(np.median(heights_above_ground(adjustment))),
-        wrap_rad(yaw - records.yaw),
-        bool(trusted_height[rows].any()),
-        start.pairs[1],
-        mine,
+        focal_px=float(adjustment.cameras.lens[0, F]),
+        height_m=float(np.median(heights_above_ground(adjustment))),
+        yaw_offset=wrap_rad(yaw - records.yaw),
+        trusted_height=bool(trusted_height[rows].any()),
+        pairs=start.pairs[1],
+        warnings=mine,
     )
     leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
     held = start.placed[rows].astype(np.float64)

@@ -34,6 +34,7 @@ def open_sparse_flights(
     grid: LocalGrid,
     origin: Array,
     read: ReadGray,
+    *,
     run: Run = serial,
     progress: Progress | None = None,
 ) -> list[Flight]:
@@ -52,7 +53,7 @@ def open_sparse_flights(
         may be moved rigidly (onto a map), but keeps its shape.
     """
     if len(units) == 1:
-        return [open_sparse_flight(units[0], grid, origin, read, run, progress)]
+        return [open_sparse_flight(units[0], grid, origin, read, run=run, progress=progress)]
     units = [[replace(frame, camera=part[0].camera) for frame in part] for part in units]
     frames = [frame for part in units for frame in part]
     records = read_photo_records(frames, grid, origin, share_lenses=True)

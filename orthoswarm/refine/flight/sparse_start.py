@@ -26,7 +26,7 @@ from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SparseStart:
     """Everything that the adjustment of N photos needs, in a local frame; pixels are those of the full pictures.
 
@@ -124,20 +124,29 @@ def sparse_start(
         run: executes the feature and matching tasks; the result does not depend on it.
         progress: called with stage, number done, total.
     """
-    builder = PairGraphBuilder(frames, records, read_gray, run, progress)
+    builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
     start = build_pair_graph(builder)
     if len(records.fov_hint) <= int(records.vehicle.max()):  # vehicles share lenses by name
         alone = find_initial_orientation(lens_per_vehicle(records), builder.pairs(), builder.features)
         records = split_unlike_lenses(records, alone)
         if records is not builder.records:
             start = find_initial_orientation(records, builder.pairs(), builder.features)
-    return assemble(frames, records, builder.features, builder.pairs(), start, builder.damaged, len(builder.tried))
+    return assemble(
+        frames,
+        records,
+        builder.features,
+        pairs=builder.pairs(),
+        start=start,
+        damaged=builder.damaged,
+        tried=len(builder.tried),
+    )
 
 
 def assemble(
     frames: Sequence[Frame],
     records: PhotoRecords,
     features: Sequence[Features],
+    *,
     pairs: Sequence[Pair],
     start: InitialOrientation,
     damaged: Mapping[int, str],

@@ -69,7 +69,9 @@ def as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
         vehicle=vehicle,
         placed=list(placed),
         dropped={},
-        legs=[Leg(vehicle, 0, len(placed) - 1, "failed", 0.0, sigma)] if placed else [],
+        legs=[Leg(vehicle=vehicle, first=0, last=len(placed) - 1, state="failed", confidence=0.0, sigma_m=sigma)]
+        if placed
+        else [],
         fov_deg=float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan"),
         fov_sigma_deg=float("nan"),
         terrain=None,

@@ -48,7 +48,7 @@ from orthoswarm.refine.initial.relative_scale import (
 from orthoswarm.refine.initial.tilt_and_lens import Matches, TiltAndLens, similarities, solve_tilt_and_lens
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InitialOrientation:
     """Orientation of N photos of L lenses in S segments with E pairs.
 
@@ -149,7 +149,7 @@ def find_initial_orientation(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Solved:
     """Results of the last round (see InitialOrientation); relative: float64 (N,), scale over the segment's."""
 
@@ -189,7 +189,9 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
             graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
         )
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
-        priors = _network_priors(records, heights, relative, metres, lens_of, tilt_px, by_height)
+        priors = _network_priors(
+            records, heights, relative, metres=metres, lens_of=lens_of, tilt_px=tilt_px, by_height=by_height
+        )
         network = solve_network(graph, records, yaw, priors)
         metres = network.metres
     return _Solved(
@@ -214,7 +216,14 @@ def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_
         float(np.radians(config.tag_tilt_sigma_deg)),
         float(np.radians(config.free_tilt_sigma_deg)),
     )
-    return solve_tilt_and_lens(matches, records, records.tag_level(), log_focal, log_focal_sigma, tilt_sigma)
+    return solve_tilt_and_lens(
+        matches,
+        records,
+        records.tag_level(),
+        log_focal=log_focal,
+        log_focal_sigma=log_focal_sigma,
+        tilt_sigma=tilt_sigma,
+    )
 
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
@@ -232,6 +241,7 @@ def _network_priors(
     records: PhotoRecords,
     heights: RecordedHeights,
     relative: Array,
+    *,
     metres: Array,
     lens_of: Ints,
     tilt_px: Array,

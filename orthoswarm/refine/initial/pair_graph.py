@@ -25,7 +25,7 @@ ReadGray = Callable[[Frame], Gray]
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PairGraphBuilder:
     """Features and matches of N photos, extended step by step.
 

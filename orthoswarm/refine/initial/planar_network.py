@@ -17,7 +17,7 @@ from orthoswarm.config import active
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkPriors:
     """Priors of the common unknowns of the network (S segments, N photos).
 
@@ -40,7 +40,7 @@ class NetworkPriors:
     vehicle: Ints
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
     """Result of the network.
 
@@ -132,7 +132,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     config = active().initial
     at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
     rows = _Rows(at.size)
-    pair_sigma = _pair_rows(rows, at, graph, records, np.exp(-1j * yaw), beliefs)
+    pair_sigma = _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
     velocity = _gps_rows(rows, at, records, beliefs.vehicle)
     _prior_rows(rows, at, beliefs)
     matrix, rhs = rows.finish()
@@ -184,7 +184,7 @@ def _sigmas(factor: Any, at: _Columns) -> Array:
 
 
 def _pair_rows(
-    rows: _Rows, at: _Columns, graph: PairGraph, records: PhotoRecords, unit: Complex, b: NetworkPriors
+    rows: _Rows, at: _Columns, graph: PairGraph, *, records: PhotoRecords, unit: Complex, b: NetworkPriors
 ) -> Array:
     """East, then north rows of all pairs; returns their one sigma in metres (E,)."""
     config = active().initial

@@ -19,7 +19,7 @@ Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoRecords:
     """Records of N photos of L lenses in S segments; NaN where unknown.
 
@@ -89,7 +89,7 @@ class PhotoRecords:
         return np.asarray(level)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PairGraph:
     """Similarities between pairs of level pictures: z of the second = factor (z of the first) + constant.
 

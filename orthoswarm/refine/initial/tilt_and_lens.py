@@ -27,7 +27,7 @@ from orthoswarm.refine.initial.planar_similarity import (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Matches:
     """Matches of all pairs in one array: of pair e, rows start[e] to start[e + 1].
 
@@ -61,7 +61,7 @@ class Matches:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TiltAndLens:
     """Tilt and lens found from the shapes of matches.
 
@@ -89,6 +89,7 @@ def solve_tilt_and_lens(
     matches: Matches,
     records: PhotoRecords,
     level: Array,
+    *,
     log_focal: Array,
     log_focal_sigma: Array,
     tilt_sigma: Array,

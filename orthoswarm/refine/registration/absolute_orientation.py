@@ -56,6 +56,7 @@ def tie_matches(
     flight: Flight,
     surface: GroundModel,
     ground: LoadedMap,
+    *,
     cell_m: float,
     reach_m: float,
     half_m: float | None = None,
@@ -80,13 +81,16 @@ def tie_matches(
     half_m = config.tie_half_m if half_m is None else half_m
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
-    return _ground_matches(flight, surface, ground, chosen, seen.camera, reach_m, half_m, texture_field)
+    return _ground_matches(
+        flight, surface, ground, chosen=chosen, camera=seen.camera, reach_m=reach_m, half_m=half_m, field=texture_field
+    )
 
 
 def _ground_matches(
     flight: Flight,
     surface: GroundModel,
     ground: LoadedMap,
+    *,
     chosen: NDArray[np.integer],
     camera: NDArray[np.int32],
     reach_m: float,
@@ -99,7 +103,16 @@ def _ground_matches(
     reach = max(config.tie_reach_px, round(reach_m / ground.gsd_m))
     level = surface.height(adj.points[:, :2])
     return match_points(
-        adj.cameras, adj.points, chosen, camera, flight.pictures.gray, ground, half, reach, level, field
+        adj.cameras,
+        adj.points,
+        chosen,
+        camera=camera,
+        gray=flight.pictures.gray,
+        ground=ground,
+        half=half,
+        reach=reach,
+        level=level,
+        field=field,
     )
 
 
@@ -118,7 +131,18 @@ def edge_displacement(
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
     half_m = config.tie_half_m
-    edges = clear_matches(_ground_matches(flight, surface, ground, some.point, camera, reach_m, half_m, gradient_field))
+    edges = clear_matches(
+        _ground_matches(
+            flight,
+            surface,
+            ground,
+            chosen=some.point,
+            camera=camera,
+            reach_m=reach_m,
+            half_m=half_m,
+            field=gradient_field,
+        )
+    )
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
     if len(away) < config.edge_fewest:
@@ -228,7 +252,16 @@ def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tup
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.roof_cell_m)
     half = max(config.tie_half_px, round(config.roof_half_m / ground.gsd_m))
     reach = max(config.tie_half_px, round(config.roof_reach_m / ground.gsd_m))
-    found = match_points(adj.cameras, adj.points, chosen, seen.camera, flight.pictures.gray, ground, half, reach)
+    found = match_points(
+        adj.cameras,
+        adj.points,
+        chosen,
+        camera=seen.camera,
+        gray=flight.pictures.gray,
+        ground=ground,
+        half=half,
+        reach=reach,
+    )
     found = clear_matches(found, config.roof_ratio)
     return found, height[found.point]
 
@@ -245,7 +278,14 @@ def add_links(flight: Flight, gsd_m: float) -> int:
     if len(np.unique(flight.leg[candidates])) < 2:
         return 0
     camera, point, uv, _ = link_legs(
-        adj.cameras, adj.points, chosen, seen.camera, flight.leg, candidates, flight.pictures.gray, gsd_m
+        adj.cameras,
+        adj.points,
+        chosen,
+        camera=seen.camera,
+        leg=flight.leg,
+        candidates=candidates,
+        gray=flight.pictures.gray,
+        gsd_m=gsd_m,
     )
     if len(camera):
         add_observations(flight, camera, point, uv, config.link_sigma_px)
@@ -272,13 +312,13 @@ def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMa
     """Tie points of a flight that the coarse registration put on the map within some metres."""
     config = active().registration
     cell_m = config.first_tie_cell_sparse_m if flight.sparse else config.first_tie_cell_m
-    return clear_matches(tie_matches(flight, surface, ground, cell_m, config.first_tie_reach_m))
+    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=config.first_tie_reach_m))
 
 
 def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
     """The same with small patches that touch each other: more evidence where few large ones fit; too noisy for ties."""
     reach = active().registration.first_tie_reach_m
-    return clear_matches(tie_matches(flight, surface, ground, 2.0 * half_m, reach, half_m))
+    return clear_matches(tie_matches(flight, surface, ground, cell_m=2.0 * half_m, reach_m=reach, half_m=half_m))
 
 
 def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: GroundModel) -> AbsoluteOrientation:
@@ -339,7 +379,7 @@ def _second_round(
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     config = active().registration
     cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
-    matches = clear_matches(tie_matches(flight, surface, ground, cell_m, reach_m, pictures=pictures))
+    matches = clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, pictures=pictures))
     matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches, reach_m))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):

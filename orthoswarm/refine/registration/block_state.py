@@ -25,7 +25,7 @@ NOT_FOUND = (
 CARRIED = "the map does not show what this flight saw; pictures of its neighbours carry it"
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class VehicleState:
     """One vehicle between passes. It can be pickled; decoded pictures are not part of it.
 
@@ -198,5 +198,14 @@ def leg_states(state: VehicleState) -> list[Leg]:
         how: LegState = "matched" if matched[k] else other
         share = agree[k] / max(ties[k], 1) if matched[k] else 0.0
         sigma = float(np.median(state.sigma_m[members]))
-        out.append(Leg(state.vehicle, int(members[0]), int(members[-1]), how, share, sigma))
+        out.append(
+            Leg(
+                vehicle=state.vehicle,
+                first=int(members[0]),
+                last=int(members[-1]),
+                state=how,
+                confidence=share,
+                sigma_m=sigma,
+            )
+        )
     return out

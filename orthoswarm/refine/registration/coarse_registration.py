@@ -49,7 +49,19 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
 def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
     """One shift for the flight, from the sum of the correlations of all its strips (see `stacked`)."""
     cameras, windows = flight.cameras(), _strips(flight)
-    strips = [strip_and_map(cameras, w, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m) for w in windows]
+    strips = [
+        strip_and_map(
+            cameras,
+            w,
+            flight.pictures.small,
+            basemap=basemap,
+            origin=origin,
+            ground_z=0.0,
+            reach_m=reach_m,
+            gsd_m=gsd_m,
+        )
+        for w in windows
+    ]
     found = stacked([s for s in strips if s is not None])
     if found is None:
         return None
@@ -64,7 +76,19 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
     matches = [
         m
         for index in windows
-        if (m := register(cameras, index, flight.pictures.small, basemap, origin, 0.0, reach_m, gsd_m)) is not None
+        if (
+            m := register(
+                cameras,
+                index,
+                flight.pictures.small,
+                basemap=basemap,
+                origin=origin,
+                ground_z=0.0,
+                reach_m=reach_m,
+                gsd_m=gsd_m,
+            )
+        )
+        is not None
     ]
     if not matches:
         return None
@@ -84,7 +108,19 @@ def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit 
     matches = [
         m
         for index in chosen
-        if (m := register(cameras, index, flight.pictures.gray, basemap, origin, 0.0, reach_m, gsd, by_learning))
+        if (
+            m := register(
+                cameras,
+                index,
+                flight.pictures.gray,
+                basemap=basemap,
+                origin=origin,
+                ground_z=0.0,
+                reach_m=reach_m,
+                gsd_m=gsd,
+                find=by_learning,
+            )
+        )
         is not None
     ]
     if len(matches) < 2:

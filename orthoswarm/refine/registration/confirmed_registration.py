@@ -67,7 +67,7 @@ def _false_matches_log10(flight: Flight, matches: MapMatches, half_m: float) -> 
         flight.adjustment.points[matches.point, :2],
         matches.shift,
         matches.camera.astype(float),
-        flight.leg[matches.camera],
-        active().registration.first_tie_reach_m,
-        2.0 * half_m,
+        leg=flight.leg[matches.camera],
+        reach_m=active().registration.first_tie_reach_m,
+        patch_m=2.0 * half_m,
     )

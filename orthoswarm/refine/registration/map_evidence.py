@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-def false_matches_log10(ground: Array, shift: Array, order: Array, leg: Ints, reach_m: float, patch_m: float) -> float:
+def false_matches_log10(
+    ground: Array, shift: Array, order: Array, *, leg: Ints, reach_m: float, patch_m: float
+) -> float:
     """Decimal logarithm of the expected number of false matches behind the best agreement of tie points.
 
     What is tried: one shift for all of them, and for each leg a line of shifts along it (drift of the receiver, error

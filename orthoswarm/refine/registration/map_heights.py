@@ -26,6 +26,7 @@ def map_heights(
     flight: Flight,
     surface: GroundModel,
     ground: LoadedMap,
+    *,
     others: Array,
     tie_sigma_m: Array,
     pictures: NDArray[np.bool_] | None = None,
@@ -51,7 +52,18 @@ def map_heights(
     reach = max(config.tie_reach_px, round(config.oblique_reach_m / ground.gsd_m))
     gray, level = flight.pictures.gray, points[:, 2]
     found = clear_matches(
-        match_points(cameras, points, chosen, camera, gray, ground, half, reach, level, texture_field)
+        match_points(
+            cameras,
+            points,
+            chosen,
+            camera=camera,
+            gray=gray,
+            ground=ground,
+            half=half,
+            reach=reach,
+            level=level,
+            field=texture_field,
+        )
     )
     sight = points[found.point] - cameras.position[found.camera]
     out = np.hypot(sight[:, 0], sight[:, 1])

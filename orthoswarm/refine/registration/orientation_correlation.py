@@ -151,7 +151,7 @@ def strip_mosaic(
     return out, np.isfinite(best), float(west), float(north)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Strip:
     """A mosaic of consecutive pictures and the part of the map where it may lie.
 
@@ -174,6 +174,7 @@ def strip_and_map(
     cameras: CameraBlock,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
+    *,
     basemap: MapWindow,
     origin: Array,
     ground_z: float,
@@ -269,7 +270,7 @@ def by_learning(strip: Strip) -> Found | None:
     """The same by learned matching, some seconds a strip: the second opinion where edges find no agreement."""
     from orthoswarm.matchers.second_opinion import second_opinion
 
-    shift = second_opinion(strip.gray, strip.valid, strip.ground, strip.known, strip.reach)
+    shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach)
     return None if shift is None else (float(shift[0]), float(shift[1]), 1.0, 0.0)
 
 
@@ -277,6 +278,7 @@ def register(
     cameras: CameraBlock,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
+    *,
     basemap: MapWindow,
     origin: Array,
     ground_z: float,
@@ -285,7 +287,9 @@ def register(
     find: Callable[[Strip], Found | None] = by_edges,
 ) -> Match | None:
     """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""
-    strip = strip_and_map(cameras, index, picture, basemap, origin, ground_z, reach_m, gsd_m)
+    strip = strip_and_map(
+        cameras, index, picture, basemap=basemap, origin=origin, ground_z=ground_z, reach_m=reach_m, gsd_m=gsd_m
+    )
     found = None if strip is None else find(strip)
     if strip is None or found is None:
         return None

@@ -31,6 +31,7 @@ def first_passes(
     units: list[list[Frame]],
     basemap: MapWindow | None,
     grid: LocalGrid,
+    *,
     origin: Array,
     options: Options,
     run: Run,
@@ -78,7 +79,7 @@ def _sparse_flights(
     A vehicle whose photos match nothing must not keep the others from being adjusted.
     """
     try:
-        return list(open_sparse_flights(units, grid, origin, read_frame, run, progress))
+        return list(open_sparse_flights(units, grid, origin, read_frame, run=run, progress=progress))
     except AdjustmentError as error:
         if len(units) == 1:
             return [str(error)]

@@ -103,7 +103,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
             _hold_drift(flight)
     surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else adjust_without_map(flight)
     _check(flight)
-    state = registered_state(flight, surface, origin, None, watch)
+    state = registered_state(flight, surface, origin, basemap=None, watch=watch)
     found = None
     if basemap is not None:
         found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
@@ -189,7 +189,9 @@ def _legs(state: VehicleState, fit: CoarseFit | None) -> list[Leg]:
     for own, part in zip(legs, share, strict=True):
         how: LegState = "failed" if fit is None else "matched" if part > least else "carried"
         sigma = float(np.median(state.coarse_sigma_m[own]))
-        out.append(Leg(state.vehicle, int(own[0]), int(own[-1]), how, part, sigma))
+        out.append(
+            Leg(vehicle=state.vehicle, first=int(own[0]), last=int(own[-1]), state=how, confidence=part, sigma_m=sigma)
+        )
     return out
 
 

@@ -82,7 +82,9 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
     track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
-    sigma, fov_sigma = frame_sigmas(adj, track_c, state.surface.height_prior(adj.points), ties, tie_c, floor)
+    sigma, fov_sigma = frame_sigmas(
+        adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor
+    )
     state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
     state.sigma_m = sigma[: len(flight.frames)]
     if not lies_on_map(state):
@@ -114,5 +116,7 @@ def _denser_ground(
     if ground is not None:
         paths = [other.flight.cameras().position[:, :2] for other in others if other.on_map]
         elsewhere = np.concatenate([np.zeros((0, 2)), *paths])
-        more = map_heights(flight, state.surface, ground, elsewhere, state.ties.sigma_m, pictures)
+        more = map_heights(
+            flight, state.surface, ground, others=elsewhere, tie_sigma_m=state.ties.sigma_m, pictures=pictures
+        )
         state.dense = np.concatenate([state.dense[0], more[0]]), np.concatenate([state.dense[1], more[1]])

@@ -137,12 +137,14 @@ class SwarmRefiner:
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner)."""
         grid, origin, units = LocalGrid(self.epsg), self.origin, units_of_area(vehicles)
-        states, lost = first_passes(units, basemap, grid, origin, self.options, run, progress)
+        states, lost = first_passes(
+            units, basemap, grid, origin=origin, options=self.options, run=run, progress=progress
+        )
         if not states:
             raise AdjustmentError(lost[0])
         below = _shifted(coarse_terrain(states), origin)
         coarse = [to_solution(s, origin, below, coarse=True) for s in states]
-        states = _second_passes(states, basemap, self.epsg, origin, run, progress)
+        states = _second_passes(states, basemap, self.epsg, origin=origin, run=run, progress=progress)
         _level(states)
         distortion = map_distortion_sigma(states)
         for state in states:
@@ -201,6 +203,7 @@ def _second_passes(
     states: list[VehicleState],
     basemap: MapWindow | None,
     epsg: int,
+    *,
     origin: Array,
     run: Run,
     progress: Progress | None,

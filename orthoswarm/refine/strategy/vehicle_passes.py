@@ -72,7 +72,9 @@ def refine_alone(
         watch = Stopwatch()
         flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
         watch.lap("tracks")
-        state = registered_state(flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap, watch)
+        state = registered_state(
+            flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap=basemap, watch=watch
+        )
     return state
 
 
@@ -108,7 +110,7 @@ def refine_tracked(
             return None  # a recorded height that leads to such a lens is wrong
         if len(frames) < active().flight.few_photos and distorts_strongly(flight):
             return None  # too few corners for all parameters of such a lens; photos matched in pairs have more
-        return registered_state(flight, surface, origin, basemap, watch, learned)
+        return registered_state(flight, surface, origin, basemap=basemap, watch=watch, learned=learned)
     except AdjustmentError:
         return None
 
@@ -118,13 +120,14 @@ def refine_matched(
 ) -> VehicleState:
     """Refine one vehicle whose photos were matched in pairs and adjusted together with those of others."""
     surface = fit_surface(flight.adjustment, options.ground(origin))
-    return registered_state(flight, surface, origin, basemap, Stopwatch(), learned)
+    return registered_state(flight, surface, origin, basemap=basemap, watch=Stopwatch(), learned=learned)
 
 
 def registered_state(
     flight: Flight,
     surface: GroundModel,
     origin: Array,
+    *,
     basemap: MapWindow | None,
     watch: Stopwatch,
     learned: bool = True,
@@ -132,7 +135,9 @@ def registered_state(
     """The state of a vehicle that is adjusted without a map: its sigmas, and its registration where there is a map."""
     adj, c = flight.adjustment, active().bundle
     belief = surface.height_prior(adj.points)
-    coarse_sigma, fov_sigma = frame_sigmas(adj, c.track_robust_c, belief, None, c.tie_robust_c, c.sigma_floor_m)
+    coarse_sigma, fov_sigma = frame_sigmas(
+        adj, c.track_robust_c, belief, ties=None, tie_c=c.tie_robust_c, floor_m=c.sigma_floor_m
+    )
     coarse = replace(
         adj.cameras,
         position=adj.cameras.position.copy(),

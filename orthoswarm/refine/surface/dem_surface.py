@@ -66,7 +66,7 @@ class SurfaceSum:
         return self.lower.height(east_north) + self.upper.height(east_north)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DemFit:
     """A height model shifted to the points' level; used in place of a TerrainFit.
 

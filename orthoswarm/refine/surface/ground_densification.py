@@ -28,7 +28,7 @@ def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = Fals
     cameras = flight.cameras()
     positions = draw_positions(cameras.position[:, :2], flying_height(flight, surface))
     gray = flight.pictures.gray
-    free = measure_ground_offset(cameras, gray, positions, surface.terrain(), flight.leg).points
+    free = measure_ground_offset(cameras, gray, positions, terrain=surface.terrain(), leg_of_camera=flight.leg).points
     kappa = surface.fit.kappa if as_smooth and isinstance(surface.fit, TerrainFit) else None
     surface = replace(surface, ground_offset_m=0.0)
     return fit_surface(flight.adjustment, surface, kappa=kappa, extra=(free.points, free.sigma_z))
@@ -42,7 +42,7 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     ground, gray = surface.terrain(), flight.pictures.gray
-    found = dense_ground(cameras, gray, cells, ground, flight.leg)
+    found = dense_ground(cameras, gray, cells, terrain=ground, leg_of_camera=flight.leg)
     high = np.zeros((0, 3))
     middle_m = 0.5 * (c.high_from_m + c.high_to_share * height)
     reach_m = 0.5 * (c.high_to_share * height - c.high_from_m)
@@ -51,7 +51,7 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
         raised = replace(ground, z=ground.z + np.float32(middle_m))
         patches = (replace(s, baselines_m=c.high_baselines_m) for s in (Sweep.small(), Sweep.large()))
         sweeps = [replace(s.at_height(height), reach_m=reach_m) for s in patches]
-        high = dense_ground(cameras, gray, left, raised, flight.leg, sweeps).points
+        high = dense_ground(cameras, gray, left, terrain=raised, leg_of_camera=flight.leg, sweeps=sweeps).points
     return found.points, found.sigma_z, high
 
 

@@ -58,6 +58,7 @@ def measure_ground_offset(
     cameras: CameraBlock,
     gray: Gray,
     positions: Array,
+    *,
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
     sweep: Sweep | None = None,
@@ -74,7 +75,7 @@ def measure_ground_offset(
     """
     c = active().surface
     sweep = sweep or near_surface().at_height(height_above(cameras, terrain))
-    found = dense_ground(cameras, gray, positions, terrain, leg_of_camera, (sweep,))
+    found = dense_ground(cameras, gray, positions, terrain=terrain, leg_of_camera=leg_of_camera, sweeps=(sweep,))
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
     if len(above) < c.offset_least_heights:
         return GroundOffset(0.0, len(above), found)

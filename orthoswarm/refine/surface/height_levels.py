@@ -13,7 +13,7 @@ from orthoswarm.model.robust import mad_sigma
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LevelNetwork:
     """Corrections that bring vehicles to a common level.
 
@@ -116,7 +116,14 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
     degree = np.bincount(edge.ravel(), minlength=count)
     sd = np.where(degree > 0, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.nan)
     residual = difference - (level[edge[:, 0]] - level[edge[:, 1]])
-    return LevelNetwork(correction, sd, component, edge, difference, residual)
+    return LevelNetwork(
+        correction_m=correction,
+        sigma_m=sd,
+        component=component,
+        pairs=edge,
+        difference_m=difference,
+        residual_m=residual,
+    )
 
 
 def _anchor(correction: Array) -> float:

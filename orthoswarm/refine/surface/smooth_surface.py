@@ -22,7 +22,7 @@ KAPPA_SPACING_M = 30.0
 distances it is scaled, so that it means the same ground."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FitSettings:
     """Settings of a surface fit: by default those of `config.SurfaceConfig`, others for drawing.
 
@@ -106,7 +106,7 @@ class _Grid:
         return np.asarray(inside, np.bool_)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Surface:
     """Points on a grid of nodes, prepared for solving with any smoothness; "inner" is the shorter side of the grid.
 

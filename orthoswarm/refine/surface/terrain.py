@@ -21,7 +21,7 @@ HALF_MAXIMUM_SIGMAS = 1.1774
 """Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TerrainFit:
     """A fitted surface, with the height prior for the adjustment and the ground for rendering.
 

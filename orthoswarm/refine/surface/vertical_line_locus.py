@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Gray = Callable[[int], NDArray[np.uint8]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
     """Settings of the height search. Lengths in metres, for the reference height above ground; see `at_height`.
 
@@ -113,10 +113,10 @@ def dense_ground(
     cameras: CameraBlock,
     gray: Gray,
     cells: Array,
+    *,
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
     sweeps: Sequence[Sweep] | None = None,
-    *,
     slots: int | None = None,
 ) -> LocusPoints:
     """Heights at free positions from correlation between pictures, preferably of one leg.

@@ -35,7 +35,7 @@ _XMP = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoTags:
     """What a photo says about itself.
 

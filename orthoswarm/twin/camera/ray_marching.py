@@ -24,7 +24,7 @@ HAZE_HEIGHT_M = 20.0
 BLOCK = 16
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
     """A scene ready for the camera.
 
@@ -56,7 +56,15 @@ def make_stage(scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambie
     blocks = scene.dsm.reshape(rows // TILE_CELLS, TILE_CELLS, cols // TILE_CELLS, TILE_CELLS)
     tiles = np.ascontiguousarray(blocks.max(axis=(1, 3)) + 0.3, np.float32)
     noise = noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711)
-    return Stage(scene, (lit, np.asarray(half), np.asarray(quarter)), tiles, sun, ambient, haze, noise)
+    return Stage(
+        scene=scene,
+        levels=(lit, np.asarray(half), np.asarray(quarter)),
+        tiles=tiles,
+        sun=sun,
+        ambient=ambient,
+        haze=haze,
+        noise=noise,
+    )
 
 
 @kernel
@@ -396,7 +404,14 @@ def satellite_view(stage: Stage, lean: tuple[float, float], gsd_m: float) -> tup
     """
     s = stage.scene
     g = s.grid
-    grid = GroundGrid(g.epsg, g.west, g.north, gsd_m, int(g.width * TEXEL_M / gsd_m), int(g.height * TEXEL_M / gsd_m))
+    grid = GroundGrid(
+        epsg=g.epsg,
+        west=g.west,
+        north=g.north,
+        gsd_m=gsd_m,
+        width=int(g.width * TEXEL_M / gsd_m),
+        height=int(g.height * TEXEL_M / gsd_m),
+    )
     out = np.empty((grid.height, grid.width, 3), np.float32)
     _satellite(
         stage.levels[0], s.dsm, s.dtm, stage.tiles, s.wall, s.facade, np.asarray(stage.sun), stage.ambient,

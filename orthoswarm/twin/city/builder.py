@@ -81,8 +81,8 @@ class Builder:
         cv2.polylines(self.scene.kind, [points], False, float(kind), thick, cv2.LINE_8, 4)
 
     def building(
-        self, u: float, v: float, hu: float, hv: float, eave: float, rise: float, shape: int, color: Color,
-        wall: Color | None = None, *, turn: float = 0.0, lift: float = 0.0, windows: bool = True,
+        self, u: float, v: float, hu: float, hv: float, *, eave: float, rise: float, shape: int, color: Color,
+        wall: Color | None = None, turn: float = 0.0, lift: float = 0.0, windows: bool = True,
     ) -> None:  # fmt: skip
         """A building at a city position; its floor is the lowest ground near its centre."""
         x, y, angle = self.local(u, v)

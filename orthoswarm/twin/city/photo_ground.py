@@ -85,16 +85,18 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
     place = place * place.translation(left, top)
     dsm = cv2.medianBlur(_fill(dsm), 5)  # wires, poles and gaps in crowns are no surface that a camera could follow
     scene = Scene.blank(scene_grid(epsg, center, *half))
-    surface = _sample(dsm, dsm_place, scene, CELL_M, image.shape, place)
+    surface = _sample(dsm, dsm_place, scene, step=CELL_M, border=image.shape, frame=place)
     if ground[2]:
         bare, bare_place, _ = _heights(ground[2], "bare ground")
-        dtm = _sample(_fill(bare), bare_place, scene, CELL_M, image.shape, place)
+        dtm = _sample(_fill(bare), bare_place, scene, step=CELL_M, border=image.shape, frame=place)
     else:
         dtm = _lower_envelope(surface)
     level = float(np.median(dtm))
     scene.dtm[:] = np.minimum(dtm, surface) - level
     scene.dsm[:] = surface - level
-    scene.albedo[:] = np.clip(_sample(image.astype(np.float32), place, scene, TEXEL_M, image.shape, place), 0, 255)
+    scene.albedo[:] = np.clip(
+        _sample(image.astype(np.float32), place, scene, step=TEXEL_M, border=image.shape, frame=place), 0, 255
+    )
     _classify(scene)
     _sharpen(scene)
     return scene
@@ -120,7 +122,7 @@ def _solid_part(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
     return 4 * top, 4 * left, 4 * bottom, 4 * right
 
 
-def _sample(data: Any, place: Any, scene: Scene, step: float, border: tuple[int, ...], frame: Any) -> Floats:
+def _sample(data: Any, place: Any, scene: Scene, *, step: float, border: tuple[int, ...], frame: Any) -> Floats:
     """Bilinear values of a raster at the scene's cells of side `step`; positions beyond the orthoimage are mirrored."""
     import cv2
 

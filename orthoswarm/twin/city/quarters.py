@@ -70,17 +70,42 @@ def _lot(b: Builder, area: Area, front: float) -> None:
     rise = 0.0 if shape == FLAT else float(rng.uniform(1.6, 3.6))
     turn = float(rng.normal(0, 0.03)) + (np.pi / 2 if rng.random() < 0.3 else 0.0)
     color = pick(rng, ROOFS)
-    b.building(u, v, hu, hv, eave, rise, shape, color, turn=turn)
+    b.building(u, v, hu, hv, eave=eave, rise=rise, shape=shape, color=color, turn=turn)
     if rng.random() < 0.4:  # a wing
-        b.building(u + rng.uniform(-2, 2), v - front * hv, 3.0, 3.5, eave * 0.7, rise * 0.6, shape, color, turn=turn)
+        b.building(
+            u + rng.uniform(-2, 2),
+            v - front * hv,
+            3.0,
+            3.5,
+            eave=eave * 0.7,
+            rise=rise * 0.6,
+            shape=shape,
+            color=color,
+            turn=turn,
+        )
     if rng.random() < 0.5:
         b.building(
-            u + rng.uniform(-hu, hu) * 0.5, v + rng.uniform(-1, 1), 0.5, 0.5, eave + rise + 0.8, 0, FLAT, (110, 84, 74)
+            u + rng.uniform(-hu, hu) * 0.5,
+            v + rng.uniform(-1, 1),
+            0.5,
+            0.5,
+            eave=eave + rise + 0.8,
+            rise=0,
+            shape=FLAT,
+            color=(110, 84, 74),
         )
     back = v1 if front < 0 else v0
     if rng.random() < 0.5:
         b.building(
-            rng.uniform(u0 + 3, u1 - 3), back + front * 3.5, 2.2, 1.8, 2.4, 0.5, GABLE, pick(rng, ROOFS), windows=False
+            rng.uniform(u0 + 3, u1 - 3),
+            back + front * 3.5,
+            2.2,
+            1.8,
+            eave=2.4,
+            rise=0.5,
+            shape=GABLE,
+            color=pick(rng, ROOFS),
+            windows=False,
         )
     if rng.random() < 0.12 and b.is_free(u, back + front * 9.0, 3.5):  # a pool
         b.polygon(rect(u - 3, back + front * 9 - 2, u + 3, back + front * 9 + 2), (92, 168, 190), kinds.CONCRETE)
@@ -117,7 +142,7 @@ def _halls(b: Builder, area: Area) -> None:
         cu, cv = u + 0.5 * width, 0.5 * (hall[0] + hall[1])
         if hu > 4 and hv > 4:
             eave = float(rng.uniform(5, 12))
-            b.building(cu, cv, hu, hv, eave, 0.0, FLAT, pick(rng, FLAT_ROOFS))
+            b.building(cu, cv, hu, hv, eave=eave, rise=0.0, shape=FLAT, color=pick(rng, FLAT_ROOFS))
             for _ in range(int(hu * hv / 35)):
                 _machine(b, cu + rng.uniform(-0.8, 0.8) * hu, cv + rng.uniform(-0.8, 0.8) * hv, eave)
         u += width + 3.0
@@ -128,7 +153,9 @@ def _machine(b: Builder, u: float, v: float, lift: float) -> None:
     rng = b.rng
     size = rng.uniform(0.5, 2.0, 2)
     tall, color = float(rng.uniform(0.4, 1.8)), pick(rng, FLAT_ROOFS)
-    b.building(u, v, float(size[0]), float(size[1]), tall, 0.0, FLAT, color, lift=lift, windows=False)
+    b.building(
+        u, v, float(size[0]), float(size[1]), eave=tall, rise=0.0, shape=FLAT, color=color, lift=lift, windows=False
+    )
 
 
 def _towers(b: Builder, area: Area) -> None:
@@ -142,10 +169,10 @@ def _towers(b: Builder, area: Area) -> None:
             hu, hv = float(rng.uniform(7, 13)), float(rng.uniform(7, 11))
             height = float(rng.uniform(14, 40))
             color = pick(rng, FLAT_ROOFS)
-            b.building(u, v, hu, hv, height, 0.0, FLAT, color)
+            b.building(u, v, hu, hv, eave=height, rise=0.0, shape=FLAT, color=color)
             for _ in range(5):
                 _machine(b, u + rng.uniform(-0.75, 0.75) * hu, v + rng.uniform(-0.75, 0.75) * hv, height)
-            b.building(u + 2, v, 2.5, 2.5, height + 2.8, 0, FLAT, color, windows=False)
+            b.building(u + 2, v, 2.5, 2.5, eave=height + 2.8, rise=0, shape=FLAT, color=color, windows=False)
             for _ in range(5):
                 r = float(rng.uniform(1.5, 3.5))
                 b.tree(u + rng.uniform(-19, 19), v + rng.choice([-1, 1]) * rng.uniform(14, 19), r, r * 2.2)
@@ -186,9 +213,9 @@ def _field(b: Builder, area: Area) -> None:
         red, green, blue = (float(x) for x in np.clip(base + rng.normal(-18, 9), 0, 255))
         start, stop = u0 + rng.uniform(0.5, 4), u1 - rng.uniform(0.5, 4)
         b.line(np.array([[start, v], [stop, v]]), 0.5, (red, green, blue), kinds.FIELD)
-    b.building(u0 + 9, v0 + 8, 5, 4, 3.5, 1.8, GABLE, pick(rng, ROOFS))
+    b.building(u0 + 9, v0 + 8, 5, 4, eave=3.5, rise=1.8, shape=GABLE, color=pick(rng, ROOFS))
     if rng.random() < 0.4:
-        b.building(u0 + 24, v0 + 10, 4, 4, 8.0, 2.5, DOME, (190, 190, 192), windows=False)
+        b.building(u0 + 24, v0 + 10, 4, 4, eave=8.0, rise=2.5, shape=DOME, color=(190, 190, 192), windows=False)
     for _ in range(6):
         r = float(rng.uniform(2, 4.5))
         b.tree(rng.uniform(u0 + 2, u1 - 2), v1 - 3, r, r * 2)

@@ -20,7 +20,7 @@ GRASS, ASPHALT, CONCRETE, SOIL, FIELD, WATER, ROOF, TREE, CAR, MARK, RUBBLE, PHO
 KINDS = 12
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
     """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m).
 
@@ -49,14 +49,14 @@ class Scene:
         """A level, black scene on a texture grid whose sides are even."""
         rows, cols = grid.height // 2, grid.width // 2
         return cls(
-            grid,
-            np.zeros((grid.height, grid.width, 3), np.uint8),
-            np.zeros((grid.height, grid.width), np.uint8),
-            np.zeros((rows, cols), np.float32),
-            np.zeros((rows, cols), np.float32),
-            np.zeros((rows, cols, 3), np.uint8),
-            np.zeros((rows, cols), np.uint8),
-            angle_rad,
+            grid=grid,
+            albedo=np.zeros((grid.height, grid.width, 3), np.uint8),
+            kind=np.zeros((grid.height, grid.width), np.uint8),
+            dsm=np.zeros((rows, cols), np.float32),
+            dtm=np.zeros((rows, cols), np.float32),
+            wall=np.zeros((rows, cols, 3), np.uint8),
+            facade=np.zeros((rows, cols), np.uint8),
+            angle_rad=angle_rad,
         )
 
     @property
@@ -68,7 +68,9 @@ class Scene:
     def cells(self) -> GroundGrid:
         """The grid of the height fields."""
         g = self.grid
-        return GroundGrid(g.epsg, g.west, g.north, CELL_M, g.width // 2, g.height // 2)
+        return GroundGrid(
+            epsg=g.epsg, west=g.west, north=g.north, gsd_m=CELL_M, width=g.width // 2, height=g.height // 2
+        )
 
     def copy(self) -> "Scene":
         """A scene whose colours and surface may be changed without touching this one (the bare ground is shared)."""
@@ -97,4 +99,6 @@ def scene_grid(epsg: int, center: tuple[float, float], half_east: float, half_no
     width, height = (int(np.ceil(2 * h / 24.0)) * 24 for h in (half_east, half_north))
     west = float(np.floor(center[0] - width / 2))
     north = float(np.ceil(center[1] + height / 2))
-    return GroundGrid(epsg, west, north, TEXEL_M, int(width / TEXEL_M), int(height / TEXEL_M))
+    return GroundGrid(
+        epsg=epsg, west=west, north=north, gsd_m=TEXEL_M, width=int(width / TEXEL_M), height=int(height / TEXEL_M)
+    )

@@ -72,7 +72,7 @@ def read_can_log(path: Path) -> FlightLog:
     for bus, pose in reading.undated:
         pose.sample.time_s = bus.utc(pose.sample.time_s or 0.0)
     poses = [(key, pose) for key, pose in reading.poses if (pose.sample.time_s or 0.0) > _EARLIEST_UTC_S]
-    log = FlightLog(path, "DroneCAN", path.stem)
+    log = FlightLog(path=path, kind="DroneCAN", vehicle=path.stem)
     for kind in ("lat_deg", "flight_yaw_deg", "yaw_deg"):
         log.samples += _best([(key, pose) for key, pose in poses if getattr(pose.sample, kind) is not None])
     log.has_gimbal = any(sample.yaw_deg is not None for sample in log.samples)

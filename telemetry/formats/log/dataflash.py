@@ -59,7 +59,7 @@ def read_dataflash(path: Path) -> FlightLog:
         rows = _rows(data)
     if not rows:
         raise NotALog("the file holds no DataFlash record; it is not an ArduPilot log")
-    log = FlightLog(path, "DataFlash", path.stem)
+    log = FlightLog(path=path, kind="DataFlash", vehicle=path.stem)
     clock = _utc_minus_boot(rows.get("GPS", []))
     if "POS" in rows:
         each(rows["POS"], lambda row: _position(log, row, clock))

@@ -34,7 +34,7 @@ def read_exposure_list(path: Path) -> FlightLog:
     with path.open("rb") as handle:
         text = handle.read(_MOST_BYTES).decode("utf-8-sig", "replace")
     is_marks = path.suffix.lower() == ".mrk"
-    log = FlightLog(path, "DJI MRK" if is_marks else "RTKLIB events", path.stem)
+    log = FlightLog(path=path, kind="DJI MRK" if is_marks else "RTKLIB events", vehicle=path.stem)
     log.events = _marks(text) if is_marks else _positions(text)
     if not log.events:
         raise NotALog("the file holds no exposure with a position; check that it is the list of events")

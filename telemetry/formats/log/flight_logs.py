@@ -219,7 +219,15 @@ class _TlogVehicle:
 
     def log(self, path: Path, system: int) -> FlightLog:
         self._close()
-        log = FlightLog(path, "tlog", f"sysid{system}", *self._done, has_gimbal=self._poses.has_gimbal)
+        samples, events = self._done
+        log = FlightLog(
+            path=path,
+            kind="tlog",
+            vehicle=f"sysid{system}",
+            samples=samples,
+            events=events,
+            has_gimbal=self._poses.has_gimbal,
+        )
         log.position_sigma_m = self._poses.position_sigma_m
         if self._poses.reboots:
             text = f"the vehicle of {path.name} was started again {plural(self._poses.reboots, 'time')}"

@@ -25,7 +25,7 @@ class NotALog(Unreadable):
     """A file with a log's suffix is not a log; the text is one sentence for the user."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class FlightLog:
     """One vehicle's log.
 

@@ -54,7 +54,7 @@ class CameraEvent:
     kind: str
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class MavlinkPoses:
     """Turns one vehicle's messages into samples and camera events.
 

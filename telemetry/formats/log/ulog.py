@@ -40,7 +40,7 @@ def read_ulog(path: Path) -> FlightLog:
         if data[:7] != _MAGIC:
             raise NotALog("the file is not a ULog; check its name")
         rows = _rows(data)
-    log = FlightLog(path, "ULog", path.stem)
+    log = FlightLog(path=path, kind="ULog", vehicle=path.stem)
     fixes = rows.get("sensor_gps") or rows.get("vehicle_gps_position", [])
     clock = _utc_minus_boot(fixes)
     homes = [r["alt"] for r in rows.get("home_position", []) if isinstance(r.get("alt"), float)]

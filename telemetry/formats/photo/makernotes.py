@@ -12,7 +12,7 @@ from dataclasses import dataclass
 _MAX_ENTRIES = 256
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DjiNote:
     """Attitude in degrees, speed in metres a second; None where absent."""
 

@@ -27,7 +27,7 @@ class NotAPicture(Unreadable):
     """A file with a picture's suffix is not a picture, or is damaged; the text is one sentence for the user."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Container:
     """Kind, size and metadata of a picture file.
 
@@ -88,7 +88,7 @@ def _by_content(fd: int, head: bytes, size: int) -> Container:
         return _big_tiff(fd, head[:1] == b"I")
     if head[:2] == b"BM" and len(head) >= 26:
         width, height = struct.unpack_from("<ii", head, 18)
-        return Container("bmp", abs(width), abs(height), exif.Exif())
+        return Container(kind="bmp", width=abs(width), height=abs(height), exif=exif.Exif())
     if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
         raise NotAPicture("HEIC and AVIF pictures cannot be read here; convert them to JPEG, which keeps their tags")
     raise NotAPicture("the content is not a picture that can be read (JPEG, PNG, TIFF, WebP, BMP); leave the file out")
@@ -123,7 +123,7 @@ def _jpeg(fd: int, head: bytes, size: int) -> Container:
         body = data[at + 4 - base : at + 2 + length - base] if wanted else b""
         if code in _START_OF_FRAME and len(body) >= 5:
             height, width = struct.unpack_from(">HH", body, 1)
-            found = Container("jpeg", width, height, tags, packet)
+            found = Container(kind="jpeg", width=width, height=height, exif=tags, xmp=packet)
         elif code == 0xE1 and body[:6] == b"Exif\0\0" and not tags.main:
             tags = exif.parse_tiff(body[6:])
         elif code == 0xE1 and not packet and b"adobe.com/xap" in body[:32]:
@@ -170,7 +170,7 @@ def _png(fd: int, size: int) -> Container:
             packet = body[max(body.find(xmp.PACKET_START), 0) :] if xmp.PACKET_START in body else packet
         elif kind == b"IEND":
             if width and height:
-                return Container("png", width, height, tags, packet)
+                return Container(kind="png", width=width, height=height, exif=tags, xmp=packet)
             break
         at += 12 + length
     raise NotAPicture("the PNG is cut off; copy it again")
@@ -204,7 +204,7 @@ def _webp(fd: int, size: int) -> Container:
         at += 8 + length + (length & 1)
     if not width or not height:
         raise NotAPicture("the WebP file is damaged; copy it again")
-    return Container("webp", width, height, tags, packet)
+    return Container(kind="webp", width=width, height=height, exif=tags, xmp=packet)
 
 
 def _big_tiff(fd: int, little: bool) -> Container:
@@ -216,7 +216,7 @@ def _big_tiff(fd: int, little: bool) -> Container:
     tags = {struct.unpack_from(order + "H", entries, at)[0] for at in range(0, len(entries) - 19, 20)}
     if exif.GEO_KEYS not in tags:
         raise NotAPicture("a BigTIFF is not a picture of a camera; save it as TIFF or JPEG")
-    return Container("tiff", 0, 0, exif.Exif(), georeferenced=True)
+    return Container(kind="tiff", width=0, height=0, exif=exif.Exif(), georeferenced=True)
 
 
 def _tiff(fd: int) -> Container:
@@ -230,11 +230,11 @@ def _tiff(fd: int) -> Container:
     )
     packet = tags.main.get(exif.XMP)
     return Container(
-        "tiff",
-        int(width),
-        int(height),
-        tags,
-        packet if isinstance(packet, bytes) else b"",
+        kind="tiff",
+        width=int(width),
+        height=int(height),
+        exif=tags,
+        xmp=packet if isinstance(packet, bytes) else b"",
         georeferenced=geo,
         raw=exif.DNG_VERSION in tags.main,
     )

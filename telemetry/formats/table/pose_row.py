@@ -8,7 +8,7 @@ from orthoswarm.model.errors import InputError
 MOST_BYTES = 256 << 20
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PoseRow:
     """A table's values for one picture; None where it has none."""
 

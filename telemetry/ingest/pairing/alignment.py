@@ -15,7 +15,7 @@ CERTAIN_BY_PICTURES = 1.0 - 1e-4
 _LEAST_PROBABILITY = 0.02
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceMatch:
     """Probabilities of pairings.
 

@@ -16,7 +16,7 @@ from telemetry.ingest.pairing.sequence_match import match_sequences
 Array = NDArray[np.float64]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Pairing:
     """Which photo belongs to which event.
 
@@ -73,7 +73,7 @@ def pair(
     if numbered is not None:
         return numbered
     count = min(len(photo_times), len(event_times))
-    return Pairing([(i, i) for i in range(count)], how="order", ambiguous=len(photo_times) != len(event_times))
+    return Pairing(pairs=[(i, i) for i in range(count)], how="order", ambiguous=len(photo_times) != len(event_times))
 
 
 def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -> Pairing:
@@ -120,4 +120,4 @@ def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pa
     # Of equally good shifts, the one that pairs the first pictures.
     shift = min((s for s, v in votes.items() if v == most), key=lambda s: abs(min(own) - s - min(theirs)))
     pairs = sorted((own[m + shift], j) for m, j in theirs.items() if m + shift in own)
-    return Pairing(pairs, how="number", ambiguous=sum(v == most for v in votes.values()) > 1)
+    return Pairing(pairs=pairs, how="number", ambiguous=sum(v == most for v in votes.values()) > 1)

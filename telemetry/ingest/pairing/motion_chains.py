@@ -43,7 +43,7 @@ class PictureMotion:
         return PictureMotion(self.path_m[list(events)], lambda some: self.shifts_px([photos[i] for i in some]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
     """Photos by chain; a photo without a measured step is a chain of its own and says nothing.
 
@@ -121,7 +121,7 @@ class Chains:
 
 
 def chains_of(
-    steps_px: Array, p: Array, e: Array, path_m: Array, resolution_s: float, offset: float, drift: float
+    steps_px: Array, p: Array, e: Array, *, path_m: Array, resolution_s: float, offset: float, drift: float
 ) -> Chains | None:
     """Chains from the steps (N - 1,) in pixels between photos, NaN where unknown; None where there are too few.
 
@@ -144,7 +144,19 @@ def chains_of(
     reach = np.arange(-0.55 * resolution_s, 0.55 * resolution_s + 1e-9, _PHASE_STEP_S)
     phases, scales = (part.ravel() for part in np.meshgrid(reach, _SCALES, indexing="ij"))
     step_m = float(np.median(np.diff(path_m)))
-    return Chains(number, along, path_m, e, p, resolution_s, scale[0], scale[1], step_m, phases, scales)
+    return Chains(
+        number=number,
+        along_px=along,
+        path_m=path_m,
+        e=e,
+        p=p,
+        resolution_s=resolution_s,
+        metres_a_pixel=scale[0],
+        sigma_m=scale[1],
+        step_m=step_m,
+        phases_s=phases,
+        scales=scales,
+    )
 
 
 def _split(steps_px: Array) -> tuple[Indices, Array]:

@@ -66,7 +66,7 @@ def match_sequences(photos: Array, events: Array, motion: PictureMotion | None =
     e = events[single] - middle
     resolution = _resolution(photos)
     p = photos - photos[0] + 0.5 * resolution
-    problem = _Problem(p, e, resolution, float(np.median(np.diff(e))))
+    problem = _Problem(p=p, e=e, resolution_s=resolution, interval_s=float(np.median(np.diff(e))))
     problem, candidates = _plausible(problem)
     if not candidates:
         return None
@@ -89,7 +89,16 @@ def _alignment(problem: "_Problem", candidates: list[tuple[float, float]], singl
     if clock_doubt < _CLOCK_DOUBT:
         shifted = _without_coincidences(problem, inside, shifted, offset, drift)
     asked = problem.chains is not None
-    return SequenceMatch(single, inside, shifted, offset, drift, problem.resolution_s, problem.jitter_s, asked)
+    return SequenceMatch(
+        events=single,
+        first=inside,
+        probability=shifted,
+        offset_s=offset,
+        drift=drift,
+        resolution_s=problem.resolution_s,
+        jitter_s=problem.jitter_s,
+        by_pictures=asked,
+    )
 
 
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
@@ -115,7 +124,9 @@ def _chained(problem: "_Problem", match: SequenceMatch, motion: PictureMotion) -
     for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         steps[start:end] = motion.shifts_px(range(start, end + 1))
     path = motion.path_m[match.events]
-    chains = chains_of(steps, problem.p, problem.e, path, problem.resolution_s, offset, drift)
+    chains = chains_of(
+        steps, problem.p, problem.e, path_m=path, resolution_s=problem.resolution_s, offset=offset, drift=drift
+    )
     if chains is None:
         return None
     clock = _Grid(np.array([offset]), np.array([drift]), (offset, drift), problem.resolution_s)
@@ -163,7 +174,7 @@ def _resolution(times: Array) -> float:
     return 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Problem:
     """Times of photos and events, each relative to its own origin, and the model's parameters.
 

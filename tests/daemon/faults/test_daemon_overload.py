@@ -22,7 +22,20 @@ from tests.kit.mosaic_scene import EAST, NORTH
 
 def pending(seq, east, north=0.0, height=100.0):
     lat, lon = (float(v) for v in GRID.to_geographic([EAST + east, NORTH + north]))
-    return Pending(seq, 0.0, 1, Frame(f"{seq}.jpg", None, "v1", float(seq), Fix(lat, lon, height), *SIZE))
+    return Pending(
+        seq,
+        0.0,
+        1,
+        Frame(
+            image=f"{seq}.jpg",
+            path=None,
+            vehicle="v1",
+            time_s=float(seq),
+            fix=Fix(lat, lon, height),
+            width=SIZE[0],
+            height=SIZE[1],
+        ),
+    )
 
 
 def drained(queue):
@@ -133,7 +146,9 @@ def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path):
     for k in range(90):  # fifteen near one another at each of six places, one place after the other
         pose = parse_pose(pose_of(camera_at(60.0 * (k // 15), 0.4 * (k % 15)), f"{k:03d}.jpg"))
         key = frame_key("v1", pose.image)
-        change = add_frame(key, "v1", pose.image, float(k), store.put(key, ".jpg", data), SIZE, pose.values)
+        change = add_frame(
+            key, "v1", pose.image, time_s=float(k), path=store.put(key, ".jpg", data), size=SIZE, pose=pose.values
+        )
         seq, _ = journal.write(change)
         path = store.path(journal.one("SELECT path FROM frames WHERE seq = ?", (seq,))["path"])
         drawer.add(

@@ -15,7 +15,9 @@ ANY_TEXT = st.text(st.characters(), max_size=60)  # lone surrogates and NUL incl
 
 
 def frame(journal, vehicle, image, time_s=1.0):
-    change = add_frame(frame_key(vehicle, image), vehicle, image, time_s, "ab/x.jpg", (4, 3), {"lat_deg": 1.0})
+    change = add_frame(
+        frame_key(vehicle, image), vehicle, image, time_s=time_s, path="ab/x.jpg", size=(4, 3), pose={"lat_deg": 1.0}
+    )
     return journal.write(change)
 
 

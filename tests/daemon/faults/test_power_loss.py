@@ -156,7 +156,7 @@ def goes_on(workspace, acknowledged, asked, shots):
         assert served.get("/healthz").json()["problems"] == []
 
 
-def fly_until(served, shots, acknowledged, lock, chance, refine):
+def fly_until(served, shots, acknowledged, *, lock, chance, refine):
     """Post for a random while; gives how many refinements were acknowledged, and the thread that goes on posting."""
     asked = 0
     if refine:
@@ -190,7 +190,7 @@ def cut_on_a_copy(tmp_path, monkeypatch, seed, refine, count=12):
     lock = threading.Lock()
     served = start(workspace)
     try:
-        asked, poster = fly_until(served, shots, acknowledged, lock, chance, refine)
+        asked, poster = fly_until(served, shots, acknowledged, lock=lock, chance=chance, refine=refine)
         with lock, halted(served):
             known = dict(acknowledged)
             copy = tmp_path / "dead"
@@ -286,7 +286,7 @@ def cut_on_a_disk(disk, tmp_path, seed, refine, count=12):
     served = start(workspace)
     dead = tmp_path / "dead.img"
     try:
-        asked, poster = fly_until(served, shots, acknowledged, lock, chance, refine)
+        asked, poster = fly_until(served, shots, acknowledged, lock=lock, chance=chance, refine=refine)
         with lock, halted(served):
             known = dict(acknowledged)
             for _ in range(20):  # until the kernel wrote nothing meanwhile: a picture of one moment

@@ -45,7 +45,7 @@ def _fly(flown: FlownLegs, vehicle: str, path: list[tuple[float, float]]) -> Non
 
 
 def test_a_leg_is_over_once_it_was_left_after_its_end() -> None:
-    flown = FlownLegs(_legs(), 20.0, 15.0)
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     _fly(flown, "v1", [(0.0, -30.0), (0.0, 295.0)])
     assert not flown.over.any()
     _fly(flown, "v1", [(0.0, 300.0), (50.0, 330.0)])
@@ -53,7 +53,7 @@ def test_a_leg_is_over_once_it_was_left_after_its_end() -> None:
 
 
 def test_a_leg_is_over_while_its_vehicle_waits_at_its_end() -> None:
-    flown = FlownLegs(_legs(), 20.0, 15.0)
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     _fly(flown, "v1", [(0.0, -30.0), (0.0, 290.0)])
     assert not flown.over.any()
     _fly(flown, "v1", [(0.0, 290.0), (0.0, 299.5), (0.0, 299.5)])
@@ -61,13 +61,13 @@ def test_a_leg_is_over_while_its_vehicle_waits_at_its_end() -> None:
 
 
 def test_crossing_the_ends_of_legs_does_not_fly_them() -> None:
-    flown = FlownLegs(_legs(), 20.0, 15.0)
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     _fly(flown, "v1", [(-40.0, 0.0), (200.0, 0.0), (200.0, 300.0), (-40.0, 300.0)])
     assert not flown.over.any()
 
 
 def test_legs_of_a_vehicle_that_came_home_early_are_over_and_offered_and_those_of_a_lost_one_only_while_it_is() -> None:
-    flown = FlownLegs(_legs(), 20.0, 15.0)
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     flown.look([_row("v1"), _row("v2")])
     assert not flown.over.any() and not flown.remaining()
     flown.look([_row("v1", "returning"), _row("v2", "lost", state="lost")])
@@ -77,11 +77,11 @@ def test_legs_of_a_vehicle_that_came_home_early_are_over_and_offered_and_those_o
 
 
 def test_what_is_over_survives_a_restart() -> None:
-    flown = FlownLegs(_legs(), 20.0, 15.0)
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     flown.look([_row("v1"), _row("v2")])
     _fly(flown, "v2", [(50.0, -30.0), (50.0, 330.0)])
     flown.look([_landed("v1"), _row("v2")])
-    again = FlownLegs(_legs(), 20.0, 15.0)
+    again = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
     again.resume(json.loads(json.dumps(flown.state())))
     assert again.over.tolist() == flown.over.tolist() == [True, True, True, False]
     assert again.remaining() == flown.remaining()

@@ -75,7 +75,7 @@ class _Asking(SimVehicle):
 
 def test_a_vehicle_that_asks_gets_its_tiles(dem: Path) -> None:
     TILES.clear()
-    vehicle = _Asking(1, Autopilot.ARDUPILOT)
+    vehicle = _Asking(system=1, autopilot=Autopilot.ARDUPILOT)
     world = World([vehicle])
     data = TerrainData(dem, world.fleet)
     data.start()

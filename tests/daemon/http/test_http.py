@@ -218,4 +218,4 @@ def test_a_second_daemon_does_not_take_a_living_ones_workspace(served, tmp_path)
     from pathlib import Path
 
     with pytest.raises(InputError, match="another run"):
-        Daemon(Settings(Path(workspace)))
+        Daemon(Settings(workspace=Path(workspace)))

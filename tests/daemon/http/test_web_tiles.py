@@ -165,7 +165,7 @@ def test_edges_do_not_darken(value, alpha):
     source = np.zeros((40, 40, 4), np.uint8)
     source[:, :20] = (value, value, value, 255)
     patch = np.stack(np.meshgrid(np.linspace(5, 35, 256), np.linspace(-35, -5, 256)), -1)
-    tile = resampled(source, GroundGrid(EPSG, 0, 0, 1, 40, 40), patch)
+    tile = resampled(source, GroundGrid(epsg=EPSG, west=0, north=0, gsd_m=1, width=40, height=40), patch)
     shown = tile[..., 3] > 8
     assert np.abs(tile[..., :3][shown].astype(int) - value).max() <= 2
     lower = np.full((256, 256, 4), (10, 20, 30, alpha), np.uint8)

@@ -178,7 +178,7 @@ class Forwarder(SimVehicle):
 
 
 def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
-    vehicle = Forwarder(1, Autopilot.ARDUPILOT, (*HOME, 500.0), boot_utc_s=time.time())
+    vehicle = Forwarder(system=1, autopilot=Autopilot.ARDUPILOT, home=(*HOME, 500.0), boot_utc_s=time.time())
     with (
         SimSwarm([vehicle], "tcpin:127.0.0.1:0") as swarm,
         serving(tmp_path / "w", "--link", swarm.addresses[0], "--source", "v1=can:mavlink") as served,
@@ -193,7 +193,7 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
 
 def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
     said = []
-    reader = CanReader("v1", "socketcan:nothing0", LivePoses("v1"), said.append, None, None)
+    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), tell=said.append, fleet=None, system=None)
     reader.start()
     time.sleep(5.0)  # more than two attempts
     state = reader.document()
@@ -205,4 +205,4 @@ def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
 def test_a_wrong_name_of_a_bus_is_refused(tmp_path):
     for bus in ("nothing:can0", "socketcan", "mavlink:7"):
         with pytest.raises(InputError, match="names no CAN bus"):
-            Settings(tmp_path, vehicles=(VehicleSettings("v1", can=bus),)).check()
+            Settings(workspace=tmp_path, vehicles=(VehicleSettings("v1", can=bus),)).check()

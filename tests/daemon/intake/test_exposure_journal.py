@@ -78,7 +78,7 @@ class _Camera(SimVehicle):
 
 
 def test_events_that_a_bad_link_has_lost_are_asked_for_and_come(tmp_path: Path) -> None:
-    vehicle = _Camera(1, Autopilot.PX4)
+    vehicle = _Camera(system=1, autopilot=Autopilot.PX4)
     world = World([vehicle], down=Faults(loss=0.3, seed=4), up=Faults(loss=0.2, seed=5))
     journal = Journal(tmp_path / "journal.db")
     kept = ExposureJournal(journal, lambda system: f"v{system}")

@@ -25,7 +25,7 @@ def flight(tmp_path_factory):
 
 @pytest.fixture
 def daemon(tmp_path, flight):
-    settings = Settings(tmp_path / "w", basemap=flight[1], coarse=False, silent_s=0.5)
+    settings = Settings(workspace=tmp_path / "w", basemap=flight[1], coarse=False, silent_s=0.5)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         yield daemon
@@ -80,7 +80,7 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
 def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight):
     frames, basemap = flight
     # each daemon ends before it notices the silence
-    settings = Settings(tmp_path / "w", basemap=basemap, coarse=False, silent_s=3600.0)
+    settings = Settings(workspace=tmp_path / "w", basemap=basemap, coarse=False, silent_s=3600.0)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         post(daemon, frames[:16])

@@ -172,7 +172,7 @@ def test_who_waits_for_a_process_is_released_when_the_daemon_stops():
 
 
 def solution():
-    return Solution("v1", [], {}, [], 70.0, 1.0, None)
+    return Solution(vehicle="v1", placed=[], dropped={}, legs=[], fov_deg=70.0, fov_sigma_deg=1.0, terrain=None)
 
 
 def test_a_solution_file_comes_back_as_it_was_written(tmp_path):

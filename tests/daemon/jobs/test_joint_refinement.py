@@ -34,7 +34,7 @@ def flights(tmp_path_factory):
 @pytest.fixture
 def daemon(tmp_path, flights, request):
     """A daemon; its parameter is the movement, in pixels, below which a joint refinement is not drawn."""
-    settings = Settings(tmp_path / "w", basemap=flights[1], coarse=False, redraw_px=request.param)
+    settings = Settings(workspace=tmp_path / "w", basemap=flights[1], coarse=False, redraw_px=request.param)
     settings.workspace.mkdir()
     with Daemon(settings) as daemon:
         yield daemon
@@ -103,7 +103,16 @@ def test_pictures_that_look_far_aside_are_left_out_of_the_refined_map(flights):
     down = Camera(np.array([0.0, 0.0, 60.0]), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(240, 180, 171.0))
     aside = replace(down, rotation=rotation_from_angles(0.0, np.radians(-40.0), 0.0))
     placed = [PlacedFrame(f, aside if k == 5 else down, "fine", 0.1) for k, f in enumerate(frames["v1"])]
-    found = Solution("v1", placed, {"x.jpg": "damaged"}, [], 70.0, 1.0, None, warnings=["a word"])
+    found = Solution(
+        vehicle="v1",
+        placed=placed,
+        dropped={"x.jpg": "damaged"},
+        legs=[],
+        fov_deg=70.0,
+        fov_sigma_deg=1.0,
+        terrain=None,
+        warnings=["a word"],
+    )
     left = without_strays(found)
     assert set(left.dropped) == {"x.jpg", frames["v1"][5].image} and len(left.placed) == len(placed) - 1
     assert len(left.warnings) == 2 and "far aside" in left.warnings[1]
@@ -193,7 +202,9 @@ class Placed:
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
     workers = StoppedWorkers()
-    work = JointRefinement(Rows(), Placed(tmp_path), workers, tmp_path / "map.tif", least_px=0.1)
+    work = JointRefinement(
+        journal=Rows(), publisher=Placed(tmp_path), workers=workers, basemap=tmp_path / "map.tif", least_px=0.1
+    )
     jobs = Jobs(journal, Events(), {"together": work.solve}, slots=1)
     job = jobs.add("together", "v1", 1)
     found = []

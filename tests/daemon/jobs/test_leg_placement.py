@@ -36,7 +36,15 @@ def lawn(legs, per_leg=20, step=5.0, apart=40.0):
 def frames_at(positions, first_s=1e9):
     places = GRID.to_geographic(positions + np.array([500_000.0, 5_000_000.0]))
     return [
-        Frame(f"{k}.jpg", None, "v1", first_s + k, Fix(float(lat), float(lon), 60.0), 160, 120)
+        Frame(
+            image=f"{k}.jpg",
+            path=None,
+            vehicle="v1",
+            time_s=first_s + k,
+            fix=Fix(float(lat), float(lon), 60.0),
+            width=160,
+            height=120,
+        )
         for k, (lat, lon) in enumerate(places)
     ]
 

@@ -16,7 +16,7 @@ def workspace(tmp_path):
     """Settings of a workspace, and the frames of a flight over its map."""
     ground = made_up_ground()
     write_map(ground, tmp_path / "map.tif")
-    settings = Settings(tmp_path / "w", basemap=tmp_path / "map.tif", coarse=False)
+    settings = Settings(workspace=tmp_path / "w", basemap=tmp_path / "map.tif", coarse=False)
     settings.workspace.mkdir()
     return settings, made_up_flight(ground, tmp_path, "v1")[:16]
 

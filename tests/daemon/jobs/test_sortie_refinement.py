@@ -7,7 +7,19 @@ import pytest
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 
-JOB = Job(1, "refine", "v1", 1, "running", 0.0, "", 0.0, 0.0, None, 1)
+JOB = Job(
+    id=1,
+    kind="refine",
+    vehicle="v1",
+    sortie=1,
+    state="running",
+    progress=0.0,
+    message="",
+    created=0.0,
+    started=0.0,
+    ended=None,
+    attempts=1,
+)
 
 
 @dataclass
@@ -30,17 +42,29 @@ class Drawing:
 @pytest.mark.parametrize("busy", [0, 5])
 def test_it_waits_until_the_first_picture_has_begun_the_map(busy):
     drawing = Drawing(busy)
-    SortieRefinement(None, None, None, None, drawing, None).wait_drawn(JOB)
+    SortieRefinement(journal=None, store=None, publisher=None, workers=None, drawer=drawing, basemap=None).wait_drawn(
+        JOB
+    )
     assert drawing.area is not None and drawing.asked == busy + 1
 
 
 def test_it_waits_no_longer_where_no_picture_can_begin_it():
     drawing = Drawing(2, begins=False)
-    SortieRefinement(None, None, None, None, drawing, None).wait_drawn(JOB)
+    SortieRefinement(journal=None, store=None, publisher=None, workers=None, drawer=drawing, basemap=None).wait_drawn(
+        JOB
+    )
     assert drawing.asked == 3
 
 
 def test_it_waits_no_longer_once_the_daemon_ends():
     drawing = Drawing(1000)
-    SortieRefinement(None, None, None, None, drawing, None, stopped=lambda: drawing.asked == 4).wait_drawn(JOB)
+    SortieRefinement(
+        journal=None,
+        store=None,
+        publisher=None,
+        workers=None,
+        drawer=drawing,
+        basemap=None,
+        stopped=lambda: drawing.asked == 4,
+    ).wait_drawn(JOB)
     assert drawing.asked == 4

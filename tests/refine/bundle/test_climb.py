@@ -62,7 +62,9 @@ def test_heights_that_leave_those_around_them_are_as_doubtful_as_they_differ(sce
     for k, height_m in ((0, 20.0), (9, 400.0), (15, 93.0)):
         frames[k] = replace(frames[k], fix=replace(frames[k].fix, height_m=height_m))
     records = read_records(frames, grid, local_origin(grid, frames))
-    told = Calibration(200.0, 90.0, np.zeros(len(frames)), True, 6, [])
+    told = Calibration(
+        focal_px=200.0, height_m=90.0, yaw_offset=np.zeros(len(frames)), trusted_height=True, pairs=6, warnings=[]
+    )
     height, sigma = _height_prior(records, told)
     expected = np.full(len(frames), active().flight.first_height_sigma_m)
     expected[[0, 9]] = 70.0, 310.0

@@ -26,7 +26,7 @@ from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, w
 def begin(world: World, frames) -> SparseStart:
     records = read_photo_records(frames, GRID, ORIGIN)
     start = find_initial_orientation(records, world.pairs, world.features)
-    return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
+    return assemble(frames, records, world.features, pairs=world.pairs, start=start, damaged={}, tried=len(world.pairs))
 
 
 def crosshatch(**options) -> World:

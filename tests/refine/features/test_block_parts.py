@@ -25,7 +25,16 @@ def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):
         "yaw_rad": 0.0,
         "pitch_rad": -np.pi / 2,
     } | fix
-    return Frame(f"{vehicle}/{i:04d}.jpg", Path("none"), vehicle, 1.7e9 + i, Fix(**given), *size, camera=camera)
+    return Frame(
+        image=f"{vehicle}/{i:04d}.jpg",
+        path=Path("none"),
+        vehicle=vehicle,
+        time_s=1.7e9 + i,
+        fix=Fix(**given),
+        width=size[0],
+        height=size[1],
+        camera=camera,
+    )
 
 
 def boustrophedon(legs=3, count=20, step=10.0, apart=60.0):
@@ -91,7 +100,16 @@ def test_long_flights_are_cut_into_even_stretches():
 def solution(vehicle, first, count):
     camera = Camera(np.zeros(3), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(640, 480, 320.0))
     placed = [PlacedFrame(frame(first + i, vehicle), camera, "fine", 0.1) for i in range(count)]
-    return Solution(vehicle, placed, {}, [Leg(vehicle, 0, count - 1, "matched")], 80.0 + first, 0.1, None, state=first)
+    return Solution(
+        vehicle=vehicle,
+        placed=placed,
+        dropped={},
+        legs=[Leg(vehicle=vehicle, first=0, last=count - 1, state="matched")],
+        fov_deg=80.0 + first,
+        fov_sigma_deg=0.1,
+        terrain=None,
+        state=first,
+    )
 
 
 def test_units_of_a_vehicle_are_joined_with_their_legs_in_place():

@@ -115,7 +115,14 @@ def test_a_thousand_photos_of_one_spot_do_not_make_a_million_pairs():
 
 def fake_features(count: int) -> Features:
     uv = np.stack([np.arange(count), np.arange(count)], 1).astype(np.float32)
-    return Features(uv, np.zeros((count, 128), np.uint8), np.ones(count, np.float32), 100, 100, 1.0)
+    return Features(
+        uv=uv,
+        descriptor=np.zeros((count, 128), np.uint8),
+        sigma_px=np.ones(count, np.float32),
+        width=100,
+        height=100,
+        step_px=1.0,
+    )
 
 
 @given(st.integers(0, 10_000))
@@ -164,8 +171,8 @@ def test_points_described_twice_for_two_orientations_are_one_observation():
 def test_thinning_keeps_every_cell_that_was_covered():
     rng = np.random.default_rng(0)
     features = [
-        Features(rng.uniform(0, 100, (400, 2)).astype(np.float32), np.zeros((400, 128), np.uint8),
-                 np.ones(400, np.float32), 100, 100, 1.0) for _ in range(4)
+        Features(uv=rng.uniform(0, 100, (400, 2)).astype(np.float32), descriptor=np.zeros((400, 128), np.uint8),
+                 sigma_px=np.ones(400, np.float32), width=100, height=100, step_px=1.0) for _ in range(4)
     ]  # fmt: skip
     same = np.stack([np.arange(400)] * 2, 1).astype(np.int32)
     tracks = build_tracks(features, [Pair(0, 1, same), Pair(1, 2, same[:200]), Pair(2, 3, same[:100])])
@@ -185,7 +192,12 @@ def test_thinning_keeps_every_cell_that_was_covered():
 )
 def test_overlap_is_measured_from_pictures_without_any_tag(step, low, high, dense):
     ground = texture(5, 500, 2200)
-    frames = [Frame(f"{k}.jpg", Path(f"{k}.jpg"), "v", None, Fix(0.0, 0.0), 480, 360) for k in range(6)]
+    frames = [
+        Frame(
+            image=f"{k}.jpg", path=Path(f"{k}.jpg"), vehicle="v", time_s=None, fix=Fix(0.0, 0.0), width=480, height=360
+        )
+        for k in range(6)
+    ]
     pictures = {f.image: ground[40:400, 40 + k * step : 520 + k * step].copy() for k, f in enumerate(frames)}
     overlap = forward_overlap(frames, lambda f: pictures[f.image])
     assert low < overlap.share < high
@@ -193,7 +205,18 @@ def test_overlap_is_measured_from_pictures_without_any_tag(step, low, high, dens
 
 
 def test_overlap_of_unrelated_pictures_is_nothing_and_not_dense():
-    frames = [Frame(f"{k}.jpg", Path(f"{k}.jpg"), "v", 1.0 * k, Fix(0.0, 0.0), 480, 360) for k in range(3)]
+    frames = [
+        Frame(
+            image=f"{k}.jpg",
+            path=Path(f"{k}.jpg"),
+            vehicle="v",
+            time_s=1.0 * k,
+            fix=Fix(0.0, 0.0),
+            width=480,
+            height=360,
+        )
+        for k in range(3)
+    ]
     overlap = forward_overlap(frames, lambda f: texture(10 + int(f.image[0]))[:360, :480])
     assert overlap.share == 0.0
     assert not overlap.dense

@@ -27,7 +27,7 @@ def begin(world: World, frames=None) -> SparseStart:
     frames = frames or world.frames
     records = read_photo_records(frames, GRID, ORIGIN)
     start = find_initial_orientation(records, world.pairs, world.features)
-    return assemble(frames, records, world.features, world.pairs, start, {}, len(world.pairs))
+    return assemble(frames, records, world.features, pairs=world.pairs, start=start, damaged={}, tried=len(world.pairs))
 
 
 def crosshatch(**options) -> World:
@@ -153,7 +153,9 @@ def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then()
     world, frames = two_vehicles()
     records = read_photo_records(frames, GRID, ORIGIN, share_lenses=True)
     plane = find_initial_orientation(records, world.pairs, world.features)
-    start = assemble(frames, records, world.features, world.pairs, plane, {}, len(world.pairs))
+    start = assemble(
+        frames, records, world.features, pairs=world.pairs, start=plane, damaged={}, tried=len(world.pairs)
+    )
     assert len(start.cameras.lens) == 1
     assert len(start.plane.tags) == 2
     own = own_lenses(solve_sparse(start), start)

@@ -18,7 +18,7 @@ from tests.kit.mosaic_scene import EAST, NORTH, hills, terrain_of
 
 EPSG = 32631
 GRID = LocalGrid(EPSG)
-LENS = Lens(640, 480, 457.0, -0.05, 0.01)
+LENS = Lens(640, 480, 457.0, k1=-0.05, k2=0.01)
 
 
 @given(
@@ -58,7 +58,15 @@ def flight(tmp_path_factory):
 def solution_of(frames):
     """A perfect refinement."""
     placed = recorded_cameras(frames, GRID).placed
-    return Solution("v1", [PlacedFrame(p.frame, p.camera, "fine", 0.1) for p in placed], {}, [], 70.0, 0.1, None)
+    return Solution(
+        vehicle="v1",
+        placed=[PlacedFrame(p.frame, p.camera, "fine", 0.1) for p in placed],
+        dropped={},
+        legs=[],
+        fov_deg=70.0,
+        fov_sigma_deg=0.1,
+        terrain=None,
+    )
 
 
 def moved(frame, east_m, north_m):

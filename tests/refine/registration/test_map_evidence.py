@@ -13,7 +13,7 @@ def evidence(shift, leg=None, ground=None, rng=None):
     if ground is None:
         ground = np.column_stack([50.0 * np.arange(count), np.zeros(count)])
     leg = np.zeros(count, np.int32) if leg is None else leg
-    return false_matches_log10(ground, shift, np.arange(count, dtype=float), leg, REACH_M, PATCH_M)
+    return false_matches_log10(ground, shift, np.arange(count, dtype=float), leg=leg, reach_m=REACH_M, patch_m=PATCH_M)
 
 
 def anywhere(count, seed):

@@ -20,7 +20,15 @@ def recorded(vehicles: int, sigma_m: float | None = None, count: int = 20) -> li
     for v in range(vehicles):
         for k in range(count):
             fix = Fix(48.0, 11.0, 80.0, position_sigma_m=sigma_m)
-            frame = Frame(f"v{v}/{k:03d}.jpg", Path("x.jpg"), f"v{v}", float(k), fix, 640, 480)
+            frame = Frame(
+                image=f"v{v}/{k:03d}.jpg",
+                path=Path("x.jpg"),
+                vehicle=f"v{v}",
+                time_s=float(k),
+                fix=fix,
+                width=640,
+                height=480,
+            )
             placed.append(PlacedFrame(frame, Camera(np.array([10.0 * k, 50.0 * v, 80.0]), down, LENS), "realtime", 3.0))
     return placed
 

@@ -82,7 +82,16 @@ def pictures_of(world, offset):
 
 def test_a_strip_is_found_although_light_and_dark_changed_places(world):
     cameras, images = pictures_of(world, (17.0, -9.0))
-    found = register(cameras, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=40.0, gsd_m=1.0)
+    found = register(
+        cameras,
+        np.arange(6),
+        lambda i: images[i],
+        basemap=world,
+        origin=np.zeros(2),
+        ground_z=0.0,
+        reach_m=40.0,
+        gsd_m=1.0,
+    )
     np.testing.assert_allclose(found.shift, (-17.0, 9.0), atol=0.3)
     assert found.ratio < 0.6
 
@@ -90,7 +99,19 @@ def test_a_strip_is_found_although_light_and_dark_changed_places(world):
 def test_a_map_elsewhere_gives_no_match(world):
     cameras, images = pictures_of(world, (0.0, 0.0))
     away = CameraBlock(cameras.position + np.array([900.0, 0, 0]), cameras.rotation, cameras.lens_id, cameras.lens)
-    assert register(away, np.arange(6), lambda i: images[i], world, np.zeros(2), 0.0, reach_m=60.0, gsd_m=2.0) is None
+    assert (
+        register(
+            away,
+            np.arange(6),
+            lambda i: images[i],
+            basemap=world,
+            origin=np.zeros(2),
+            ground_z=0.0,
+            reach_m=60.0,
+            gsd_m=2.0,
+        )
+        is None
+    )
 
 
 def test_correlation_finds_fractions_of_a_pixel():
@@ -117,7 +138,17 @@ def faint_strips(shift, count=4, reach=30, seed=0):
         gray = view + 2.0 * view.std() * noise / noise.std()
         ground = whole[r - reach : r + 100 + reach, c - reach : c + 160 + reach]
         mask = np.ones(view.shape, bool), np.ones(ground.shape, bool)
-        strips.append(Strip(gray.astype(np.float32), mask[0], ground.copy(), mask[1], reach, 2.0, (0.0, 0.0)))
+        strips.append(
+            Strip(
+                gray=gray.astype(np.float32),
+                valid=mask[0],
+                ground=ground.copy(),
+                known=mask[1],
+                reach=reach,
+                gsd_m=2.0,
+                offset=(0.0, 0.0),
+            )
+        )
     return strips
 
 
@@ -170,7 +201,7 @@ def raised_ground(height_m):
 @pytest.mark.parametrize("height_m", [-2.5, 0.0, 3.0])
 def test_the_map_tells_the_height_of_what_is_seen_obliquely(height_m):
     flight, ground = raised_ground(height_m)
-    points, sigma = map_heights(flight, GroundModel(), ground, np.zeros((0, 2)), np.full(50, 0.1))
+    points, sigma = map_heights(flight, GroundModel(), ground, others=np.zeros((0, 2)), tie_sigma_m=np.full(50, 0.1))
     assert len(points) > 50
     assert np.median(np.abs(points[:, 2] - height_m)) < 0.15
     assert np.percentile(np.abs(points[:, 2] - height_m), 90) < 0.5
@@ -182,12 +213,16 @@ def test_the_map_tells_the_height_of_what_is_seen_obliquely(height_m):
 def test_ground_that_another_vehicle_sees_better_is_left_to_it():
     flight, ground = raised_ground(0.0)
     other = np.array([[x, 80.0] for x in np.linspace(-100, 100, 9)])
-    points, _ = map_heights(flight, GroundModel(), ground, other, np.full(50, 0.1))
+    points, _ = map_heights(flight, GroundModel(), ground, others=other, tie_sigma_m=np.full(50, 0.1))
     assert len(points)
     assert (points[:, 1] < 45.0).all()
-    assert not len(map_heights(flight, GroundModel(), ground, other, np.zeros(0))[0])  # no ties, no heights
+    assert not len(
+        map_heights(flight, GroundModel(), ground, others=other, tie_sigma_m=np.zeros(0))[0]
+    )  # no ties, no heights
     flight.leg = np.full(5, -1, np.int32)
-    assert not len(map_heights(flight, GroundModel(), ground, other, np.full(50, 0.1))[0])  # nor without a leg
+    assert not len(
+        map_heights(flight, GroundModel(), ground, others=other, tie_sigma_m=np.full(50, 0.1))[0]
+    )  # nor without a leg
 
 
 def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
@@ -198,7 +233,17 @@ def test_points_are_tied_to_a_tenth_of_a_map_pixel(world):
     camera = np.abs(points[:, None, 0] - cameras.position[None, :, 0]).argmin(1).astype(np.int32)
     ground = LoadedMap.load(inverted, np.zeros(2), BoundingBox(-120.0, -80.0, 120.0, 100.0), GSD)
     flipped = [255 - im for im in images]
-    found = match_points(cameras, points, np.arange(9), camera, lambda i: flipped[i], ground, 16, 10, np.zeros(9))
+    found = match_points(
+        cameras,
+        points,
+        np.arange(9),
+        camera=camera,
+        gray=lambda i: flipped[i],
+        ground=ground,
+        half=16,
+        reach=10,
+        level=np.zeros(9),
+    )
     assert len(found.point) == 9
     np.testing.assert_allclose(found.shift, np.tile([-1.5, 0.8], (9, 1)), atol=0.1)
     assert (found.ratio < 0.8).all()
@@ -210,7 +255,17 @@ def test_raised_corners_are_tied_by_the_ground_around_them(world):
     camera = np.array([2, 2], np.int32)
     ground = LoadedMap.load(world, np.zeros(2), BoundingBox(-120.0, -80.0, 120.0, 100.0), GSD)
     plain = [255 - im for im in images]
-    found = match_points(cameras, raised, np.arange(2), camera, lambda i: plain[i], ground, 16, 10, np.zeros(2))
+    found = match_points(
+        cameras,
+        raised,
+        np.arange(2),
+        camera=camera,
+        gray=lambda i: plain[i],
+        ground=ground,
+        half=16,
+        reach=10,
+        level=np.zeros(2),
+    )
     np.testing.assert_allclose(found.shift, 0.0, atol=0.1)
 
 
@@ -273,7 +328,16 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
     chosen = np.arange(len(points))
     found = clear_matches(
         match_points(
-            cameras, points, chosen, camera, flight.pictures.gray, loaded, 20, 10, np.zeros(len(points)), texture_field
+            cameras,
+            points,
+            chosen,
+            camera=camera,
+            gray=flight.pictures.gray,
+            ground=loaded,
+            half=20,
+            reach=10,
+            level=np.zeros(len(points)),
+            field=texture_field,
         )
     )
     off = found.shift.mean(0)

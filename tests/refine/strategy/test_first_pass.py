@@ -25,12 +25,12 @@ def opened(monkeypatch):
     def singular(*_):
         raise AdjustmentError("the adjustment is singular")
 
-    def sparse(units, *rest):
+    def sparse(units, *rest, **named):
         names = [unit[0].vehicle for unit in units]
         asked.append(names)
         if any(test(names) for test in breaks):
             raise AdjustmentError("the adjustment is singular")
-        return open_together(units, *rest)
+        return open_together(units, *rest, **named)
 
     open_together = first_pass.open_sparse_flights
     monkeypatch.setattr(vehicle_passes, "adjust_without_map", singular)

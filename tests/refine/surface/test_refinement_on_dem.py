@@ -73,13 +73,13 @@ def without(scene):
 def test_a_right_model_gives_the_ground_and_the_map_is_as_good(scene, without, tmp_path):
     vehicles, grid, basemap, _, (heights, _) = scene
     given = options(tmp_path, scene, heights)
-    refined = refine_all(vehicles, basemap, grid, given)
+    refined = refine_all(vehicles, basemap, grid, options=given)
     assert refined.warnings == []
     assert np.abs(off_ground(refined, scene)).max() < 0.3
     assert np.percentile(np.abs(off_ground(refined, scene)), 90) < np.percentile(np.abs(off_ground(without, scene)), 90)
     assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.05
     assert all(leg.state == "matched" for s in refined.fine for leg in s.legs)
-    processes = refine_all(vehicles, basemap, grid, given, through_pickle)
+    processes = refine_all(vehicles, basemap, grid, options=given, run=through_pickle)
     for one, other in zip(refined.fine, processes.fine, strict=True):
         assert len(pickle.dumps(one.state.surface)) < 60_000  # no raster travels
         for p, q in zip(one.placed, other.placed, strict=True):
@@ -100,7 +100,7 @@ def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):
     vehicles, grid, basemap, _, (heights, _) = scene
     half = heights.copy()
     half[:, : heights.shape[1] // 2] = np.nan
-    refined = refine_all(vehicles, basemap, grid, options(tmp_path, scene, half))
+    refined = refine_all(vehicles, basemap, grid, options=options(tmp_path, scene, half))
     assert any("elsewhere the ground is found from the pictures" in w for w in refined.warnings)
     assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.05
     with_it, without_it = (
@@ -113,7 +113,7 @@ def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):
 
 def test_a_model_of_another_place_is_told_and_does_no_harm(scene, without, tmp_path):
     vehicles, grid, basemap, _, (heights, _) = scene
-    refined = refine_all(vehicles, basemap, grid, options(tmp_path, scene, 3.0 * heights[::-1, ::-1]))
+    refined = refine_all(vehicles, basemap, grid, options=options(tmp_path, scene, 3.0 * heights[::-1, ::-1]))
     assert any("contradicts" in w for w in refined.warnings)
     assert np.median(all_errors(refined, scene)) < np.median(all_errors(without, scene)) + 0.1
     assert np.abs(off_ground(refined, scene)).max() < np.abs(off_ground(without, scene)).max() + 0.5

@@ -34,7 +34,7 @@ SWEEP = (Sweep.large().at_height(100.0),)
 
 def test_the_sweep_finds_the_surface_to_decimetres(hilly):
     cameras, leg, gray = hilly
-    found = dense_ground(cameras, gray, cells(), Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     error = found.points[:, 2] - hill(found.points[:, :2])
     assert len(found.points) > 0.8 * len(cells())
     assert abs(np.median(error)) < 0.05
@@ -45,7 +45,7 @@ def test_the_sweep_finds_the_surface_to_decimetres(hilly):
 
 def test_points_stay_by_their_cells(hilly):
     cameras, leg, gray = hilly
-    found = dense_ground(cameras, gray, cells(), Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     beside = np.hypot(*(found.points[:, :2] - cells()[found.cell]).T)
     assert beside.max() < 8.0
     assert len(np.unique(found.cell)) == len(found.cell)
@@ -55,7 +55,7 @@ def test_distortion_is_honoured():
     cameras, leg = rig_of(legs=1, k1=-0.06)
     gray = Pictures(cameras, hill)
     at = cells(pad=30)[:, :]
-    found = dense_ground(cameras, gray, at, Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, at, terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     error = found.points[:, 2] - hill(found.points[:, :2])
     assert len(error) > 100
     assert np.median(np.abs(error)) < 0.12
@@ -63,9 +63,9 @@ def test_distortion_is_honoured():
 
 def test_results_do_not_depend_on_how_many_pictures_are_held(hilly):
     cameras, leg, gray = hilly
-    wide = dense_ground(cameras, gray, cells(), Terrain.flat(1.0), leg, SWEEP, slots=64)
+    wide = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP, slots=64)
     gray.read.clear()
-    narrow = dense_ground(cameras, gray, cells(), Terrain.flat(1.0), leg, SWEEP, slots=2)
+    narrow = dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP, slots=2)
     np.testing.assert_array_equal(wide.points, narrow.points)
     assert len(gray.read) < 4 * len(cameras)
 
@@ -73,7 +73,7 @@ def test_results_do_not_depend_on_how_many_pictures_are_held(hilly):
 def test_each_picture_is_read_once_when_the_window_is_wide(hilly):
     cameras, leg, gray = hilly
     gray.read.clear()
-    dense_ground(cameras, gray, cells(), Terrain.flat(1.0), leg, SWEEP)
+    dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP)
     assert len(gray.read) == len(set(gray.read))
 
 
@@ -81,9 +81,11 @@ def test_cameras_without_a_leg_are_not_used(hilly):
     cameras, leg, gray = hilly
     gray.read.clear()
     without = np.where(np.arange(len(cameras)) == 3, -1, leg)
-    dense_ground(cameras, gray, cells(), Terrain.flat(1.0), without, SWEEP)
+    dense_ground(cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=without, sweeps=SWEEP)
     assert 3 not in gray.read
-    nothing = dense_ground(cameras, gray, cells(), Terrain.flat(1.0), np.full(len(cameras), -1), SWEEP)
+    nothing = dense_ground(
+        cameras, gray, cells(), terrain=Terrain.flat(1.0), leg_of_camera=np.full(len(cameras), -1), sweeps=SWEEP
+    )
     assert nothing.points.shape == (0, 3)
 
 
@@ -92,18 +94,20 @@ def test_ground_beyond_the_ends_of_legs_is_measured_between_legs():
     cameras, leg = rig_of(legs=3, per_leg=4)
     gray = Pictures(cameras, hill)
     at = np.c_[np.arange(0.0, 121.0, 4.0), np.full(31, -66.0)]
-    found = dense_ground(cameras, gray, at, Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, at, terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     error = found.points[:, 2] - hill(found.points[:, :2])
     assert len(error) > 8
     assert np.abs(error).max() < 0.3
-    alone = dense_ground(cameras, gray, at, Terrain.flat(0.0), np.where(leg == 1, 1, -1), SWEEP)
+    alone = dense_ground(
+        cameras, gray, at, terrain=Terrain.flat(0.0), leg_of_camera=np.where(leg == 1, 1, -1), sweeps=SWEEP
+    )
     assert len(alone.points) == 0
 
 
 def test_featureless_ground_gives_nothing():
     cameras, leg = rig_of(legs=1)
     gray = Pictures(cameras, hill, np.full((1100, 1100), 130.0, np.float32))
-    found = dense_ground(cameras, gray, cells(pad=20), Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, cells(pad=20), terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     assert len(found.points) < 0.02 * len(cells(pad=20))
 
 
@@ -112,17 +116,24 @@ def test_a_repeating_texture_is_resolved_by_several_baselines_and_refused_with_o
     stripes = np.tile((120 + 60 * np.sin(np.arange(1100) * 0.785))[:, None], (1, 1100)).astype(np.float32)
     gray = Pictures(cameras, hill, stripes)  # repeats along the flight every 3.2 m
     middle = cells(pad=20)[np.abs(cells(pad=20)[:, 1] - 99) < 25]  # seen from 54 m fore and aft
-    found = dense_ground(cameras, gray, middle, Terrain.flat(0.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, middle, terrain=Terrain.flat(0.0), leg_of_camera=leg, sweeps=SWEEP)
     assert len(found.points) > 0.8 * len(middle)
     assert np.percentile(np.abs(found.points[:, 2] - hill(found.points[:, :2])), 95) < 0.5
-    lone = dense_ground(cameras, gray, middle, Terrain.flat(0.0), leg, [replace(SWEEP[0], baselines_m=(54.0,))])
+    lone = dense_ground(
+        cameras,
+        gray,
+        middle,
+        terrain=Terrain.flat(0.0),
+        leg_of_camera=leg,
+        sweeps=[replace(SWEEP[0], baselines_m=(54.0,))],
+    )
     assert len(lone.points) < 0.1 * len(middle)
 
 
 def test_positions_nobody_sees_are_left_out(hilly):
     cameras, leg, gray = hilly
     far = np.array([[900.0, 900.0], [30.0, 100.0]])
-    found = dense_ground(cameras, gray, far, Terrain.flat(1.0), leg, SWEEP)
+    found = dense_ground(cameras, gray, far, terrain=Terrain.flat(1.0), leg_of_camera=leg, sweeps=SWEEP)
     assert 0 not in found.cell
 
 
@@ -133,8 +144,8 @@ def test_large_pictures_are_shrunk_to_what_the_sweep_needs():
     fine[:, [0, 6, 7]] *= 3
     double = CameraBlock(cameras.position, cameras.rotation, cameras.lens_id, fine)
     big = lambda i: cv2.resize(gray(i), (3 * WIDTH, 3 * HEIGHT), interpolation=cv2.INTER_LINEAR)  # noqa: E731
-    coarse = dense_ground(cameras, gray, cells(pad=20), Terrain.flat(0.0), leg)
-    shrunk = dense_ground(double, big, cells(pad=20), Terrain.flat(0.0), leg)
+    coarse = dense_ground(cameras, gray, cells(pad=20), terrain=Terrain.flat(0.0), leg_of_camera=leg)
+    shrunk = dense_ground(double, big, cells(pad=20), terrain=Terrain.flat(0.0), leg_of_camera=leg)
     assert len(shrunk.points) > 0.8 * len(coarse.points)
     error = shrunk.points[:, 2] - hill(shrunk.points[:, :2])
     assert np.median(np.abs(error)) < 0.2
@@ -147,14 +158,14 @@ def test_the_offset_is_that_of_the_open_ground(hilly):
     east, north = np.meshgrid(-300 + 5.0 * np.arange(120), -300 + 5.0 * np.arange(160))
     for offset in (0.0, 0.4):
         surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
-        found = measure_ground_offset(cameras, gray, positions, surface, leg)
+        found = measure_ground_offset(cameras, gray, positions, terrain=surface, leg_of_camera=leg)
         assert found.count > 200
         assert found.ground_offset_m == pytest.approx(-offset, abs=0.08)
 
 
 def test_too_few_heights_give_no_offset(hilly):
     cameras, leg, gray = hilly
-    found = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), Terrain.flat(3.0), leg)
+    found = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), terrain=Terrain.flat(3.0), leg_of_camera=leg)
     assert found.ground_offset_m == 0.0
 
 
@@ -179,7 +190,7 @@ def test_a_wall_in_the_terrain_reads_no_pixel_outside_a_picture():
     z[:, 30:] = 45.0  # a stadium in a height model, 2 m nodes: slopes of 20
     wall = Terrain(-20.0, 0.0, 2.0, z)
     cells = np.stack(np.meshgrid(np.linspace(20.0, 60.0, 60), np.linspace(20.0, 90.0, 20)), -1).reshape(-1, 2)
-    found = dense_ground(cameras, pictures, cells, wall, leg)
+    found = dense_ground(cameras, pictures, cells, terrain=wall, leg_of_camera=leg)
     assert np.isfinite(found.points).all()
 
 

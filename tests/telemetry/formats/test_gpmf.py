@@ -51,7 +51,7 @@ def test_gps9_is_read_with_a_time_for_each_sample():
 
 
 def test_positions_stand_between_the_samples_of_the_track(tmp_path):
-    scan = VideoScan(tmp_path / "a.mp4", "h264", 64, 48, rate=10.0)
+    scan = VideoScan(path=tmp_path / "a.mp4", codec="h264", width=64, height=48, rate=10.0)
     scan.pictures = [PictureNote(0.1 * i) for i in range(10)]
     scan.gpmf_samples = [(i / 18, sample) for i, sample in enumerate(read_gpmf(gps5()))]
     pose = Poses(scan).of(5)

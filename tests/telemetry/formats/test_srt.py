@@ -165,7 +165,7 @@ def test_djmd_of_an_avata_and_of_an_action_camera():
 
 
 def test_the_utc_of_an_action_camera_dates_its_pictures_between_the_seconds(tmp_path):
-    scan = VideoScan(tmp_path / "a.mp4", "h264", 64, 48, rate=10.0)
+    scan = VideoScan(path=tmp_path / "a.mp4", codec="h264", width=64, height=48, rate=10.0)
     scan.pictures = [PictureNote(0.1 * i) for i in range(40)]
     for i in range(40):
         text = f"2024-05-06 10:11:{12 + (3 + i) // 10:02d}".encode()  # the video begins at 12.3 s

@@ -200,14 +200,19 @@ def test_the_sharpest_of_neighbours_is_taken():
     for number in range(40):
         sample = Sample(lat_deg=47.0 + number * METRE, lon_deg=8.0)
         sharp = 40.0 if number % 10 == 1 else 5.0
-        taken += [c.number for c in picker.push(Candidate(number, Blurred(sharp), sample, number / 10))]
+        taken += [
+            c.number
+            for c in picker.push(Candidate(number=number, frame=Blurred(sharp), sample=sample, video_s=number / 10))
+        ]
     assert taken[:3] == [0, 11, 21]
 
 
 def test_a_hovering_drone_gives_one_picture():
     picker = Picker(every_m=5.0)
     sample = Sample(lat_deg=47.0, lon_deg=8.0)
-    taken = [c for n in range(100) for c in picker.push(Candidate(n, Blurred(1), sample, n / 10))]
+    taken = [
+        c for n in range(100) for c in picker.push(Candidate(number=n, frame=Blurred(1), sample=sample, video_s=n / 10))
+    ]
     assert len([*taken, *picker.flush()]) == 1
 
 

@@ -34,7 +34,7 @@ class LossyLink(Link):
 
     def __init__(self, link, up, down):
         super().__init__(link.name)
-        self.link, self.up, self.down = link, Channel(up), Channel(down)
+        self.link, self.up, self.down = link, Channel(faults=up), Channel(faults=down)
 
     def open(self, selector, now):
         self.link.open(_Renamed(selector, self), now)
@@ -88,7 +88,7 @@ class Simulated:
 
     def __init__(self, autopilot, faults=None):
         up, down = faults or (Faults(), Faults())
-        self.world = World([SimVehicle(1, autopilot, ready_s=5.0)], up, down)
+        self.world = World([SimVehicle(system=1, autopilot=autopilot, ready_s=5.0)], up, down)
         self.fleet, self.events = self.world.fleet, self.world.events
         self.close = self.world.fleet.close
 
@@ -162,7 +162,7 @@ class Site:
         return [e.kind for e in self.place.events[self.begun :] if e.system == self.system and e.kind in missions]
 
     def mission(self, *last, height=15.0, legs=2):
-        items = [self.at(TAKEOFF, 0, 0, height), MissionItem(CHANGE_SPEED, params=(1.0, 8.0, -1.0, 0.0))]
+        items = [self.at(TAKEOFF, 0, 0, height), MissionItem(command=CHANGE_SPEED, params=(1.0, 8.0, -1.0, 0.0))]
         for leg in range(legs):
             ends = (5.0, 45.0) if leg % 2 == 0 else (45.0, 5.0)
             items += [
@@ -174,7 +174,9 @@ class Site:
         return build_mission(self.vehicle.autopilot, [*items, *last])
 
     def at(self, command, north, east, height):
-        return MissionItem(command, 3, (0.0, 0.0, 0.0, math.nan), *self.chart.to_degrees(north, east), height)
+        lat, lon = self.chart.to_degrees(north, east)
+        yaw_free = (0.0, 0.0, 0.0, math.nan)
+        return MissionItem(command=command, frame=3, params=yaw_free, lat_deg=lat, lon_deg=lon, alt_m=height)
 
     def fly(self, *last):
         upload = self.finish(self.fleet.upload(self.system, self.mission(*last)))
@@ -184,7 +186,7 @@ class Site:
 
 
 def trigger(distance):
-    return MissionItem(TRIGGER_DISTANCE, params=(distance, 0.0, 1.0 if distance else 0.0, 0.0))
+    return MissionItem(command=TRIGGER_DISTANCE, params=(distance, 0.0, 1.0 if distance else 0.0, 0.0))
 
 
 PLACES = [
@@ -214,7 +216,7 @@ def make_site(request):
 
 def last_items(site, ending):
     return {
-        "rtl": [MissionItem(RTL)],
+        "rtl": [MissionItem(command=RTL)],
         "land": [site.at(LAND, 3, 3, 0.0)],
         "waypoint": [site.at(WAYPOINT, 3, 3, 15.0)],
         "do": [site.at(WAYPOINT, 3, 3, 15.0), trigger(0.0)],
@@ -259,16 +261,16 @@ def test_loiter_unlimited_and_the_operators_rtl_are_no_completion(make_site):
 
 def test_a_new_upload_after_a_flight_is_not_complete(make_site):
     site = make_site()
-    site.fly(MissionItem(RTL))
+    site.fly(MissionItem(command=RTL))
     assert site.place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)
-    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(RTL), height=18.0))).ok
+    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL), height=18.0))).ok
     site.place.until(lambda: False, 5.0)
     assert site.kinds() == ["started", "complete"]
 
 
 def test_pause_and_resume(make_site):
     site = make_site()
-    site.fly(MissionItem(RTL))
+    site.fly(MissionItem(command=RTL))
     site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 100.0)
     site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 100.0)
     assert site.finish(site.fleet.pause(site.system)).ok
@@ -296,14 +298,14 @@ def test_an_upload_through_thirty_percent_loss_both_ways(make_site):
     faults = (Faults(loss=0.3, duplicate=0.1, seed=1), Faults(loss=0.3, duplicate=0.1, seed=2))
     site = make_site(faults)
     for height in (15.0, 16.0):
-        mission = site.mission(MissionItem(RTL), height=height)
+        mission = site.mission(MissionItem(command=RTL), height=height)
         outcome = site.finish(site.fleet.upload(site.system, mission), 180.0)
         assert outcome is not None and outcome.ok, outcome
 
 
 def test_a_mission_that_is_refused_names_the_item_and_leaves_no_success(make_site):
     site = make_site()
-    good = site.mission(MissionItem(RTL))
+    good = site.mission(MissionItem(command=RTL))
     assert site.finish(site.fleet.upload(site.system, good)).ok
     items = list(good.items)
     wrong = good.first_seq + 2

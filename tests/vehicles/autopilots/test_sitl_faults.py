@@ -88,7 +88,7 @@ def per_autopilot(site, **kinds):
 
 
 def on_mission(site):
-    site.fly(MissionItem(RTL))
+    site.fly(MissionItem(command=RTL))
     return site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 120.0)
 
 
@@ -145,7 +145,7 @@ def test_a_mission_is_flown_in_wind_of_twelve_metres_a_second(site, parameters):
     if site.vehicle.autopilot is PX4:
         pytest.skip("the simulation inside PX4 has no wind")
     parameters.set(SIM_WIND_SPD=12, SIM_WIND_DIR=270)
-    site.fly(MissionItem(RTL))
+    site.fly(MissionItem(command=RTL))
     began, leans, words = time.monotonic(), [], []
 
     def done():
@@ -164,7 +164,7 @@ def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(ad
     try:
         site = Site(place)
         began = time.monotonic()
-        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(RTL))))
+        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL))))
         assert upload.ok, upload
         uploaded = time.monotonic() - began
         assert site.finish(site.fleet.start(site.system)).ok
@@ -252,7 +252,7 @@ def test_a_second_station_that_asks_for_everything_disturbs_nothing(address):
         heard = []
         second.subscribe(lambda vehicle, message, utc: heard.append(message), "PARAM_VALUE")
         reading = second.call(lambda: (second._dialogues.send(to.system, asked), second.download(to.system))[1])
-        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(RTL))))
+        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL))))
         assert upload.ok, upload
         assert site.finish(site.fleet.start(site.system)).ok
         assert place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)

@@ -216,7 +216,7 @@ def products(served, workspace):
 
 
 def test_pictures_are_taken_at_even_moments_of_the_vehicles_clock():
-    shutter = Shutter(0.5, 20.0)
+    shutter = Shutter(every_s=0.5, above_m=20.0)
     assert shutter.due(100.0, False, 50.0) is None
     assert shutter.due(100.0, True, 5.0) is None
     moments = [m for now in np.arange(100.0, 103.0, 0.1) if (m := shutter.due(float(now), True, 50.0)) is not None]
@@ -226,7 +226,7 @@ def test_pictures_are_taken_at_even_moments_of_the_vehicles_clock():
 
 
 def test_a_camera_that_is_far_behind_skips_and_says_so():
-    shutter = Shutter(0.5, 20.0)
+    shutter = Shutter(every_s=0.5, above_m=20.0)
     assert shutter.due(100.0, True, 50.0) == pytest.approx(100.0 - LATE_S)
     late = shutter.due(130.0, True, 50.0)
     assert late is not None and 130.0 - late < 2.0
@@ -235,7 +235,7 @@ def test_a_camera_that_is_far_behind_skips_and_says_so():
 
 
 def test_a_camera_that_is_too_slow_takes_pictures_farther_apart_without_holes():
-    shutter, now, moments = Shutter(0.5, 20.0), 100.0, []
+    shutter, now, moments = Shutter(every_s=0.5, above_m=20.0), 100.0, []
     while now < 220.0:
         moment = shutter.due(now, True, 50.0)
         moments += [] if moment is None else [moment]
@@ -247,7 +247,7 @@ def test_a_camera_that_is_too_slow_takes_pictures_farther_apart_without_holes():
 
 
 def test_pictures_can_follow_the_autopilots_triggers():
-    shutter = Shutter(0.5, 20.0, on_trigger=True)
+    shutter = Shutter(every_s=0.5, above_m=20.0, on_trigger=True)
     shutter.exposed(99.0)
     assert shutter.due(99.1, True, 50.0) is None  # telemetry from behind it is still to come
     assert shutter.due(99.5, True, 50.0) == 99.0

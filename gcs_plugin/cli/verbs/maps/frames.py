@@ -51,7 +51,9 @@ def run(args: argparse.Namespace) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=args.out, prefix=".taking-") as cache, ProgressBars() as progress:
             layouts = tuple(args.sei_layout)
-            options = LoadOptions(args.every_m, args.every_s, Path(cache), exclude=(args.out,), sei_layouts=layouts)
+            options = LoadOptions(
+                every_m=args.every_m, every_s=args.every_s, cache=Path(cache), exclude=(args.out,), sei_layouts=layouts
+            )
             found = load(args.inputs, progress=progress, options=options)
             require_frames(found)
             taken: set[Path] = set()

@@ -94,10 +94,13 @@ def run(args: argparse.Namespace) -> int:
 
     def load(progress: pipeline.Progress) -> Ingest:
         reading = telemetry.LoadOptions(
-            args.every_m, args.every_s, args.out / ".work" / VIDEO, exclude=(args.out,),
+            every_m=args.every_m,
+            every_s=args.every_s,
+            cache=args.out / ".work" / VIDEO,
+            exclude=(args.out,),
             sei_layouts=tuple(args.sei_layout),
             run=None if args.cluster or pool is None else pool.map,
-        )  # fmt: skip
+        )
         return telemetry.load(args.inputs, progress=progress, options=reading)
 
     if args.out.is_file():

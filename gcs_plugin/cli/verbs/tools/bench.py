@@ -112,7 +112,9 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.scaling import plot_scaling, run_scaling, scaling_table
 
     counts, images = numbers(args.vehicles, "--vehicles"), numbers(args.images, "--images")
-    result = run_scaling(args.sets[0], counts, images, args.refine, args.out, args.workers, args.keep)
+    result = run_scaling(
+        args.sets[0], counts, images, refine=args.refine, out=args.out, workers=args.workers, maps=args.keep
+    )
     plot_scaling(result, args.figures or args.out)
     return result, scaling_table(result)
 
@@ -124,13 +126,13 @@ def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
         raise InputError("--every, --limit-s and --workers take numbers above 0")
     settings = Settings(
-        tuple(_list(args.programs)),
-        args.out.absolute(),
-        args.environments or args.out.absolute() / "environments",
-        args.limit_s,
-        args.every,
-        args.workers or 1,
-        args.keep,
+        programs=tuple(_list(args.programs)),
+        out=args.out.absolute(),
+        environments=args.environments or args.out.absolute() / "environments",
+        limit_s=args.limit_s,
+        every=args.every,
+        threads=args.workers or 1,
+        keep_maps=args.keep,
     )
     result = run_peers(args.sets, settings)
     thin = f"-every{args.every}" if args.every > 1 else ""

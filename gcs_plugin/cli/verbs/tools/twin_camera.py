@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
             crew = Crew(
                 fleet, stage, site, args.stream, seed=args.seed, level=args.level, opened=_opened,
                 rays=1 if args.fast else 2,
-                shutter=lambda: Shutter(1.0 / args.rate, args.above, args.on_trigger),
+                shutter=lambda: Shutter(every_s=1.0 / args.rate, above_m=args.above, on_trigger=args.on_trigger),
             )  # fmt: skip
             print(f"map: {folder / 'basemap.tif'}; area: {folder / 'area.geojson'}", file=sys.stderr, flush=True)
             _watch(crew, fleet, stop)

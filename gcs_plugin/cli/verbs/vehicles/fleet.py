@@ -285,7 +285,9 @@ def _upload(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, f
         files = {found[0]: prepared.single}
     missions = {s: read_mission(path, backend.autopilot(s)) for s, path in files.items() if s in found}
     outcomes = {
-        s: Outcome(False, f"vehicle {s} was not heard; check its link and system id") for s in files if s not in found
+        s: Outcome(ok=False, text=f"vehicle {s} was not heard; check its link and system id")
+        for s in files
+        if s not in found
     }
     outcomes |= _with_bar(lambda report: backend.upload(missions, report))
     lengths = {s: {"items": len(m), "file": str(files[s])} for s, m in missions.items()}
@@ -312,7 +314,10 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         airspace = checked
     given = time.monotonic()
     text = "was not heard; check its link and system id"
-    orders = {s: Order(args.action, s, given).end(f"vehicle {s} {text}", Verdict.NOT_SENT) for s in missing}
+    orders = {
+        s: Order(verb=args.action, system=s, given_s=given).end(f"vehicle {s} {text}", Verdict.NOT_SENT)
+        for s in missing
+    }
     for order in orders.values():
         _say(args, order.outcome.text if order.outcome else "")
     delays = {s: prepared.delays.get(s, 0.0) for s in heard}
@@ -355,7 +360,9 @@ def _ready(
     if red:
         others = "was not started, because others are not ready"
         return {
-            s: Outcome(False, f"vehicle {s} {'was not started: ' + red[s] if s in red else others}", failure=failure)
+            s: Outcome(
+                ok=False, text=f"vehicle {s} {'was not started: ' + red[s] if s in red else others}", failure=failure
+            )
             for s in systems
             for failure in (Verdict.REFUSED if s in red else Verdict.NOT_SENT,)
         }

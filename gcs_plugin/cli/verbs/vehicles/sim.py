@@ -64,7 +64,10 @@ def run(args: argparse.Namespace) -> int:
     for at, system, what, _ in events:
         if system not in {vehicle.system for vehicle in vehicles}:
             raise InputError(f"there is no vehicle {system} to {what} at {at:g} s; there are 1 to {args.vehicles}")
-    faults = [Faults(args.loss, args.duplicate, (0.0, args.delay), (), 2 * args.seed + way) for way in (0, 1)]
+    faults = [
+        Faults(loss=args.loss, duplicate=args.duplicate, delay_s=(0.0, args.delay), silent=(), seed=2 * args.seed + way)
+        for way in (0, 1)
+    ]
     swarm = SimSwarm(
         vehicles, args.link, together=args.together, speed=args.speed, up=faults[0], down=faults[1], key=find_key()
     )
