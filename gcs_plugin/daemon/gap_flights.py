@@ -1,21 +1,20 @@
 """Flights over missed ground: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
-from gcs_plugin.fleet.preflight import RESERVE
+from gcs_plugin.fleet.flight_limits import RESERVE
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _NARROWER: Final = 0.995
 """The solved field of view is taken a little narrower."""
 _LONGEST_MIN: Final = 600.0
 _ON_ITS_WAY: Final = frozenset({"on mission", "paused", "holding", "flying"})
-_EARTH_M: Final = 6_371_000.0
 _HOME_M_S: Final = 5.0
 """A plan ends where a vehicle in the air began it; from there it still flies home, at least so fast."""
 
@@ -155,7 +154,5 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -
 
 def _home_min(row: Mapping[str, Any]) -> float:
     """Minutes home from where a vehicle is."""
-    lat, lon = math.radians(row["lat_deg"]), math.radians(row["lon_deg"])
-    home_lat, home_lon = (math.radians(v) for v in row["home"][:2])
-    away_m = _EARTH_M * math.hypot(home_lat - lat, (home_lon - lon) * math.cos(lat))
-    return away_m / _HOME_M_S / 60.0
+    home_lat, home_lon = row["home"][:2]
+    return distance_m(row["lat_deg"], row["lon_deg"], home_lat, home_lon) / _HOME_M_S / 60.0

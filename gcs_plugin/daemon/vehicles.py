@@ -276,7 +276,8 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
         """
-        from gcs_plugin.fleet.preflight import ENDURANCE_S, LEGAL_HEIGHT_M, preflight_all
+        from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M
+        from gcs_plugin.fleet.preflight import preflight_all
 
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
         systems = {self.system_of(name): name for name in names}

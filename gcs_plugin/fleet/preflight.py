@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M, RESERVE
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.control import unflyable
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
 ITEMS: Final = (
     "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "height", "separation",
 )  # fmt: skip
-LEGAL_HEIGHT_M: Final = 120.0
-"""Height up to which drones fly without a permit in the EU (2019/947, UAS.OPEN.010); 400 ft in the US."""
-ENDURANCE_S: Final = 1200.0
-"""Flight time of a full battery where the plan does not say it."""
-RESERVE: Final = 0.2
-"""Share of the battery that is to be left after landing."""
 _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
 _HOME_M: Final = 50.0

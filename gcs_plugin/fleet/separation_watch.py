@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from orthoswarm.model.earth import DEGREE_M, distance_m
+
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
-_EARTH_M: Final = 6_378_137.0
 _FRESH_S: Final = 2.0
 _OVER: Final = 1.2
 _PAD: Final = 1.5
@@ -84,10 +85,10 @@ class SeparationWatch:
     def _at_start(self, one: "Vehicle", other: "Vehicle") -> bool:
         """Both are above a start that they share."""
         reach = _PAD * self.distance_m
-        if one.launch is None or other.launch is None or _apart(one.launch, other.launch) > reach:
+        if one.launch is None or other.launch is None or distance_m(*one.launch, *other.launch) > reach:
             return False
         here = [((v.lat_deg or 0.0, v.lon_deg or 0.0), v.launch) for v in (one, other)]
-        return all(launch is not None and _apart(place, launch) < reach for place, launch in here)
+        return all(launch is not None and distance_m(*place, *launch) < reach for place, launch in here)
 
 
 def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = number_name) -> str:
@@ -111,10 +112,4 @@ def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
 
 
 def _metres(vehicle: "Vehicle", shrink: float) -> tuple[float, float]:
-    north = math.radians(vehicle.lat_deg or 0.0) * _EARTH_M
-    return north, math.radians(vehicle.lon_deg or 0.0) * _EARTH_M * shrink
-
-
-def _apart(a: tuple[float, float], b: tuple[float, float]) -> float:
-    east = math.radians(b[1] - a[1]) * math.cos(math.radians(a[0]))
-    return math.hypot(math.radians(b[0] - a[0]), east) * _EARTH_M
+    return (vehicle.lat_deg or 0.0) * DEGREE_M, (vehicle.lon_deg or 0.0) * DEGREE_M * shrink

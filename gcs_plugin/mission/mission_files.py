@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Plan, Sortie, Waypoint
 
@@ -335,6 +336,6 @@ def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:
 def _circle(circle: Mapping[str, Any]) -> tuple[LatLon, ...]:
     """A circular fence as a 32-gon around it."""
     (lat, lon), radius = circle["center"], float(circle["radius"]) / math.cos(math.pi / 32)
-    north, east = 111_195.0, 111_195.0 * math.cos(math.radians(float(lat)))
+    north, east = DEGREE_M, DEGREE_M * math.cos(math.radians(float(lat)))
     angles = [2.0 * math.pi * k / 32 for k in range(32)]
     return tuple((lat + radius * math.cos(a) / north, lon + radius * math.sin(a) / east) for a in angles)

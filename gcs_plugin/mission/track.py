@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, LOITER_TIME, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
+from orthoswarm.model.earth import DEGREE_M
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
@@ -23,7 +24,6 @@ Array = NDArray[np.float64]
 _STEP_S: Final = 0.5
 _GROUND_M: Final = 2.0
 _SPEED_M_S: Final = 5.0
-_EARTH_M: Final = 6_378_137.0
 _HAIR_M: Final = 0.01
 _PAD: Final = 1.5  # radius about a start that vehicles share, in separation distances: only time keeps them apart there
 
@@ -206,5 +206,5 @@ def _ground_m(mission: "Mission") -> float:
 
 
 def _metres(lat: float, lon: float, origin: tuple[float, float]) -> tuple[float, float]:
-    east = math.radians(lon - origin[1]) * _EARTH_M * math.cos(math.radians(origin[0]))
-    return east, math.radians(lat - origin[0]) * _EARTH_M
+    east = (lon - origin[1]) * DEGREE_M * math.cos(math.radians(origin[0]))
+    return east, (lat - origin[0]) * DEGREE_M

@@ -14,9 +14,9 @@ from random import Random
 from typing import Final
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.earth import EQUATOR_RADIUS_M
 
 _GRAVITY: Final = 9.80665
-_SEMI_MAJOR_M: Final = 6378137.0
 _ECCENTRICITY2: Final = 6.69437999014e-3
 STEP_S: Final = 0.05
 _FILTER_S: Final = 3.0
@@ -40,8 +40,8 @@ class Chart:
         """Length of a degree of latitude and of longitude."""
         sin2 = math.sin(math.radians(self.lat_deg)) ** 2
         w = 1.0 - _ECCENTRICITY2 * sin2
-        meridian = _SEMI_MAJOR_M * (1.0 - _ECCENTRICITY2) / w**1.5
-        parallel = _SEMI_MAJOR_M / math.sqrt(w) * math.cos(math.radians(self.lat_deg))
+        meridian = EQUATOR_RADIUS_M * (1.0 - _ECCENTRICITY2) / w**1.5
+        parallel = EQUATOR_RADIUS_M / math.sqrt(w) * math.cos(math.radians(self.lat_deg))
         return math.radians(meridian), math.radians(parallel)
 
     def to_metres(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]
 Format = Literal["png", "webp", "jpg"]
 _SIZE = 256
-_WORLD_M = 2 * math.pi * 6378137.0
 _BATCH = 8
 _MAX_ZOOM = 23
 
@@ -90,7 +90,7 @@ def _levels(bounds: tuple[float, float, float, float], gsd_m: float) -> list[Ran
     """From the zoom that is not coarser than the raster to the one where a single tile holds all."""
     west, south, east, north = bounds
     latitude = math.radians(0.5 * (south + north))
-    zoom = math.ceil(math.log2(_WORLD_M * math.cos(latitude) / _SIZE / gsd_m) - 0.3)
+    zoom = math.ceil(math.log2(WEB_MERCATOR_M * math.cos(latitude) / _SIZE / gsd_m) - 0.3)
     zoom = min(max(zoom, 0), _MAX_ZOOM)
     left, top = _tile_of(west, north, zoom)
     right, bottom = _tile_of(east, south, zoom)
@@ -173,13 +173,13 @@ class _Writer:
         from rasterio.vrt import WarpedVRT
 
         level = self.levels[0]
-        side = _WORLD_M / 2**level.zoom
+        side = WEB_MERCATOR_M / 2**level.zoom
         for top in range(level.top, level.bottom + 1, _BATCH):
             for left in range(level.left, level.right + 1, _BATCH):
                 rows = min(_BATCH, level.bottom + 1 - top)
                 cols = min(_BATCH, level.right + 1 - left)
                 transform = from_origin(
-                    left * side - _WORLD_M / 2, _WORLD_M / 2 - top * side, side / _SIZE, side / _SIZE
+                    left * side - WEB_MERCATOR_M / 2, WEB_MERCATOR_M / 2 - top * side, side / _SIZE, side / _SIZE
                 )
                 with WarpedVRT(
                     raster,

@@ -17,6 +17,10 @@ NADIR_PITCH_RAD = -np.pi / 2
 _CAMERA_TO_BODY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
+LEAST_RADIAL_SLOPE = 0.2
+"""The lens model holds while d r_distorted / d r = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 stays above this: a polynomial
+that was fitted within the picture folds back somewhere outside it."""
+
 
 def focal_px(fov_rad: float, width: int) -> float:
     """Focal length in pixels of a horizontal field of view: (W/2) / tan(FoV/2)."""

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.camera import Lens
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Lens
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,7 @@ y low, y high) of undistorted normalised coordinates: OUTER holds all the usable
 
 def folds(lens: Lens, r2: Array) -> NDArray[np.bool_]:
     """Where (squared undistorted radius) the distortion hardly grows with the angle any more: nothing is visible."""
-    return np.asarray(1.0 + r2 * (3 * lens.k1 + r2 * (5 * lens.k2 + r2 * 7 * lens.k3)) < 0.2)
+    return np.asarray(1.0 + r2 * (3 * lens.k1 + r2 * (5 * lens.k2 + r2 * 7 * lens.k3)) < LEAST_RADIAL_SLOPE)
 
 
 @lru_cache(maxsize=256)

@@ -8,6 +8,7 @@ Loops are split so that all but the sampling compile to vector code; constants a
 import numpy as np
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 
 _EVEN = np.uint32(0x00FF00FF)
 _ODD = np.uint32(0xFF00FF00)
@@ -127,7 +128,7 @@ def _distort(us, vs, k1, k2, k3):  # type: ignore[no-untyped-def]
     for i in range(us.shape[0]):
         r2 = us[i] * us[i] + vs[i] * vs[i]
         s = one + r2 * (k1 + r2 * (k2 + r2 * k3))
-        if one + r2 * (three + r2 * (five + r2 * seven)) < np.float32(0.2):
+        if one + r2 * (three + r2 * (five + r2 * seven)) < np.float32(LEAST_RADIAL_SLOPE):
             s = np.float32(1e6)
         us[i] *= s
         vs[i] *= s

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.camera import Camera
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
@@ -150,7 +150,7 @@ def project(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     px = (rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz) / depth
     py = (rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz) / depth
     r2 = px * px + py * py
-    if 1.0 + r2 * (3.0 * lens[K1] + r2 * (5.0 * lens[K2] + r2 * 7.0 * lens[K3])) < 0.2:
+    if 1.0 + r2 * (3.0 * lens[K1] + r2 * (5.0 * lens[K2] + r2 * 7.0 * lens[K3])) < LEAST_RADIAL_SLOPE:
         return -1e9, -1e9
     s = lens[F] * (1.0 + r2 * (lens[K1] + r2 * (lens[K2] + r2 * lens[K3])))
     return s * px + lens[U], s * py + lens[V]

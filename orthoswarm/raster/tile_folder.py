@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-_WORLD_M = 2 * np.pi * 6378137.0
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -44,7 +44,7 @@ class TileFolder:
         self.bounds = self._ground_bounds(near)
         x, y = (near or self.bounds).center
         per_metre = np.diff(self._mercator(np.array([[x, y], [x + 100.0, y]])), axis=0)
-        self.native_gsd_m = float(_WORLD_M / 2**self._zoom / self._size / np.hypot(*per_metre[0]) * 100.0)
+        self.native_gsd_m = float(WEB_MERCATOR_M / 2**self._zoom / self._size / np.hypot(*per_metre[0]) * 100.0)
 
     def _mercator(self, east_north: NDArray[np.float64]) -> NDArray[np.float64]:
         x, y = _transformer(self._epsg).transform(east_north[:, 0], east_north[:, 1])
@@ -61,9 +61,9 @@ class TileFolder:
             np.c_[np.full(9, east), south + s * (north - south)],
         ]
         xy = self._mercator(ring)
-        side = _WORLD_M / 2**zoom
-        column = np.floor((xy[:, 0] + _WORLD_M / 2) / side)
-        row = np.floor((_WORLD_M / 2 - xy[:, 1]) / side)
+        side = WEB_MERCATOR_M / 2**zoom
+        column = np.floor((xy[:, 0] + WEB_MERCATOR_M / 2) / side)
+        row = np.floor((WEB_MERCATOR_M / 2 - xy[:, 1]) / side)
         return int(column.min()), int(column.max()), int(row.min()), int(row.max())
 
     def _rows_from_south(self, near: BoundingBox) -> bool:
@@ -79,7 +79,7 @@ class TileFolder:
 
     def _ground_bounds(self, near: BoundingBox | None) -> BoundingBox:
         """Bounds of the finest tiles in the grid, those within some kilometres of the area."""
-        side, flip = _WORLD_M / 2**self._zoom, 2**self._zoom - 1
+        side, flip = WEB_MERCATOR_M / 2**self._zoom, 2**self._zoom - 1
         tiles = np.array(
             [(c, flip - r if self._tms else r) for c, rows in self._columns[self._zoom].items() for r in rows]
         )
@@ -88,8 +88,8 @@ class TileFolder:
             left, right, top, bottom = self._tile_range(near.grown(margin), self._zoom)
             close = (tiles[:, 0] >= left) & (tiles[:, 0] <= right) & (tiles[:, 1] >= top) & (tiles[:, 1] <= bottom)
             tiles = tiles[close] if close.any() else tiles
-        x = np.array([tiles[:, 0].min(), tiles[:, 0].max() + 1]) * side - _WORLD_M / 2
-        y = _WORLD_M / 2 - np.array([tiles[:, 1].max() + 1, tiles[:, 1].min()]) * side
+        x = np.array([tiles[:, 0].min(), tiles[:, 0].max() + 1]) * side - WEB_MERCATOR_M / 2
+        y = WEB_MERCATOR_M / 2 - np.array([tiles[:, 1].max() + 1, tiles[:, 1].min()]) * side
         corners = np.array([[a, b] for a in (*x, x.mean()) for b in (*y, y.mean())])
         east, north = _transformer(self._epsg).transform(corners[:, 0], corners[:, 1], direction="INVERSE")
         return BoundingBox.around_points(np.column_stack([east, north]))
@@ -144,8 +144,8 @@ class TileFolder:
             for r, file in self._columns[zoom].get(c, {}).items()
         }
         tiles = {(c, r): file for (c, r), file in tiles.items() if top <= r <= bottom}
-        side = _WORLD_M / 2**zoom
-        origin = (left * side - _WORLD_M / 2, _WORLD_M / 2 - top * side)
+        side = WEB_MERCATOR_M / 2**zoom
+        origin = (left * side - WEB_MERCATOR_M / 2, WEB_MERCATOR_M / 2 - top * side)
         if not tiles:
             return None, origin, side / n
         canvas = np.zeros(((bottom - top + 1) * n, (right - left + 1) * n, 4), np.uint8)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoswarm.config.refiner.records import RecordsConfig
+from orthoswarm.config import active
+from orthoswarm.model.earth import MEAN_RADIUS_M
 from telemetry.formats.log.log_data import FlightLog
-from telemetry.samples.course import EARTH_RADIUS_M
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
@@ -25,7 +25,7 @@ def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
     lat, lon = (np.array([getattr(s, name) for s in own], np.float64) for name in ("lat_deg", "lon_deg"))
     north = np.radians(track.values("lat_deg", times) - lat)
     east = np.radians(track.values("lon_deg", times) - lon) * np.cos(np.radians(lat))
-    distance = EARTH_RADIUS_M * np.hypot(north, east)
+    distance = MEAN_RADIUS_M * np.hypot(north, east)
     common = distance[np.isfinite(distance)]
     return float(np.median(common)) if len(common) >= _LEAST_COMMON else None
 
@@ -33,7 +33,7 @@ def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
 def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
     """The autopilot's log with values of the CAN bus that state a lower sigma, and a description of these.
 
-    Positions are compared by their stated sigmas; without a stated sigma 1.5 m is assumed. A gimbal on
+    Positions are compared by their stated sigmas; without one `records.position_sigma_m` holds. A gimbal on
     the bus is used where the autopilot reports none. None if the logs are not of one vehicle, or nothing is more
     accurate.
     """
@@ -41,7 +41,7 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     if distance is None or distance > _SAME_VEHICLE_M:
         return None
     track = bus.timeline()
-    sigma_m = log.position_sigma_m or RecordsConfig().position_sigma_m
+    sigma_m = log.position_sigma_m or active().records.position_sigma_m
     samples = [_placed(sample, track, sigma_m) for sample in log.samples]
     events = [replace(event, sample=_placed(event.sample, track, sigma_m)) for event in log.events]
     changed = sum(new is not old for new, old in zip(samples, log.samples, strict=True))
@@ -64,6 +64,6 @@ def _placed(sample: Sample, track: Timeline, sigma_m: float) -> Sample:
     if not sample.has_position or sample.time_s is None:
         return sample
     known = track.at(sample.time_s)
-    if not known.has_position or (known.sigma_m or RecordsConfig().position_sigma_m) >= (sample.sigma_m or sigma_m):
+    if not known.has_position or (known.sigma_m or active().records.position_sigma_m) >= (sample.sigma_m or sigma_m):
         return sample
     return replace(sample, **{name: getattr(known, name) for name in _POSITION})

@@ -5,6 +5,7 @@ used. Fast enough for a hundred vehicles: a message costs a few microseconds, me
 stored.
 """
 
+import math
 import threading
 import time
 from bisect import bisect_left, bisect_right
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from orthoswarm.config.refiner.records import RecordsConfig
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from telemetry.formats.log.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
 from telemetry.samples.sample import Sample
@@ -25,8 +26,6 @@ _FLIGHT = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 _CAMERA = ("yaw_deg", "pitch_deg", "roll_deg")
 _HELD_S = 0.3
 _ALL_HEARD_S: Final = 0.5
-_UNSTATED_M: Final = RecordsConfig().position_sigma_m
-_UNSTATED_DEG: Final = 57.3 * RecordsConfig().tagged_tilt_sigma
 _TURNS = frozenset({"lon_deg", *_FLIGHT, *_CAMERA})
 
 
@@ -190,7 +189,9 @@ class LivePoses:
         """
         if sample.time_s is None:
             return
-        metres, degrees = sigma or _UNSTATED_M, sigma or _UNSTATED_DEG
+        unstated = active().records
+        metres = sigma or unstated.position_sigma_m
+        degrees = sigma or math.degrees(unstated.tagged_tilt_sigma)
         with self._lock:
             if sample.has_position:
                 self._position.add(source, sample, metres)

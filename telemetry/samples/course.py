@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg, wrap_rad
+from orthoswarm.model.earth import MEAN_RADIUS_M
 
 Array = NDArray[np.float64]
-
-EARTH_RADIUS_M = 6_371_008.8
 
 
 def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Array) -> Array:
@@ -20,7 +19,7 @@ def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Ar
     if lat.size == 0:
         return np.zeros((0, 2))
     dlon = wrap_rad(lon - lon[0])
-    return EARTH_RADIUS_M * np.stack([dlon * np.cos(np.median(lat)), lat - lat[0]], axis=-1)
+    return MEAN_RADIUS_M * np.stack([dlon * np.cos(np.median(lat)), lat - lat[0]], axis=-1)
 
 
 def courses_deg(east_north: Array, *, least_step_m: float = 1.0, bend_deg: float = 40.0) -> Array:

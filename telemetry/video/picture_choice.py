@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.model.angles import wrap_deg
-from telemetry.samples.course import EARTH_RADIUS_M
+from orthoswarm.model.earth import MEAN_RADIUS_M
 from telemetry.samples.sample import Sample
 
 _HEIGHT_SHARE = 0.04
@@ -106,7 +106,7 @@ def _distance_m(a: Sample | None, b: Sample | None) -> float | None:
         return None
     north = np.radians(a.lat_deg - b.lat_deg)
     east = np.radians(wrap_deg(a.lon_deg - b.lon_deg)) * np.cos(np.radians(a.lat_deg))
-    return float(EARTH_RADIUS_M * np.hypot(north, east))
+    return float(MEAN_RADIUS_M * np.hypot(north, east))
 
 
 def sharpness(frame: Any) -> float:

@@ -1,9 +1,9 @@
 """Poses from files and links in the form of posted ones."""
 
-import math
 from collections.abc import Mapping
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, pose_values
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Frame
 from telemetry.live.live_poses import LinkPose
 from telemetry.samples.sample_frame import sample_of
@@ -11,9 +11,7 @@ from telemetry.samples.sample_frame import sample_of
 
 def apart_m(a: Mapping[str, float], b: Mapping[str, float]) -> float:
     """Metres between the places of two poses."""
-    north = (a["lat_deg"] - b["lat_deg"]) * 111_000.0
-    east = (a["lon_deg"] - b["lon_deg"]) * 111_000.0 * math.cos(math.radians(a["lat_deg"]))
-    return math.hypot(north, east)
+    return distance_m(a["lat_deg"], a["lon_deg"], b["lat_deg"], b["lon_deg"])
 
 
 def linked_pose(vehicle: str, name: str, time_s: float | None, linked: LinkPose | None) -> PostedPose | None:

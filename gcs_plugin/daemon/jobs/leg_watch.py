@@ -13,12 +13,12 @@ from typing import Final
 import numpy as np
 
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.refine.flight.finished_legs import ended_legs
 
 FEWEST: Final = 10
 """Least number of new pictures of finished legs for a coarse map."""
 _LOOK_S: Final = 0.5
-_METRES_A_DEGREE: Final = 111_320.0
 _log = logging.getLogger(__name__)
 
 Ask = Callable[[str, int, bool], None]
@@ -102,8 +102,8 @@ class LegWatch:
         if len(times) < FEWEST:
             return
         lat, lon = np.array(places).T
-        north = (lat - lat[0]) * _METRES_A_DEGREE
-        east = (lon - lon[0]) * _METRES_A_DEGREE * np.cos(np.radians(lat[0]))
+        north = (lat - lat[0]) * DEGREE_M
+        east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
         legs = ended_legs(np.column_stack([east, north]), np.array(times), over=silent)
         if sum(last + 1 - first for first, last in legs) < FEWEST:
             return

@@ -11,12 +11,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
+from orthoswarm.config import active
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.frame import Frame
 
 LEVELS: Final = 8
 _STEP_SHARE: Final = 0.06
-_HEIGHT_M: Final = 100.0
-_METRES_A_DEGREE: Final = 111_320.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class DrawQueue:
         self._queues: list[deque[Pending]] = [deque() for _ in range(LEVELS)]
         self._drawn: set[tuple[int, int]] = set()
         self._step_m = 0.0
-        self._east_m = _METRES_A_DEGREE
+        self._east_m = DEGREE_M
         self._count = 0
 
     def __len__(self) -> int:
@@ -87,10 +87,10 @@ class DrawQueue:
     def _cell(self, frame: Frame) -> tuple[int, int]:
         fix = frame.fix
         if self._step_m == 0.0:  # the first frame sets the scale
-            self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or _HEIGHT_M))
-            self._east_m = _METRES_A_DEGREE * max(0.05, math.cos(math.radians(fix.lat_deg)))
+            self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or active().records.default_height_m))
+            self._east_m = DEGREE_M * max(0.05, math.cos(math.radians(fix.lat_deg)))
         return (
-            int(fix.lat_deg * _METRES_A_DEGREE / self._step_m // 1),
+            int(fix.lat_deg * DEGREE_M / self._step_m // 1),
             int(fix.lon_deg * self._east_m / self._step_m // 1),
         )
 

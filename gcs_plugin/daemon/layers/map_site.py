@@ -14,12 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import is_position
-from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
+from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
 from gcs_plugin.daemon.store.journal import Journal, fact_change
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, utm_epsg

@@ -19,6 +19,7 @@ from pyproj import Transformer
 from gcs_plugin.daemon.layers.layers import Layer
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.basemap import Basemap
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 
 SIDE: Final = 256
 DEEPEST: Final = 24
-_HALF_WORLD_M: Final = math.pi * 6378137.0
+_HALF_WORLD_M: Final = 0.5 * WEB_MERCATOR_M
 _NODES: Final = 9
 _CACHE_BYTES: Final = 64 << 20
 _local = threading.local()

@@ -12,8 +12,6 @@ class FeaturesConfig:
     """Longer side of the pictures on which corners are followed, pixels (chosen; not measured)."""
     small_width_px: int = 160
     """Columns of the reduced pictures that stay in memory (chosen; not measured)."""
-    cache_mb: float = 160.0
-    """Working-scale pictures kept in memory, MB (10^6 bytes; chosen for its memory)."""
 
     # Corners, followed from picture to picture
     cell_px: int = 80

@@ -6,16 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.model.camera import Camera, Lens
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera, Lens
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
-LEAST_RADIAL_SLOPE = 0.2
-"""The lens model holds while d r_distorted / d r = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 stays above this: a polynomial
-that was fitted within the picture folds back somewhere outside it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ The camera system is stored as LAPACK's lower band (row = distance from the diag
 import numpy as np
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.refine.bundle.block_arrays import LEAST_RADIAL_SLOPE
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 from orthoswarm.refine.bundle.robust_kernel import robust_weight
 
 

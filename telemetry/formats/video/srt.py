@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import parse_time
 
@@ -140,7 +141,7 @@ def _latitude_first(blocks: list[_Raw]) -> bool | None:
         if home is not None and distance is not None and float(distance[1]) > 20.0:
             da, db, flown = float(home[1]) - a, float(home[2]) - b, float(distance[1])
             for order, (dlat, dlon, lat) in ((True, (da, db, a)), (False, (db, da, b))):
-                metres = 111_195.0 * math.hypot(dlat, dlon * math.cos(math.radians(lat)))
+                metres = DEGREE_M * math.hypot(dlat, dlon * math.cos(math.radians(lat)))
                 votes[order] += abs(metres - flown) / flown
     if votes[True] != votes[False]:
         return votes[True] < votes[False]
@@ -205,7 +206,7 @@ def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
     )
     if decimals <= 4:
         result.notes["position-coarse"] = (
-            f"positions have {decimals} decimals only, steps of {111_195 * 10.0**-decimals:.0f} m"
+            f"positions have {decimals} decimals only, steps of {DEGREE_M * 10.0**-decimals:.0f} m"
         )
     if all(s.yaw_deg is None and s.flight_yaw_deg is None for s in placed):
         result.notes["srt-no-attitude"] = "the subtitles hold no yaw; it has to come from the course and the pictures"

@@ -5,7 +5,8 @@ import json
 import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
-from gcs_plugin.daemon.layers.anchor import Anchor, distance_m
+from gcs_plugin.daemon.layers.anchor import Anchor
+from orthoswarm.model.earth import distance_m
 from tests.kit.daemon_kit import Shot, camera_at, jpeg, line, pose_of, serving, tile_over
 from tests.kit.sim_cameras import square
 
