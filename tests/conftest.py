@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from orthoswarm.compute.workers import single_threaded
+from orthoswarm.compute.workers import prepare_process
 from orthoswarm.config import override
 
-single_threaded()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
+prepare_process()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
 
 # Machines differ and are shared: a slow example is not a failure. A gate tries the same examples each time.
 settings.register_profile("unhurried", deadline=None, derandomize=bool(os.environ.get("CI")))

@@ -11,8 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import cv2  # before any thread: two that import it at once find it half made
-
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.coverage.event_requests import EventRequests
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
@@ -51,7 +49,7 @@ from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.terrain_data import TerrainData
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
-from orthoswarm.compute.workers import peak_rss_mb
+from orthoswarm.compute.workers import peak_rss_mb, prepare_process
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.basemap import Basemap
@@ -78,7 +76,7 @@ class Daemon:
             InputError: another daemon runs in the workspace, or the basemap cannot be used.
             OrthoSwarmError: the workspace cannot be written.
         """
-        cv2.setNumThreads(1)  # its threads would compete with the daemon's own for cores
+        prepare_process()
         self.settings, self.started = settings, time.time()
         self.events = Events()
         self._lock = take_over(settings.workspace)

@@ -35,9 +35,9 @@ def simulate(setting: Setting, pipe: Connection) -> None:
     Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # not inherited everywhere
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
 
-    single_threaded()
+    prepare_process()
     from gcs_plugin.demo.setting import build_stage
     from gcs_plugin.demo.simulated_camera import Studio, TwinCamera, VideoServer
     from gcs_plugin.sim.multirotor import Airframe

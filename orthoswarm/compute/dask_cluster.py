@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from uuid import uuid4
 
 from orthoswarm import __version__
-from orthoswarm.compute.workers import Usage, peak_rss_mb, single_threaded
+from orthoswarm.compute.workers import Usage, peak_rss_mb, prepare_process
 from orthoswarm.config import active, overridden, override
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -185,7 +185,7 @@ def _short(error: BaseException) -> str:
 
 def _work(payload: bytes) -> _Outcome:
     """Runs on a worker."""
-    single_threaded()
+    prepare_process()
     function, item, config = pickle.loads(payload)
     override(config)
     raised = False

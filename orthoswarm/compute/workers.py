@@ -30,17 +30,29 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_importing = threading.Lock()
+
+
+def prepare_process() -> None:
+    """First thing in a process that computes: before numpy is imported, and before any thread or process is started.
+
+    BLAS, OpenMP and OpenCV get one thread each, since small matching calls take ten times as long otherwise; settings
+    that the user made in the environment stay.
+
+    OpenCV is imported here, because nothing else may happen meanwhile. A second thread that imports it finds it half
+    made. It also puts its own folder, which holds a module `typing`, first on the path for that time; a process that
+    another thread spawns then inherits this path and ends at its first import.
+    """
+    for name in _THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
+    with _importing:
+        import cv2
+    cv2.setNumThreads(1)
 
 
 def spawn_context() -> SpawnContext:
-    """How worker processes are started: spawned, since forking a process with threads can hang.
-
-    OpenCV puts its own folder, which holds a module `typing`, first on the path while it is being imported, and a
-    process that another thread spawns at that moment inherits that path and ends at its first import. So OpenCV is
-    imported before any is started.
-    """
-    import cv2  # noqa: F401
-
+    """How worker processes are started: spawned, since forking a process with threads can hang."""
+    prepare_process()
     return multiprocessing.get_context("spawn")
 
 
@@ -162,7 +174,6 @@ class Processes:
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            single_threaded()
             self._pool = ProcessPoolExecutor(self.count - 1, mp_context=spawn_context(), initializer=_prepare)
         return self._pool
 
@@ -235,9 +246,7 @@ def _prepare() -> None:
     """First thing in a new process: the parent handles Ctrl-C, and threads would only fight over the cores."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
-    import cv2
-
-    cv2.setNumThreads(1)
+    prepare_process()
 
 
 def end_with_parent() -> None:
@@ -264,17 +273,6 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def single_threaded() -> None:
-    """Keep BLAS, OpenMP and OpenCV to one thread each; call it before numpy is imported.
-
-    Small matching calls take ten times as long otherwise. Settings that the user made in the environment stay.
-    """
-    for name in _THREAD_VARIABLES:
-        os.environ.setdefault(name, "1")
-    if "cv2" in sys.modules:
-        sys.modules["cv2"].setNumThreads(1)
 
 
 def peak_rss_mb() -> float:

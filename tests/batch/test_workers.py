@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, single_threaded, workers
+from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, prepare_process, workers
 from orthoswarm.model.errors import OrthoSwarmError
 
 
@@ -112,7 +112,7 @@ def test_each_process_keeps_to_one_thread():
 
 def test_helpers(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    single_threaded()
+    prepare_process()
     assert os.environ["OMP_NUM_THREADS"] == "1"
     assert isinstance(workers(1), Serial)
     assert workers(4).count == 4

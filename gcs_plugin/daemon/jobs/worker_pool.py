@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from gcs_plugin.daemon.jobs.process_usage import used_by
-from orthoswarm.compute.workers import Usage, single_threaded, spawn_context
+from orthoswarm.compute.workers import Usage, prepare_process, spawn_context
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
 Result = TypeVar("Result")
@@ -62,7 +62,6 @@ class WorkerPool:
             if self._closed:
                 raise OrthoSwarmError("the daemon is stopping; start it again")
             if self._pool is None:
-                single_threaded()
                 context = spawn_context()
                 self._pool = ProcessPoolExecutor(
                     self.count, mp_context=context, initializer=_prepare, initargs=(self._nice,)
@@ -152,9 +151,7 @@ def _prepare(nice: int) -> None:
     if hasattr(os, "nice"):
         os.nice(nice)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    import cv2
-
-    cv2.setNumThreads(1)
+    prepare_process()
 
 
 def _end_with_parent() -> None:

@@ -56,9 +56,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
 
-    single_threaded()
+    prepare_process()
     import json
 
     from gcs_plugin.cli.progress import ProgressBars

@@ -35,10 +35,10 @@ def run(args: argparse.Namespace) -> int:
     from contextlib import suppress
 
     from gcs_plugin.cli.progress import ProgressBars
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
     from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-    single_threaded()
+    prepare_process()
     from telemetry.ingest.ingest import LoadOptions, load, require_frames
 
     for name, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):

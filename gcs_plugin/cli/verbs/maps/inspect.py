@@ -33,9 +33,9 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from gcs_plugin.cli.progress import ProgressBars
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
 
-    single_threaded()
+    prepare_process()
     from telemetry.ingest.ingest import LoadOptions, survey
     from telemetry.ingest.summary import summarise
 

@@ -56,9 +56,9 @@ def _refiners() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Make the map."""
-    from orthoswarm.compute.workers import Workers, single_threaded, workers
+    from orthoswarm.compute.workers import Workers, prepare_process, workers
 
-    single_threaded()
+    prepare_process()
     # Objects of tens of thousands of photos live to the end: collecting garbage among them would cost a tenth of the
     # time.
     gc.set_threshold(100_000, 50, 50)

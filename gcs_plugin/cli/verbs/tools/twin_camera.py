@@ -51,9 +51,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Follow until interrupted."""
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
 
-    single_threaded()
+    prepare_process()
     import json
     import signal
     import threading

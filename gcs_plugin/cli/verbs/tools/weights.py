@@ -39,9 +39,9 @@ def _action(actions: Any, name: str, text: str, example: str = "") -> argparse.A
 
 def run(args: argparse.Namespace) -> int:
     """List, import or check."""
-    from orthoswarm.compute.workers import single_threaded
+    from orthoswarm.compute.workers import prepare_process
 
-    single_threaded()
+    prepare_process()
     import json
 
     from orthoswarm.matchers import weight_files
