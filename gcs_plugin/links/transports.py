@@ -402,11 +402,15 @@ class SerialLink(Link):
             self._selector.register(self._port.fileno(), selectors.EVENT_READ, self)
 
     def _flush(self, now: float) -> None:
+        import serial
+
         try:
             if data := self._pending.bytes():
                 self._pending.sent(self._port.write(data) or 0)
+        except serial.SerialTimeoutException:
+            return  # its buffer is full: what is left over goes at the next tick
         except OSError as error:
-            if error.errno not in _AGAIN and "timeout" not in str(error).lower():
+            if error.errno not in _AGAIN:
                 self._lose(str(error), now)
 
     def _lose(self, why: str, now: float) -> None:

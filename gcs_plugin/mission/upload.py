@@ -296,7 +296,8 @@ class MissionUpload(Exchange):
 
     def _fail(self, text: str, failure: Verdict = Verdict.REFUSED) -> None:
         self.stage = Stage.DONE
-        mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and "upload again" not in text
+        # ArduPilot writes items as they come; `_mixed` says by itself what it then holds.
+        mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and text != self._mixed
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
         if self.refusal is not None and self.outcome is not None:

@@ -3,6 +3,7 @@
 The finest zoom is warped tile by tile from the COG; each coarser tile is made of its four finer ones.
 """
 
+import errno
 import math
 import sqlite3
 from collections.abc import Callable
@@ -80,8 +81,8 @@ def write_mbtiles(
                 try:
                     _Writer(database, tile_format, quality, levels, progress).write(raster, name, bounds)
                 except sqlite3.Error as error:
-                    full = "full" in str(error)
-                    raise OSError(28 if full else 5, str(error)) from None
+                    full = error.sqlite_errorcode == sqlite3.SQLITE_FULL
+                    raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from None
     except RasterioError as error:
         raise InputError(f"{source} cannot be read ({error}); make the map again") from None
 

@@ -144,3 +144,13 @@ def test_a_polygon_within_a_hole_cannot_be_reached():
     around = on_globe([(0, 0), (100, 0), (100, 100), (0, 100)], [[(40, 40), (60, 40), (60, 60), (40, 60)]])
     with pytest.raises(InputError, match="polygon 2 lies inside a no-fly zone"):
         make_area([around, island])
+
+
+def test_a_hole_outside_and_an_outline_that_crosses_itself_are_told_apart():
+    square = [(0, 0), (600, 0), (600, 500), (0, 500)]
+    with pytest.raises(InputError, match="move the hole inside"):
+        make_area([on_globe(square, [[(700, 100), (800, 100), (800, 200)]])])
+    with pytest.raises(InputError, match="redraw its outline"):
+        make_area([on_globe([(0, 0), (600, 500), (600, 0), (0, 500)])])
+    with pytest.raises(InputError, match="redraw its outline"):
+        make_area([on_globe(square, [[(100, 100), (300, 300), (300, 100), (100, 300)]])])

@@ -94,7 +94,7 @@ def _check(polygon: Geometry, grid: LocalGrid, name: str) -> None:
     if place:
         lat, lon = grid.to_geographic([float(v) for v in place.rstrip("]").split()[:2]])
         where = f" at {lat:.6f}, {lon:.6f}"
-    if "hole" in reason.lower():
+    if outline.is_valid and not all(outline.covers(ring) for ring in polygon.interiors):
         raise InputError(f"{name} has a hole that is not inside it ({reason.lower()}{where}); move the hole inside")
     raise InputError(f"{name} crosses or touches itself{where} ({reason.lower()}); redraw its outline without crossing")
 

@@ -74,8 +74,15 @@ def register(decoder: Decoder) -> None:
     _REGISTRY[decoder.payload_type, decoder.uuid] = decoder
 
 
+def unregister(decoder: Decoder) -> None:
+    """Remove a decoder again; nothing happens if another one has replaced it."""
+    if _REGISTRY.get((decoder.payload_type, decoder.uuid)) is decoder:
+        del _REGISTRY[decoder.payload_type, decoder.uuid]
+
+
 @cache
-def _load_entry_points() -> None:
+def load_entry_points() -> None:
+    """Register the decoders of installed packages, once a process."""
     from importlib.metadata import entry_points
 
     for point in entry_points(group=ENTRY_POINTS):
@@ -97,7 +104,7 @@ class Reading:
 
 def read(messages: Iterable[tuple[int, bytes]]) -> Reading | None:
     """Read a picture's SEI messages; None if none is recognised (an encoder's settings are not)."""
-    _load_entry_points()
+    load_entry_points()
     merged: Sample | None = None
     names: list[str] = []
     for kind, payload in messages:

@@ -181,12 +181,16 @@ def test_a_position_beats_a_bare_time_stamp_and_both_are_kept():
     assert (reading.sample.time_s, reading.sample.lat_deg) == (5.0, 47.1)
 
 
-def test_a_users_decoder_takes_ten_lines_and_may_fail(monkeypatch):
-    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))  # a decoder stays registered for the process
+def test_a_users_decoder_takes_ten_lines_and_may_fail():
     uuid = bytes.fromhex("00112233445566778899aabbccddeeff")
-    sei.register(sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=b[0] / 2, lon_deg=b[1] / 2)))
-    assert sei.read(user_data(uuid, b"\x10\x20")).sample.lon_deg == 16.0
-    assert sei.read(user_data(uuid, b"")) is None
+    mine = sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=b[0] / 2, lon_deg=b[1] / 2))
+    sei.register(mine)
+    try:
+        assert sei.read(user_data(uuid, b"\x10\x20")).sample.lon_deg == 16.0
+        assert sei.read(user_data(uuid, b"")) is None
+    finally:
+        sei.unregister(mine)
+    assert sei.read(user_data(uuid, b"\x10\x20")) is None
 
 
 def test_a_decoder_is_found_by_its_entry_point_and_a_broken_one_is_passed_over(monkeypatch):
@@ -203,13 +207,15 @@ def test_a_decoder_is_found_by_its_entry_point_and_a_broken_one_is_passed_over(m
 
     uuid = bytes(range(100, 116))
     mine = sei.Decoder("mine", 5, uuid, lambda b: Sample(lat_deg=47.0, lon_deg=8.0))
-    monkeypatch.setattr(sei, "_REGISTRY", dict(sei._REGISTRY))  # a decoder stays registered for the process
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda group: [Point(None), Point("no decoder"), Point(mine)]
     )
-    sei._load_entry_points.cache_clear()
-    assert sei.read(user_data(uuid, b"x")).decoders == ("mine",)
-    sei._load_entry_points.cache_clear()
+    sei.load_entry_points.cache_clear()
+    try:
+        assert sei.read(user_data(uuid, b"x")).decoders == ("mine",)
+    finally:
+        sei.unregister(mine)
+        sei.load_entry_points.cache_clear()
 
 
 @pytest.mark.parametrize("bad", [{"lat_deg": 0.0, "lon_deg": 0.0}, {"lat_deg": 91.0, "lon_deg": 5.0}])
