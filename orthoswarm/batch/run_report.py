@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, SEAMLINES, RunContext, RunState
+from orthoswarm.batch.surface_product import make_surface
 from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
 from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
 from orthoswarm.model.errors import InputError
@@ -19,12 +20,13 @@ def write_products(
     for name in PRODUCTS:  # left by an earlier run with other options
         if name not in _made(run, state.fault is not None):
             (run.out / name).unlink(missing_ok=True)
+    solved = refinement is not None and state.terrain is refinement.terrain
+    level = solved_level(refinement.fine) if refinement and solved else ground_level(placed, state.terrain)
+    stated, z = from_takeoff(placed, level, state.terrain)
+    surface = None if run.options.surface is None else make_surface(run, state, stated, z - level, refinement)
     with run.clock.stage("final: report", len(placed)) as stage:
-        solved = refinement is not None and state.terrain is refinement.terrain
-        level = solved_level(refinement.fine) if refinement and solved else ground_level(placed, state.terrain)
-        stated, z = from_takeoff(placed, level, state.terrain)
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z)
-        report = _report(run, state, placed, refinement, z)
+        report = _report(run, state, placed, refinement, z) | {"surface": surface}
         _add_checkpoints(run, report, z)
         left_out = list(state.rejected.values())
         try:

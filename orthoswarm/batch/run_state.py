@@ -53,6 +53,7 @@ class Options:
         refine: which refiner. until: the last stage to run.
         fov_min_deg: theta-hat, the assumed field of view of the real-time stage; None takes hints, else 70.
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
+        surface: where to write a surface model; None for none.
         dem: raster of ground heights. split_legs: treat each leg of a vehicle as a separate vehicle.
         gains: balance brightness between pictures. blend: mix the two pictures at each seam, see Seams.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
@@ -65,6 +66,7 @@ class Options:
     until: Literal["realtime", "coarse", "fine"] = "fine"
     fov_min_deg: float | None = None
     gsd_m: float | None = None
+    surface: Path | None = None
     dem: Path | None = None
     split_legs: bool = False
     gains: bool = True

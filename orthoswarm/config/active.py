@@ -26,6 +26,7 @@ from orthoswarm.config.refiner.records import RecordsConfig
 from orthoswarm.config.refiner.registration import RegistrationConfig
 from orthoswarm.config.refiner.strategy import StrategyConfig
 from orthoswarm.config.refiner.surface import SurfaceConfig
+from orthoswarm.config.stereo import StereoConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -48,6 +49,7 @@ class Config:
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)

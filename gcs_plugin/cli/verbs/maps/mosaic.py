@@ -27,6 +27,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
     add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
     add(
+        "--surface", type=Path, metavar="FILE.tif",
+        help="also write a surface model there: height of ground, roofs and crowns, with its sigma",
+    )  # fmt: skip
+    add(
         "--control", type=Path, metavar="FILE",
         help="surveyed points that move the map onto the ground: ODM's gcp_list.txt, or a CSV (docs/usage.md)",
     )  # fmt: skip
@@ -80,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
         until=args.until,
         fov_min_deg=args.fov_min,
         gsd_m=args.gsd,
+        surface=args.surface,
         dem=args.dem,
         split_legs=args.split == "legs",
         gains=not args.no_gains,
@@ -142,6 +147,11 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")
     if args.workers is not None and args.workers < 1:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
+    if args.surface is not None:
+        if args.surface.suffix.lower() not in (".tif", ".tiff") or args.surface.is_dir():
+            raise InputError(f"--surface {args.surface} is not the name of a GeoTIFF; end it in .tif")
+        if args.until == "realtime" or args.refine != "swarm":
+            raise InputError("--surface needs the refined pictures; leave out --until realtime and --refine paper")
     if not args.pixel_scale > 0.0:
         raise InputError("--pixel-scale must be greater than 0; leave it out for points marked in these photos")
     files = (

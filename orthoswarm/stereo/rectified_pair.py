@@ -1,0 +1,189 @@
+"""One pair of pictures: epipolar rectification, semi-global matching, and the ground points of its matches.
+
+The rectified cameras look along the mean of both lines of sight, at right angles to the base, with rows along it
+(Fusiello et al. 2000); matching is Hirschmüller's (2008) as OpenCV has it.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.placement import Terrain
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+_FRACTION = 16.0
+"""Disparities of OpenCV are whole numbers of this part of a pixel."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A picture with its camera.
+
+    Attributes:
+        camera: of the full picture.
+        gray: uint8 (rows, columns), the picture reduced by `factor` along each side.
+    """
+
+    camera: Camera
+    gray: Gray
+    factor: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Rectified:
+    """The common frame of a pair.
+
+    Attributes:
+        axes: float64 (3, 3), its x (along the base), y and z (depth) axes in east, north, up, as columns.
+        base_m: distance of the cameras. focal_px: of both rectified pictures.
+        left, top: place of pixel (0, 0) relative to the principal point, pixels.
+        width, height: of the rectified pictures. shift: smallest disparity; count: number of disparities.
+    """
+
+    axes: Array
+    base_m: float
+    focal_px: float
+    left: int
+    top: int
+    width: int
+    height: int
+    shift: int
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class PairPoints:
+    """Points of a pair: float64 (N, 3) east, north, up, and one sigma of each height, float64 (N,)."""
+
+    points: Array
+    sigma_m: Array
+
+
+def match_pair(first: View, second: View, terrain: Terrain) -> PairPoints:
+    """Heights of what two pictures show.
+
+    Args:
+        first, second: the pictures. terrain: ground around which heights are sought.
+
+    Returns:
+        The points of all consistent matches, none if the pictures have too little in common.
+    """
+    frame = _common_frame(first, second, terrain)
+    if frame is None:
+        return PairPoints(np.zeros((0, 3)), np.zeros(0))
+    left, seen_left = _resampled(first, frame, 0)
+    right, seen_right = _resampled(second, frame, frame.shift)
+    disparity = _disparities(left, right, frame.count)
+    rows, columns = np.nonzero(seen_left & (disparity >= 0.0))
+    found = disparity[rows, columns]
+    other = np.rint(columns - found).astype(np.intp)
+    within = other >= 0
+    within[within] = seen_right[rows[within], other[within]]
+    rows, columns, total = rows[within], columns[within], found[within] + frame.shift
+    positive = total > 0.0
+    rows, columns, total = rows[positive], columns[positive], total[positive]
+    depth = frame.focal_px * frame.base_m / total
+    rays = np.stack([columns + frame.left, rows + frame.top, np.full(len(rows), frame.focal_px)], -1) / frame.focal_px
+    points = first.camera.position + (rays * depth[:, None]) @ frame.axes.T
+    along = abs(float(frame.axes[2, 2])) * active().stereo.disparity_sigma_px
+    return PairPoints(points, along * depth / total)
+
+
+def _common_frame(left: View, right: View, terrain: Terrain) -> _Rectified | None:
+    """The rectified frame: the first picture's extent, on the rows that both have, with the heights' disparities."""
+    c = active().stereo
+    first, second = left.camera, right.camera
+    base = second.position - first.position
+    base_m = float(np.linalg.norm(base))
+    x = base / base_m
+    z = first.rotation[:, 2] + second.rotation[:, 2]
+    z = z - x * (z @ x)
+    z = z / np.linalg.norm(z)
+    axes = np.stack([x, np.cross(z, x), z], 1)
+    focal = min(view.camera.lens.focal_px / view.factor for view in (left, right))
+    one, two = _outline(first, axes), _outline(second, axes)
+    if one is None or two is None:
+        return None
+    low, high = one.min(0) * focal, one.max(0) * focal
+    top, bottom = max(low[1], two[:, 1].min() * focal), min(high[1], two[:, 1].max() * focal)
+    width, height = int(np.ceil(high[0] - low[0])) + 1, int(np.ceil(bottom - top)) + 1
+    ground = _levels(first, terrain)
+    above = min(c.tallest_m, c.tallest_heights * (float(first.position[2]) - ground[1]))
+    depths = [_depths(first, axes, ground[0] - c.depth_m), _depths(first, axes, ground[1] + above)]
+    if height < 4 * c.block_px or not min(d.min() for d in depths) > 0.0:
+        return None
+    disparity = focal * base_m / np.concatenate(depths)
+    shift = int(np.floor(disparity.min()))
+    count = 16 * int(np.ceil((float(disparity.max()) - shift + 1.0) / 16.0))
+    return _Rectified(
+        axes=axes, base_m=base_m, focal_px=focal, left=int(np.floor(low[0])), top=int(np.floor(top)), width=width,
+        height=height, shift=shift, count=count,
+    )  # fmt: skip
+
+
+def _rim(camera: Camera) -> Array:
+    """Pixels (8, 2) on the picture's border."""
+    w, h = camera.lens.width - 1.0, camera.lens.height - 1.0
+    return np.array([[0, 0], [w / 2, 0], [w, 0], [w, h / 2], [w, h], [w / 2, h], [0, h], [0, h / 2]])
+
+
+def _outline(camera: Camera, axes: Array) -> Array | None:
+    """The border in normalised coordinates (8, 2) of the rectified frame; None where it looks away from it."""
+    lens = camera.lens
+    xy = lens.undistort((_rim(camera) - np.array(lens.principal_point)) / lens.focal_px)
+    ray = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ (camera.rotation.T @ axes)
+    return ray[:, :2] / ray[:, 2:] if (ray[:, 2] > 0.2).all() else None
+
+
+def _levels(camera: Camera, terrain: Terrain) -> tuple[float, float]:
+    """The lowest and the highest ground below a picture."""
+    w, h = camera.lens.width - 1.0, camera.lens.height - 1.0
+    columns, rows = np.meshgrid(np.linspace(0, w, 5), np.linspace(0, h, 5))
+    ground = camera.to_ground(np.stack([columns.ravel(), rows.ravel()], -1), float(terrain.height(camera.nadir)))
+    z = terrain.height(ground[np.isfinite(ground).all(1)])
+    return (float(z.min()), float(z.max())) if len(z) else (0.0, 0.0)
+
+
+def _depths(camera: Camera, axes: Array, level_m: float) -> Array:
+    """Depths along the rectified z axis of the border's points on a level."""
+    ground = camera.to_ground(_rim(camera), level_m)
+    points = np.column_stack([ground, np.full(len(ground), level_m)])
+    return np.asarray(np.nan_to_num((points - camera.position) @ axes[:, 2], nan=-1.0))
+
+
+def _resampled(view: View, frame: _Rectified, shift: int) -> tuple[Gray, NDArray[np.bool_]]:
+    """A picture in the rectified frame, moved right by `shift` pixels, and where it has content."""
+    lens, factor = view.camera.lens, view.factor
+    u, v = ((p + 0.5) / factor - 0.5 for p in lens.principal_point)
+    focal = lens.focal_px / factor
+    inner = np.array([[focal, 0.0, u], [0.0, focal, v], [0.0, 0.0, 1.0]])
+    rectified = np.array(
+        [[frame.focal_px, 0.0, shift - frame.left], [0.0, frame.focal_px, -frame.top], [0.0, 0.0, 1.0]]
+    )
+    terms = np.array([lens.k1, lens.k2, 0.0, 0.0, lens.k3])
+    turn = frame.axes.T @ view.camera.rotation
+    column, row = cv2.initUndistortRectifyMap(inner, terms, turn, rectified, (frame.width, frame.height), cv2.CV_32FC1)
+    height, width = view.gray.shape
+    seen = (column >= 0) & (row >= 0) & (column <= width - 1) & (row <= height - 1)
+    picture = cv2.remap(view.gray, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(picture, np.uint8), seen
+
+
+def _disparities(left: Gray, right: Gray, count: int) -> NDArray[np.float32]:
+    """Disparity of each pixel of the left picture, float32, negative where no match is found."""
+    c = active().stereo
+    area = c.block_px**2
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=count, blockSize=c.block_px, P1=int(c.smoothness[0] * area),
+        P2=int(c.smoothness[1] * area), disp12MaxDiff=1, uniquenessRatio=c.unique_percent,
+        speckleWindowSize=c.speckle_px, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    pads = (0, 0, count, 0, cv2.BORDER_REPLICATE)  # the matcher leaves out as many columns as there are disparities
+    found = matcher.compute(cv2.copyMakeBorder(left, *pads), cv2.copyMakeBorder(right, *pads))
+    return np.asarray(found[:, count:], np.float32) / np.float32(_FRACTION)

@@ -1,0 +1,122 @@
+"""The surface model of placed frames: pairs are matched in parallel, their heights gathered on one grid."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.raster.picture_file import PictureError, read_gray, reduction
+from orthoswarm.stereo.picture_pairs import choose_pairs
+from orthoswarm.stereo.rectified_pair import View, match_pair
+from orthoswarm.stereo.surface_cells import CellHeights, SurfaceCells, SurfaceModel, cell_heights
+
+_PAIRS_PER_TASK = 12
+"""Pairs of a task: enough of them share pictures."""
+_PICTURES_HELD = 8
+"""Decoded pictures that a task keeps for its next pairs."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Pairs of neighbouring pictures: frames, indices of pairs into them, ground below them, cells."""
+
+    frames: list[PlacedFrame]
+    pairs: list[tuple[int, int]]
+    terrain: Terrain
+    grid: GroundGrid
+
+
+def surface_model(
+    frames: Sequence[PlacedFrame],
+    terrain: Terrain,
+    epsg: int,
+    scratch: Path,
+    *,
+    run: Run = serial,
+    progress: Callable[[int, int], None] | None = None,
+) -> SurfaceModel:
+    """Measure the visible surface from refined frames.
+
+    Args:
+        frames: with solved cameras.
+        terrain: ground below them: heights are sought around it.
+        epsg: the grid of the area. scratch: an empty folder for what does not fit into memory.
+        run: where the work runs. progress: called with the pairs done and all pairs.
+
+    Raises:
+        OrthoSwarmError: if no two pictures overlap enough.
+    """
+    pairs = choose_pairs(frames, terrain)
+    if not pairs:
+        raise OrthoSwarmError("no two pictures overlap enough to tell heights")
+    cells = SurfaceCells(_grid(frames, terrain, epsg, pairs), scratch)
+    done = 0
+    for found, count in run(_match, _tasks(frames, pairs, terrain, cells.grid)):
+        cells.add(found)
+        done += count
+        if progress is not None:
+            progress(done, len(pairs))
+    return cells.merged()
+
+
+def _grid(frames: Sequence[PlacedFrame], terrain: Terrain, epsg: int, pairs: Sequence[tuple[int, int]]) -> GroundGrid:
+    """Cells over the footprints of all frames with a partner."""
+    c = active().stereo
+    some = [frames[i] for i in sorted({i for pair in pairs for i in pair})]
+    level = [float(terrain.height(p.camera.nadir)) for p in some]
+    corners = np.concatenate([p.camera.corners(z) for p, z in zip(some, level)])
+    bounds = BoundingBox.around_points(corners[np.isfinite(corners).all(1)], 0.0)
+    pixel = [(p.camera.position[2] - z) / p.camera.lens.focal_px * _factor(p) for p, z in zip(some, level)]
+    west, south, east, north = bounds
+    smallest = float(np.sqrt((east - west) * (north - south) / c.most_cells))
+    return GroundGrid.around(epsg, bounds, round(max(c.cell_pixels * float(np.median(pixel)), smallest), 3))
+
+
+def _factor(placed: PlacedFrame) -> int:
+    lens = placed.camera.lens
+    return reduction(lens.width, lens.height, active().stereo.longest_px)
+
+
+def _tasks(
+    frames: Sequence[PlacedFrame], pairs: Sequence[tuple[int, int]], terrain: Terrain, grid: GroundGrid
+) -> list[_Task]:
+    bare = terrain.bare_ground()
+    tasks = []
+    for start in range(0, len(pairs), _PAIRS_PER_TASK):
+        some = pairs[start : start + _PAIRS_PER_TASK]
+        index = sorted({i for pair in some for i in pair})
+        place = {i: k for k, i in enumerate(index)}
+        tasks.append(_Task([frames[i] for i in index], [(place[i], place[j]) for i, j in some], bare, grid))
+    return tasks
+
+
+def _match(task: _Task) -> tuple[list[CellHeights], int]:
+    """The heights of a task's pairs, and how many pairs it had."""
+
+    @lru_cache(_PICTURES_HELD)
+    def picture(index: int) -> NDArray[np.uint8] | None:
+        try:
+            return read_gray(task.frames[index].frame.path, _factor(task.frames[index]))
+        except PictureError:
+            return None  # it is named among the pictures that were not drawn
+
+    out = []
+    for i, j in task.pairs:
+        first, second = task.frames[i], task.frames[j]
+        one, two = picture(i), picture(j)
+        if one is None or two is None:
+            continue
+        found = match_pair(
+            View(first.camera, one, _factor(first)), View(second.camera, two, _factor(second)), task.terrain
+        )
+        out.append(cell_heights(found, task.grid))
+    return out, len(task.pairs)

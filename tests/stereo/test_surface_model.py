@@ -1,0 +1,65 @@
+"""`mosaic --surface`: the surface model of a run beside the true heights of its scene."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+
+from gcs_plugin.cli.main import main
+from tests.kit.scenes import tiny_twin
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    return tiny_twin(tmp_path_factory, 5)
+
+
+@pytest.fixture(scope="module")
+def made(twin, tmp_path_factory):
+    out = tmp_path_factory.mktemp("surface") / "map"
+    inputs = [str(twin / "photos"), "--basemap", str(twin / "basemap.tif"), "--workers", "1"]
+    assert main(["mosaic", *inputs, "--out", str(out), "--surface", str(out / "dsm.tif")]) == 0
+    return out
+
+
+def test_heights_and_sigmas_are_those_of_the_scene(twin, made):
+    with rasterio.open(made / "dsm.tif") as file:
+        height, sigma, pairs = file.read(masked=True)
+        altitude = float(file.tags()["TAKEOFF_ALTITUDE_M"])
+        rows, columns = np.nonzero(~np.ma.getmaskarray(height))
+        east, north = (np.array(v) for v in rasterio.transform.xy(file.transform, rows, columns))
+        assert file.descriptions[1].startswith("one sigma") and file.crs.is_projected
+    with rasterio.open(twin / "truth" / "dsm.tif") as truth, rasterio.open(twin / "truth" / "dtm.tif") as ground:
+        row, column = (np.array(v) for v in rasterio.transform.rowcol(truth.transform, east, north))
+        inside = (row >= 0) & (column >= 0) & (row < truth.height) & (column < truth.width)
+        true = truth.read(1)[row[inside], column[inside]]
+        tall = true - ground.read(1)[row[inside], column[inside]] > 3.0
+    error = height[rows, columns].data[inside] - altitude - true
+    error = np.abs(error - np.median(error[~tall]))  # the takeoff level itself is known to some decimetres
+    stated = sigma[rows, columns].data[inside]
+    assert len(error) > 20_000 and tall.sum() > 1_000
+    assert np.median(error) < 0.4 and np.median(error[tall]) < 1.2  # a pixel is 0.67 m
+    assert 0.6 < (error < stated).mean() < 0.9 and (error < 2 * stated).mean() > 0.9
+    assert pairs.min() >= 2
+
+
+def test_the_report_says_what_was_made(made):
+    surface = json.loads((made / "report.json").read_text())["surface"]
+    assert surface["file"].endswith("dsm.tif") and surface["known_ha"] > 3.0
+    assert 0.1 < surface["median_sigma_m"] < 1.0 < surface["cell_m"] < 2.0
+
+
+def test_photos_without_common_ground_make_a_map_and_a_warning_but_no_surface(twin, tmp_path):
+    photos = sorted((twin / "photos").rglob("*.JPG"))[:1]
+    out = tmp_path / "map"
+    assert main(["mosaic", *map(str, photos), "--out", str(out), "--surface", str(tmp_path / "dsm.tif")]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["surface"] is None and any("surface model was not made" in w for w in report["warnings"])
+    assert not (tmp_path / "dsm.tif").exists()
+
+
+@pytest.mark.parametrize("more", [["--surface", "dsm.png"], ["--surface", "dsm.tif", "--until", "realtime"]])
+def test_what_cannot_be_made_is_refused_before_the_work(more, twin, tmp_path, capsys):
+    assert main(["mosaic", str(twin / "photos"), "--out", str(tmp_path / "map"), *more]) == 2
+    assert "--surface" in capsys.readouterr().err and not (tmp_path / "map").exists()
