@@ -21,7 +21,7 @@ DESK, TABLET, PHONE = (1440, 900), (1024, 768), (390, 844)
 LIMIT_MS = 600_000
 DRAWN_MS = 4000
 TILES = "[...document.querySelectorAll('.tile .pictures')]"
-COME = TILES + ".reduce((n, e) => n + parseInt(e.textContent.split('/')[1]), 0)"
+COME = TILES + ".reduce((n, e) => n + parseInt(e.textContent.split('/')[0]), 0)"
 
 
 class Program:

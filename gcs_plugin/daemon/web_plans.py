@@ -19,7 +19,7 @@ from orthoswarm.model.errors import InputError
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
 _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
-    "clearance_m", "height_tolerance_m", "wait_min",
+    "clearance_m", "height_tolerance_m", "wait_min", "wind_m_s", "wind_from_deg",
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6
 _NO_FLY_FILE: Final = "no-fly.geojson"

@@ -182,8 +182,12 @@ class Routes:
     # -- what pages share -----------------------------------------------------------------------------------------
 
     async def console_plan(self) -> Response:
-        """The operator's plan as all pages see it: `area`, `settings`, `plan` (id), `vehicles`, `version`."""
-        return JsonAnswer(await self.work(self.daemon.console.plan))
+        """The operator's plan as all pages see it: `area`, `settings`, `plan` (id), `vehicles`, `version`.
+
+        `dem` is the name of the height model that plans follow, null without one.
+        """
+        dem = self.daemon.plans.dem
+        return JsonAnswer(await self.work(self.daemon.console.plan) | {"dem": None if dem is None else dem.name})
 
     async def put_console_plan(self, request: Request) -> Response:
         """Replace the operator's plan; 409 if it has another `version` than the one that was changed."""

@@ -199,3 +199,18 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             start.click()
             page.wait_for_selector("dialog[aria-labelledby=preflight-title]", state="hidden")
             assert station.commands("start")[0]["override"] == {"v7": ["battery", "gps"]}
+
+
+def test_on_a_phone_the_panel_can_be_made_taller_and_the_scale_is_free(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url, PHONE) as page:
+        page.click("#tab-plan")
+        low = page.locator("#side").bounding_box()["height"]
+        assert low <= PHONE[1] / 3
+        page.click("button[aria-label='Taller panel']")
+        tall = page.locator("#side").bounding_box()["height"]
+        assert tall > 0.4 * PHONE[1]
+        page.click("button[aria-label='Lower panel']")
+        assert page.locator("#side").bounding_box()["height"] == low
+        scale = page.locator(".maplibregl-ctrl-scale").bounding_box()
+        fold = page.locator(".grow").bounding_box()
+        assert scale["x"] + scale["width"] <= fold["x"]

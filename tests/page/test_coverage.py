@@ -49,7 +49,7 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             words = page.locator(".coverage")
             page.wait_for_function("document.querySelector('.gaps button')?.textContent.includes('not triggered')")
             assert "90.0 %" in words.inner_text() and "3 legs" in words.inner_text()
-            assert "2 pictures not arrived (event 7)" in words.inner_text()
+            assert "2 pictures not arrived (the first: event 7)" in words.inner_text()
             page.locator(".gaps button").click()
             assert abs(page.evaluate("orthoswarm.map.getCenter().lng") - 8.5605) < 1e-3
             page.click("text=Fly the gaps…")

@@ -140,3 +140,54 @@ def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
             page.wait_for_function("document.querySelector('[name=altitude_m]').value === '120'")
             assert [body["version"] for _, path, body in station.heard if path == "/api/plan"] == [3]
             assert corners(page) == 3
+
+
+def opened_groups(page):
+    for summary in page.locator(".panel form summary").all():
+        summary.click()
+
+
+def test_wind_wait_and_terrain_go_into_the_request_and_contradictions_are_said(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        station.gets["/api/plan"] = {"version": 1, "dem": "hills.tif", "settings": {"relief": "level"}}
+        station.answer = lambda *_: (422, {"detail": "30 m above ground are too few; give a larger --altitude"})
+        page.reload()
+        page.wait_for_function("() => window.orthoswarm")
+        planning(page)
+        draw(page, (600, 250), (900, 250), (900, 550))
+        opened_groups(page)
+        page.wait_for_function("document.querySelector('[name=relief]').value === 'level'")
+        for name, text in (("wind_m_s", "8"), ("wait_min", "4"), ("height_tolerance_m", "12")):
+            page.fill(f"[name={name}]", text)
+        page.select_option("[name=end]", "hover")
+        page.check("[name=terrain_items]")
+        page.click("text=Make plan")
+        page.wait_for_selector(".notice:has-text('say where the wind comes from')")
+        page.fill("[name=wind_from_deg]", "270")
+        page.click("text=Make plan")
+        page.wait_for_selector(".notice:has-text('hovers at the end needs no wait')")
+        page.select_option("[name=end]", "land")
+        page.click("text=Make plan")
+        page.wait_for_selector(".notice:has-text('give a larger \"Height above ground, m\"')")
+        (body,) = [body for method, path, body in station.heard if method == "POST" and path == "/api/plans"]
+        assert {
+            "wind_m_s": 8, "wind_from_deg": 270, "wait_min": 4, "relief": "level", "height_tolerance_m": 12,
+            "terrain_items": True, "end": "land",
+        }.items() <= body.items()  # fmt: skip
+        assert len(body["starts"]) == 1
+        page.wait_for_timeout(1500)  # kept for other pages a moment after the last change
+        kept = [body["settings"] for method, path, body in station.heard if (method, path) == ("PUT", "/api/plan")][-1]
+        assert (kept["wind_from_deg"], kept["terrain_items"], kept["relief"]) == ("270", True, "level")
+
+
+def test_without_a_height_model_the_page_says_how_to_get_one(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        planning(page)
+        draw(page, (600, 250), (900, 250), (900, 550))
+        opened_groups(page)
+        assert not page.is_visible("[name=relief]")
+        assert page.is_visible("text=Start it with --dem FILE")
+        page.click("text=Make plan")
+        page.wait_for_selector(".notice")
+        (body,) = [body for method, path, body in station.heard if method == "POST" and path == "/api/plans"]
+        assert not {"relief", "terrain_items", "wind_m_s", "wait_min"} & body.keys()

@@ -21,6 +21,7 @@ COUNT = """() => {
   window.presses = 0;
   for (const tile of document.querySelectorAll(".tile")) tile.addEventListener("click", () => { window.presses++; });
 }"""
+NONE = "\N{EN DASH}"
 FOCUSED = "document.activeElement.closest('.tile').querySelector('b').textContent"
 WILD = [
     {"type": "vehicle", "id": "v1", "lat_deg": 1e308}, {"type": "frame", "outline": 7}, {"type": "job"}, {},
@@ -217,3 +218,28 @@ def test_other_aircraft_are_on_the_map_while_they_are_heard(browser):
         assert page.locator(".traffic").count() == 1
         send(page, {"type": "traffic", "rows": []})
         page.wait_for_selector(".traffic", state="detached")
+
+
+def test_a_vehicle_that_only_sends_pictures_shows_nothing_that_is_not_known(browser):
+    row = {"id": "v7", "name": "Card", "lat_deg": 47.3977, "lon_deg": 8.5456, "frames": {"frames": 5}, "state": ""}
+    with standing(row) as station, opened(browser, station.url) as page:
+        page.click(".tile")
+        assert "armed" not in page.inner_text(".details")
+        assert page.inner_text(".tile .cells").split() == [NONE, "5/5", "pics"]
+        assert page.locator(".details dd:visible").all_inner_texts().count(NONE) <= 2  # height, refined
+
+
+def test_start_is_not_offered_in_the_air_and_the_details_do_not_cover_the_map(browser):
+    ground = vehicle(2, armed=False, flight={"state": "on ground", "text": "on ground"})
+    with standing(vehicle(1), ground) as station, opened(browser, station.url) as page:
+        page.click(".tile >> nth=0")
+        page.wait_for_selector(".details [data-verb=start]:disabled")
+        assert page.is_enabled(".details [data-verb=rtl]")
+        page.click(".tile >> nth=1")
+        page.wait_for_selector(".details [data-verb=start]:enabled")
+        page.click("#tab-map")
+        page.wait_for_selector(".details", state="hidden")
+        page.click(".vehicle >> nth=0")
+        page.wait_for_selector(".details")  # asked for here
+        page.click("#tab-fly")
+        page.wait_for_selector(".details")

@@ -18,6 +18,7 @@ document.title = t("app.title");
 const tabs = MODES.map((mode) => make("button", { type: "button", role: "tab", id: `tab-${mode}`, "aria-controls": `panel-${mode}`, onclick: () => setMode(mode) }, t(`mode.${mode}`)));
 const settingsBox = settingsDialog(refresh);
 const fold = button("", () => { setSetting("folded", !settings.folded); setMode(settings.mode); }, { class: "fold" });
+const grow = button("", () => { setSetting("tall", !settings.tall); setMode(settings.mode); }, { class: "fold grow" });
 const header = make("header", {}, make("h1", {}, t("app.title")), make("div", { class: "tabs", role: "tablist", "aria-label": t("mode.title") }, ...tabs), problemList(), linkStatus(),
   button("⚙", settingsBox.open, { class: "icon", "aria-label": t("settings.title") }));
 byId("top").replaceWith(header);
@@ -31,7 +32,7 @@ const { stripOf } = await import("/static/fly/tiles.js");
 const { alarmList } = await import("/static/fly/alarms.js");
 const panels = Object.fromEntries(MODES.map((mode) => [mode, make("div", { class: "panel", role: "tabpanel", id: `panel-${mode}`, "aria-labelledby": `tab-${mode}`, tabindex: "0" })]));
 setAttribute(byId("side"), "aria-label", t("panel.title"));
-byId("side").append(fold, ...Object.values(panels));
+byId("side").append(grow, fold, ...Object.values(panels));
 panels.fly.append(stripOf());
 byId("stage").append(make("div", { class: "corner" }, alarmList(), noticeBox()));
 
@@ -48,6 +49,9 @@ function setMode(mode) {
   setText(fold, settings.folded ? "»" : "«");
   setAttribute(fold, "aria-label", t(settings.folded ? "panel.open" : "panel.fold"));
   setAttribute(fold, "aria-expanded", settings.folded ? "false" : "true");
+  setAttribute(document.body, "data-tall", settings.tall);
+  setText(grow, settings.tall ? "▾" : "▴");
+  setAttribute(grow, "aria-label", t(settings.tall ? "panel.lower" : "panel.taller"));
   setEditing(mode === "plan");
 }
 header.querySelector("[role=tablist]").addEventListener("keydown", (event) => {

@@ -9,6 +9,7 @@ import { showCoverage } from "/static/coverage/layer.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 const MOST = 30;
+const STATES = ["seen", "poor", "missed", "planned"];
 const percent = (share) => `${(100 * (share ?? 0)).toFixed(share > 0.999 && share < 1 ? 2 : 1)} %`;
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
 
@@ -30,6 +31,8 @@ function missingRows(rows) {
 
 export function coveragePanel() {
   const shares = make("p", {});
+  const figures = Object.fromEntries(STATES.map((key) => [key, make("b", {})]));
+  const legend = make("ul", { class: "shares" }, ...STATES.map((key) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true", dataset: { state: key } }), make("span", {}, t(`coverage.${key}`)), figures[key])));
   const recorded = make("p", { class: "quiet" });
   const gapsTitle = make("p", {});
   const list = make("ul", { class: "gaps" });
@@ -45,14 +48,15 @@ export function coveragePanel() {
     setText(row.firstChild, `${t("coverage.gap", { size: units.area(gap.area_m2), cause })}, ${t("coverage.sure", { sure: percent(gap.confidence) })}`);
     setAttribute(row, "data-poor", gap.detail ? "true" : "false");
   });
-  const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.image })));
-  const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, recorded, toggle, offers, gapsTitle, list, more, fly, missing);
+  const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.n > 1 ? t("coverage.missing.first", { image: group.image }) : group.image })));
+  const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing);
   subscribe("coverage vehicles", "coverage", () => {
     const now = state.coverage;
     const known = now?.seen_share != null;
-    for (const part of [recorded, toggle, offers, gapsTitle, list, more, fly, missing]) setHidden(part, !known);
+    for (const part of [legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing]) setHidden(part, !known);
     if (!known) { setText(shares, t("coverage.none")); return; }
-    setText(shares, `${t(`coverage.state.${now.state}`)} ${t("coverage.shares", { seen: percent(now.seen_share), poor: percent(now.poor_share), missed: percent(now.missed_share), planned: percent(now.planned_share) })}`);
+    setText(shares, t(`coverage.state.${now.state}`));
+    for (const key of STATES) setText(figures[key], percent(now[`${key}_share`]));
     setText(recorded, t("coverage.recorded", { seen: percent(now.recorded.seen_share), placed: now.pictures.placed, left: now.pictures.recorded }));
     setText(gapsTitle, now.gaps.length ? t("coverage.gaps", { n: now.gaps.length, size: units.area(now.gaps.reduce((sum, gap) => sum + gap.area_m2, 0)) }) : t("coverage.nogaps"));
     drawGaps(now.gaps.slice(0, MOST).map((gap) => [`${gap.lat_deg},${gap.lon_deg},${gap.cause}`, gap]));

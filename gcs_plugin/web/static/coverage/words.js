@@ -2,11 +2,11 @@
 
 export const coverageWords = {
   "coverage.title": "Coverage", "coverage.none": "No area yet: plan one, or draw it.", "coverage.show": "Show on the map",
-  "coverage.shares": "Seen {seen}, seen poorly {poor}, missed {missed}, still planned {planned}.",
+  "coverage.seen": "seen", "coverage.poor": "seen poorly", "coverage.missed": "missed", "coverage.planned": "not flown yet",
   "coverage.recorded": "By recorded poses alone: {seen} seen. {placed} pictures are placed, {left} lie as recorded.",
   "coverage.gaps": "{n} gaps, {size} together", "coverage.nogaps": "No gap so far.",
   "coverage.gap": "{size}: {cause}", "coverage.sure": "{sure} sure", "coverage.more": "and {n} smaller ones",
-  "coverage.missing": "{n} pictures are missing:", "coverage.missing.row": "{name}: {n} {cause} ({first})",
+  "coverage.missing.first": "the first: {image}", "coverage.missing.row": "{name}: {n} {cause} ({first})",
   "coverage.state.planned": "Nothing flown yet.", "coverage.state.in flight": "In flight.", "coverage.state.complete": "The flight is over.",
   "coverage.fly": "Fly the gaps…", "coverage.offer": "{name} has left {legs} legs ({length}) behind: others can fly them as gaps.",
   "gapflight.title": "Fly the gaps", "gapflight.about": "The plan uses the lens as it was solved and the battery that is left. Nothing is uploaded before you confirm, and nothing starts before the check.",

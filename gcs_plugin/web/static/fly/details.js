@@ -1,46 +1,60 @@
 // The selected vehicle: its figures in full, its commands, and what its autopilot says.
 
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
-import { settings } from "/static/core/settings.js";
-import { select, state, subscribe } from "/static/core/store.js";
+import { onSettings, settings } from "/static/core/settings.js";
+import { changed, select, state, subscribe } from "/static/core/store.js";
 import { positionText } from "/static/core/coordinates.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
-import { need } from "/static/fly/need.js";
+import { inAir, need } from "/static/fly/need.js";
 import { askOne } from "/static/fly/command_bar.js";
 import { wordOf } from "/static/fly/tiles.js";
 import { lengthOf } from "/static/map/geodesy.js";
 import { map } from "/static/map/map.js";
 import { refine } from "/static/work/jobs.js";
 
+// What only a vehicle on a link can say.
+const OF_A_LINK = ["speed", "battery", "gps", "home", "mission"];
 const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "home", "mission", "pictures", "refined"];
 
 export function detailsPanel() {
   const name = make("h2", {});
   const why = make("p", { class: "why" });
   const cells = Object.fromEntries(FACTS.map((key) => [key, make("dd", {})]));
-  const facts = make("dl", {}, ...FACTS.flatMap((key) => [make("dt", {}, t(`details.${key}`)), cells[key]]));
+  const terms = Object.fromEntries(FACTS.map((key) => [key, make("dt", {}, t(`details.${key}`))]));
+  const facts = make("dl", {}, ...FACTS.flatMap((key) => [terms[key], cells[key]]));
   const chosen = () => state.vehicles.get(state.selected);
   const verb = (key) => make("button", { type: "button", dataset: { verb: key }, onclick: () => chosen() && askOne(chosen(), key) }, t(`verb.${key}`));
-  const linked = make("div", { class: "row wrap", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
+  const linked = make("div", { class: "verbs", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
+  const start = linked.lastChild;
   const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
   const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.time == null ? message.text : `${new Date(message.time * 1000).toTimeString().slice(0, 8)} ${message.text}`); setAttribute(row, "data-severity", message.severity); });
   const silent = make("p", { class: "quiet" }, t("details.silent"));
+  const heading = make("h3", {}, t("details.messages"));
   const box = make("aside", { class: "details", "aria-label": t("details.title"), hidden: true },
     make("div", { class: "row" }, name, button("×", () => select(null), { class: "close", "aria-label": t("details.close") })),
-    why, linked, make("div", { class: "row wrap" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
+    why, linked, make("div", { class: "verbs" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
       button(t("details.refine"), () => chosen() && refine(chosen().id))),
-    facts, make("h3", {}, t("details.messages")), silent, messages);
+    facts, heading, silent, messages);
+  // In Plan and Map it covers the map only if it was opened there.
+  let shownFor = null;
+  let openedIn = "fly";
+  onSettings((setting) => { if (setting === "mode") changed("selected"); });
   subscribe("vehicles selected tick completions", "details of a vehicle", () => {
     const row = chosen();
-    setHidden(box, !row);
-    if (!row) return;
+    if (state.selected !== shownFor) { shownFor = state.selected; openedIn = settings.mode; }
+    const covered = settings.mode !== "fly" && settings.mode !== openedIn;
+    setHidden(box, !row || covered);
+    if (!row || covered) return;
     const wanted = need(row, performance.now());
     setText(name, row.name === row.id ? row.id : `${row.name} (${row.id})`);
     setText(why, wanted.why.map((item) => item.words).join("; "));
-    setHidden(linked, !row.linked);
+    for (const part of [linked, heading, messages]) setHidden(part, !row.linked);
+    for (const key of OF_A_LINK) for (const cell of [terms[key], cells[key]]) setHidden(cell, !row.linked);
+    start.disabled = inAir(row);
+    setAttribute(start, "title", inAir(row) ? t("details.start.air") : null);
     const values = {
-      state: [wordOf(row), row.mode, row.armed ? t("details.armed") : t("details.disarmed")].filter(Boolean).join(", "),
+      state: row.linked ? [wordOf(row), row.mode, row.armed ? t("details.armed") : t("details.disarmed")].filter(Boolean).join(", ") : wordOf(row),
       position: row.position ? positionText(row.position[1], row.position[0], settings.coordinates) : "–",
       height: units.height(row.height_m), speed: units.speed(row.speed_m_s),
       battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
@@ -53,7 +67,7 @@ export function detailsPanel() {
     };
     for (const key of FACTS) setText(cells[key], values[key]);
     const said = row.texts.toReversed();
-    setHidden(silent, said.length > 0);
+    setHidden(silent, said.length > 0 || !row.linked);
     draw(said.map((message, k) => [k, message]));
   });
   return box;

@@ -11,6 +11,8 @@ import { colourOf } from "/static/map/colours.js";
 import { inAir, need } from "/static/fly/need.js";
 
 const FIX = ["", "", "2D", "3D", "DGPS", "RTK~", "RTK"];
+// What only a vehicle on a link can say.
+const OF_A_LINK = ["speed", "battery", "gps", "age"];
 const PARTS = ["height", "speed", "battery", "gps", "age", "pictures"];
 const tiles = new Map();
 const list = make("ul", { class: "tiles", "aria-label": t("fly.vehicles") });
@@ -52,8 +54,9 @@ const update = (row, now) => {
   setText(tile.word, wordOf(row));
   setText(tile.cells.height, units.height(row.height_m));
   setText(tile.cells.speed, units.speed(row.speed_m_s));
-  setText(tile.cells.battery, `${units.percent(row.battery)}${row.battery_left_s == null ? "" : ` ${units.clock(row.battery_left_s)}`}`);
-  setText(tile.cells.gps, row.linked ? t("tile.fix", { fix: FIX[row.gps_fix] || t("tile.nofix"), n: row.satellites ?? "–" }) : "–");
+  for (const key of OF_A_LINK) setHidden(tile.cells[key], !row.linked);
+  setText(tile.cells.battery, t("tile.batt", { left: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : ` ${units.clock(row.battery_left_s)}`}` }));
+  setText(tile.cells.gps, t("tile.fix", { fix: FIX[row.gps_fix] || t("tile.nofix"), n: row.satellites ?? "–" }));
   setText(tile.cells.age, age_s == null ? "–" : t("tile.heard", { age: units.ageText(Math.floor(age_s * 2) / 2) }));
   setText(tile.cells.pictures, t("tile.counts", { taken: Math.max(row.photos, row.frames.frames), come: row.frames.frames }));
   setText(tile.why, why.map((item) => item.words).join("; "));

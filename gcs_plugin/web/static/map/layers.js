@@ -5,8 +5,9 @@ import { tileRequest } from "/static/core/api.js";
 import { guarded } from "/static/core/guard.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { FIRST_OVERLAY, FLIGHT_LAYERS, fit, isMoved, isReady, map } from "/static/map/map.js";
+import { boundsOf, FIRST_OVERLAY, FLIGHT_LAYERS, fit, inView, isMoved, isReady, map } from "/static/map/map.js";
 
+const FLOWN = ["realtime", "coarse", "fine"];
 export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 const address = (name) => tileRequest(`/tiles/${name}/{z}/{x}/{y}.webp`).url.replaceAll("%7B", "{").replaceAll("%7D", "}");
 export const rasterSource = (name) => ({ type: "raster", tiles: [address(name)], tileSize: 256, maxzoom: 22 });
@@ -75,13 +76,15 @@ subscribe("layers ready", "layers", () => {
   const full = state.layers.filter((layer) => Array.isArray(layer?.bounds));
   const bounds = mappedBounds();
   if (bounds && String(bounds) !== fitted && !isMoved()) {
-    fit(bounds);
+    if (!fitted || !inView(bounds)) fit(bounds);
     fitted = String(bounds);
   }
   for (const layer of full) if (RASTERS.includes(layer.name)) guarded(`layer ${layer.name} on the map`, showRaster)(layer.name);
 });
 
+// What the pictures of the flights show; before the first one, the basemap.
 export function mappedBounds() {
   const full = state.layers.filter((layer) => layer?.bounds?.length === 4 && layer.bounds.every(Number.isFinite));
-  return (full.find((layer) => layer.name === "best") ?? full[0])?.bounds ?? null;
+  const flown = full.filter((layer) => FLOWN.includes(layer.name));
+  return boundsOf((flown.length ? flown : full).flatMap(({ bounds }) => [bounds.slice(0, 2), bounds.slice(2)]));
 }

@@ -2,6 +2,7 @@
 
 import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
 import { tileRequest } from "/static/core/api.js";
+import { onSettings, settings } from "/static/core/settings.js";
 
 maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
 export { maplibregl };
@@ -14,6 +15,7 @@ const COLOUR = ["coalesce", ["get", "colour"], "#16202a"];
 // id, type, paint, filter, source if it is not the id
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": COLOUR, "fill-opacity": 0.12, "fill-outline-color": COLOUR }],
+  ["trails-edge", "line", { "line-color": "#fff", "line-width": 4, "line-opacity": 0.45 }, null, "trails"],
   ["trails", "line", { "line-color": COLOUR, "line-width": 2, "line-opacity": 0.85 }],
   ["legs", "line", { "line-color": "#fff", "line-width": 7, "line-opacity": 0.6 }],
   ["legs-refined", "line", { "line-color": STATE, "line-width": 4 }, ["==", ["get", "stage"], "fine"], "legs"],
@@ -31,17 +33,21 @@ const OVERLAYS = [
   ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],
   ["measure-line", "line", { "line-color": "#ffd43b", "line-width": 3 }, null, "measure"],
 ];
-export const FLIGHT_LAYERS = ["footprints", "trails", "legs", "legs-refined", "legs-flying", "homes"];
+export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "homes"];
 export const FIRST_OVERLAY = OVERLAYS[0][0];
+
+// Where no layer has pixels: no glare at night.
+const ground = () => (settings.theme === "sunlight" ? "#cfd6dc" : "#3d4751");
 
 export const mapOptions = (container) => ({
   container, center: [0, 20], zoom: 1.5, maxZoom: 23, attributionControl: false, dragRotate: false, pitchWithRotate: false,
-  style: { version: 8, sources: {}, layers: [{ id: "ground", type: "background", paint: { "background-color": "#cfd6dc" } }] },
+  style: { version: 8, sources: {}, layers: [{ id: "ground", type: "background", paint: { "background-color": ground() } }] },
   transformRequest: tileRequest, fadeDuration: 0, trackResize: true,
 });
 
 export const map = new maplibregl.Map(mapOptions("map"));
 map.addControl(new maplibregl.NavigationControl({ showCompass: false }), "top-right");
+onSettings((name) => { if (name === "theme") map.setPaintProperty("ground", "background-color", ground()); });
 map.touchZoomRotate.disableRotation();
 map.keyboard.disableRotation();
 
@@ -78,6 +84,11 @@ export const isMoved = () => moved;
 export function fit([west, south, east, north]) {
   if (![west, south, east, north].every(Number.isFinite)) return;
   map.fitBounds([[west, south], [east, north]], { padding: 40, duration: 0, maxZoom: 19 });
+}
+
+export function inView([west, south, east, north]) {
+  const view = map.getBounds();
+  return view.contains([west, south]) && view.contains([east, north]);
 }
 
 export function boundsOf(points) {
