@@ -90,6 +90,7 @@ class CompletionDetector:
     _proofs: int = 0
     _proofs_needed: int = 1
     _new_total: int | None = None
+    _new_total_under_way: bool = False
     _learned: dict[int, int] = dataclasses.field(default_factory=dict)
     _learned_count: int = 0
 
@@ -323,11 +324,12 @@ class CompletionDetector:
         elif self.total is None:
             self.total = total
         elif total != self._new_total:  # a single one may be a late packet
-            self._new_total = total
+            self._new_total, self._new_total_under_way = total, self.phase is not Phase.IDLE
         else:
             self._commands = None
             self.total, self._new_total = total, None
-            self._restart(hot=bool(self.armed))
+            if self._new_total_under_way:  # else what has started meanwhile is the new mission
+                self._restart(hot=bool(self.armed))
 
     def _learn(self, message: Message) -> None:
         """Learn the commands from a download by any ground station, if they are unknown."""

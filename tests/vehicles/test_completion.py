@@ -309,6 +309,18 @@ def test_a_restarted_program_goes_on_where_it_stopped(cut, ending, autopilot):
     assert events.count(MissionEvent.COMPLETE) == (0 if ending == "abort" else 1)
 
 
+@pytest.mark.parametrize("lead", [0, 1, 2])
+def test_a_mission_of_another_station_that_starts_at_once_starts_once(lead):
+    """The number of items changes, and the mission is active, before a second message has confirmed the number."""
+    detector = CompletionDetector(autopilot=AP)
+    before = [heartbeat(False), current(0, NOT_STARTED, 12), current(0, NOT_STARTED, 12)]
+    started = [*[current(0, NOT_STARTED, 11)] * lead, heartbeat(True), *[current(1, ACTIVE, 11)] * 4]
+    assert run(detector, [*before, *started]) == [MissionEvent.STARTED]
+    assert detector.total == 11
+    other = [current(1, ACTIVE, 7)] * 4  # a mission that another station stores in flight is another one
+    assert run(detector, other) == [MissionEvent.STARTED] and detector.total == 7
+
+
 @pytest.mark.parametrize("log", ["copter_cam_rtl_1x", "swarm_v1", "swarm_v2", "swarm_v3"])
 def test_recorded_flights_complete_exactly_once(real_data, log):
     detector = CompletionDetector(autopilot=AP)
