@@ -1,7 +1,8 @@
 """Pairs photos with camera events, although their clocks differ and some of both are missing.
 
-By time: both are matched as sequences (`sequence_match`). Without times: by the numbers in file names and events, else
-by order alone. Missing first, dropped and extra pictures are found that way and reported.
+By time: both are matched as sequences (`sequence_match`). Where times decide nothing: by the numbers in file names and
+events, else by order alone, unless the times contradict that. Missing first, dropped and extra pictures are found that
+way and reported.
 """
 
 from collections.abc import Sequence
@@ -56,6 +57,7 @@ def pair(
     """
     if not len(photo_times) or not len(event_times):
         return Pairing()
+    by_times: Pairing | None = None
     timed = [i for i, t in enumerate(photo_times) if t is not None]
     dated = [j for j, t in enumerate(event_times) if t is not None]
     if len(timed) > 1 and len(dated) > 1:
@@ -64,16 +66,32 @@ def pair(
         if np.ptp(photos) > 0.0:
             if motion is not None:
                 motion = motion.subset(timed, dated)
-            found = by_time(photos, events, motion)
-            if len(found.pairs) >= 0.5 * min(len(photos), len(events)):
-                found.pairs = [(timed[i], dated[j]) for i, j in found.pairs]
-                found.doubtful = {timed[i]: [dated[j] for j in at] for i, at in found.doubtful.items()}
-                return found
-    numbered = _by_number(photo_numbers, event_numbers)
-    if numbered is not None:
-        return numbered
-    count = min(len(photo_times), len(event_times))
-    return Pairing(pairs=[(i, i) for i in range(count)], how="order", ambiguous=len(photo_times) != len(event_times))
+            by_times = by_time(photos, events, motion)
+            by_times.pairs = [(timed[i], dated[j]) for i, j in by_times.pairs]
+            by_times.doubtful = {timed[i]: [dated[j] for j in at] for i, at in by_times.doubtful.items()}
+            share = len(by_times.pairs) / min(len(photos), len(events))
+            if share >= 0.5 or (by_times.pairs and not by_times.ambiguous):
+                return by_times
+    other = _by_number(photo_numbers, event_numbers)
+    if other is None:
+        pairs = [(i, i) for i in range(min(len(photo_times), len(event_times)))]
+        other = Pairing(pairs=pairs, how="order", ambiguous=len(photo_times) != len(event_times))
+    if by_times is not None and _contradicted(other.pairs, photo_times, event_times):
+        return by_times
+    return other
+
+
+def _contradicted(
+    pairs: Sequence[tuple[int, int]], photo_times: Sequence[float | None], event_times: Sequence[float | None]
+) -> bool:
+    """Whether the two clocks would differ by another offset for most pairs; half of the usual interval is allowed."""
+    timed = [(p, e) for i, j in pairs if (p := photo_times[i]) is not None and (e := event_times[j]) is not None]
+    if len(timed) < 3:
+        return False
+    photo, event = np.array(timed).T
+    offset = photo - event
+    apart = np.abs(offset - np.median(offset))
+    return bool(np.mean(apart > 0.5 * np.median(np.diff(np.sort(event)))) > 0.5)
 
 
 def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -> Pairing:

@@ -93,6 +93,19 @@ def test_without_times_numbers_and_then_order_decide():
     assert pair([], [1.0]).pairs == []
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_numbers_do_not_overrule_the_times_of_photos_of_which_most_are_of_another_flight(whole):
+    events = uneven(100, 3)
+    other_flight = events[-1] + 4000.0 + np.cumsum(np.random.default_rng(4).uniform(1.8, 2.6, 60))
+    photos = np.concatenate([events[60:] + 3600.2, other_flight])
+    numbers = list(range(1, 101))
+    found = pair(list(np.floor(photos) if whole else photos), list(events), numbers, numbers)
+    wrong = [i for i, j in found.pairs if j != i + 60]
+    assert all(i in found.doubtful for i in wrong), "wrong and not marked"
+    if not whole:
+        assert found.pairs == [(i, i + 60) for i in range(40)]
+
+
 def photos_of(events, folder, *, offset_s, skip=()):
     """JPEGs without position, their camera clock off by some seconds."""
     folder.mkdir(parents=True, exist_ok=True)
