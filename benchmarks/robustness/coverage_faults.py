@@ -25,6 +25,7 @@ from orthoswarm.coverage.coverage_files import write_gaps
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, State
 from orthoswarm.coverage.gaps import PlannedFlight, find_gaps
 from orthoswarm.coverage.missing_pictures import Cause
+from orthoswarm.coverage.planning_lens import planning_fovs_deg
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import LocalGrid
@@ -106,7 +107,7 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     truth = _truly_seen(cells, shots)
     said = cover.states()
     wanted = cells.wanted
-    solved = footprint(height, math.radians(true_fov * 0.996))
+    solved = footprint(height, math.radians(min(planning_fovs_deg(cover.views).values())))
     missing = missing_by_events(cover.views, flown.events).pictures
     listed = {m.view.image for m in missing if m.cause is Cause.NOT_ARRIVED}
     after = _fly_gaps(plan, cover, truth, solved=solved, rng=rng, fov_deg=true_fov, planned=foot, events=flown.events)
@@ -186,7 +187,7 @@ def _fly(
                 sharp = not ("blur" in faults and rng.random() < 0.1)
                 view = View.of_camera(
                     placed, f"DJI_{number:05d}.JPG", vehicle.id, sigma, 10.0 * number, focal_sigma=0.001,
-                    flaws=NO_FLAW if sharp else Flaw.BLURRED,
+                    flaws=NO_FLAW if sharp else Flaw.BLURRED, recorded_height_m=plan.altitude_m,
                 )  # fmt: skip
                 at_m = np.array([*(at[:2] + rng.normal(0.0, 1.0, 2)), 0.0])
                 events.append(CameraEvent(vehicle.id, number, 10.0 * number + float(rng.normal(0.0, 0.5)), at_m))

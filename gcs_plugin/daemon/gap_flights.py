@@ -11,8 +11,6 @@ from gcs_plugin.fleet.flight_limits import RESERVE
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-_NARROWER: Final = 0.995
-"""The solved field of view is taken a little narrower."""
 _LONGEST_MIN: Final = 600.0
 _ON_ITS_WAY: Final = frozenset({"on mission", "paused", "holding", "flying"})
 _HOME_M_S: Final = 5.0
@@ -56,7 +54,7 @@ class GapFlights:
         return rows
 
     def plan(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Plan a flight over the gaps, with the solved lens.
+        """Plan a flight over the gaps, with what the vehicles' pictures saw from the heights that were recorded.
 
         Args:
             body: `vehicles` {id: minutes that it can fly, or null for what its battery says}; `altitude_m`, that of the
@@ -93,9 +91,9 @@ class GapFlights:
         altitude = body.get("altitude_m", over["nominal_m"])
         if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
             raise InputError("altitude_m is missing or no height; send metres above takeoff, for example 80")
-        solved = self._coverage.solved_fov_deg
+        solved = self._coverage.planning_fovs_deg(heights_over_level_ground=self._plans.dem is None)
         unknown = [vehicle for vehicle in vehicles if vehicle not in solved]
-        found = [_NARROWER * solved[vehicle] for vehicle in vehicles if vehicle in solved]
+        found = [solved[vehicle] for vehicle in vehicles if vehicle in solved]
         notes = []
         if unknown:
             if not figures:

@@ -60,6 +60,7 @@ class View:
         flaws: what is wrong with the whole picture.
         placed: True where the map or neighbours hold it, False for a recorded pose.
         ground: the terrain with which the camera was solved, in the datum of its position; None for that of the grid.
+        recorded_height_m: recorded height above the takeoff level, None if unknown.
     """
 
     image: str
@@ -73,6 +74,7 @@ class View:
     flaws: Flaw = NO_FLAW
     placed: bool = True
     ground: Terrain | None = None
+    recorded_height_m: float | None = None
 
     @classmethod
     def of_camera(
@@ -99,6 +101,7 @@ class View:
         return cls.of_camera(
             placed.camera, frame.image, frame.vehicle, placed.sigma_m, frame.time_s, flaws=flaws,
             focal_sigma=focal_sigma, placed=placed.stage != "realtime", ground=ground,
+            recorded_height_m=frame.fix.height_m,
         )  # fmt: skip
 
     @classmethod
@@ -122,6 +125,8 @@ class View:
                 width, height, focal_px(np.radians(row["fov_deg"]), width), k1=row.get("k1", 0.0), k2=row.get("k2", 0.0)
             )
             sigma = float("nan") if row["sigma_m"] is None else float(row["sigma_m"])
+            recorded = row.get("recorded_height_m")
+            recorded_m = None if recorded is None else float(recorded)
             to_camera = _to_camera(homography, position, lens, ground_z_m)
         except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
             raise InputError(
@@ -139,6 +144,7 @@ class View:
             lens=lens,
             sigma_m=sigma,
             placed=row["stage"] != "realtime",
+            recorded_height_m=recorded_m,
         )
 
     def moved_to(self, position: Array, image: str, time_s: float | None = None) -> "View":

@@ -32,7 +32,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
 
     `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
     `ground_z_m`; `camera` has the camera's position, attitude (yaw from true north) and lens (focal
-    length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for other programs.
+    length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for other programs;
+    `recorded_height_m` is the height above takeoff that was recorded with the picture, absent if none was.
     """
     frame, camera = placed.frame, placed.camera
     lens = camera.lens
@@ -54,6 +55,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
         row |= {"cx": lens.cx, "cy": lens.cy, "k3": lens.k3}
     row["fov_deg"] = math.degrees(lens.fov_rad)
     row["sigma_m"] = placed.sigma_m
+    if frame.fix.height_m is not None:
+        row["recorded_height_m"] = frame.fix.height_m
     if placed.weak:
         row["weak"] = True
     if frame.damaged:

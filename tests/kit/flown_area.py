@@ -32,6 +32,8 @@ class FlownArea:
     skip_numbers: bool = True
     """Missing pictures leave a hole in the numbers of the files."""
     sigma_m: float = 0.2
+    recorded_share: float = 1.0
+    """Recorded height, as a share of the true one."""
 
     @property
     def grid(self) -> LocalGrid:
@@ -67,7 +69,7 @@ class FlownArea:
         rotation = rotation_from_angles(0.0, -np.pi / 2, 0.0)
         name = f"{vehicle}/DJI_{number:04d}.JPG"
         lat, lon = self.grid.to_geographic(at)
-        fix = Fix(float(lat), float(lon), HEIGHT_M)
+        fix = Fix(float(lat), float(lon), self.recorded_share * HEIGHT_M)
         frame = Frame(image=name, path=Path(name), vehicle=vehicle, time_s=time_s, fix=fix, width=1600, height=1200)
         return PlacedFrame(frame, Camera(np.array([*at, HEIGHT_M]), rotation, lens), "fine", self.sigma_m)
 

@@ -51,7 +51,7 @@ def test_gaps_of_a_coverage_are_covered_with_the_solved_lens(
         tmp_path, capsys, "--gaps", tmp_path / "c" / "gaps.geojson", "--map", made, "--vehicles", 2, "--fly-not-arrived"
     )
     assert out["method"] == "gaps" and out["covered_share"] > 0.999
-    assert out["footprint_m"][0] == pytest.approx(2 * 80 * np.tan(np.radians(54.9 / 2)), rel=1e-3)
+    assert out["footprint_m"][0] == pytest.approx(2 * 80 * np.tan(np.radians(55.0 / 2)), rel=1e-3)
     features = json.loads((tmp_path / "c" / "gaps.geojson").read_text())["features"]
     seen = shapely.union_all([shapely.LineString(leg).buffer(0.5 * out["footprint_m"][0]) for leg in _legs(tmp_path)])
     for feature in features:
@@ -60,6 +60,16 @@ def test_gaps_of_a_coverage_are_covered_with_the_solved_lens(
         assert gap.difference(seen).area < 0.01 * gap.area
     length = sum(float(np.hypot(*(leg[-1] - leg[0]))) for leg in _legs(tmp_path))
     assert missed["missed_share"] > 0.1 and length < 0.4 * 6 * 300.0
+
+
+@pytest.mark.parametrize("recorded_share", [1.25, 0.8])
+def test_the_map_gives_what_its_pictures_saw_from_the_heights_that_were_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recorded_share: float
+) -> None:
+    made = FlownArea(fov_deg=60.0, recorded_share=recorded_share).write(tmp_path / "map")
+    gaps = _gaps(tmp_path / "g.geojson", ((0, 0, 100, 200), "not flown"))
+    out = _plan(tmp_path, capsys, "--gaps", gaps, "--map", made, "--vehicles", 1)
+    assert out["footprint_m"][0] == pytest.approx(2 * 80 / recorded_share * np.tan(np.radians(30.0)), rel=1e-3)
 
 
 def test_neighbouring_gaps_become_one_leg(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

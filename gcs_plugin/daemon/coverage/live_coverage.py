@@ -30,6 +30,7 @@ from orthoswarm.coverage.coverage_files import gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares
 from orthoswarm.coverage.gaps import below_legs, find_gaps
 from orthoswarm.coverage.missing_pictures import MissingPicture
+from orthoswarm.coverage.planning_lens import planning_fovs_deg
 from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -71,12 +72,12 @@ class _Followed:
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """The latest result: the API's document, gaps as GeoJSON, and the picture of the cells."""
+    """The latest result: the API's document, gaps as GeoJSON, the picture of the cells, and the placed pictures."""
 
     document: dict[str, Any]
     gaps: dict[str, Any]
     png: bytes
-    solved: dict[str, float]
+    placed: list[View]
 
 
 _NOTHING: Final = _Result(
@@ -84,7 +85,7 @@ _NOTHING: Final = _Result(
         "state": "no area", "version": 0, "plan": None, "seen_share": None, "poor_share": None, "missed_share": None,
         "planned_share": None, "gaps": [], "missing_pictures": [], "offers": [], "warnings": [],
     },
-    {"type": "FeatureCollection", "features": []}, b"", {},
+    {"type": "FeatureCollection", "features": []}, b"", [],
 )  # fmt: skip
 
 
@@ -171,10 +172,9 @@ class LiveCoverage:
             return None
         return zone_features(here.covered.area)
 
-    @property
-    def solved_fov_deg(self) -> dict[str, float]:
-        """Vehicle -> smallest horizontal field of view of its placed pictures, degrees."""
-        return self._result.solved
+    def planning_fovs_deg(self, heights_over_level_ground: bool) -> dict[str, float]:
+        """Vehicle with placed pictures -> field of view to plan with, as `planning_fov_rad` has it, degrees."""
+        return planning_fovs_deg(self._result.placed, heights_over_level_ground=heights_over_level_ground)
 
     # -- the thread -----------------------------------------------------------------------------------------------
 
@@ -331,11 +331,7 @@ class LiveCoverage:
             "small_gaps": {"count": gaps.small, "area_m2": round(gaps.small_m2, 1)},
             "missing_pictures": _missing_rows(missing), "warnings": [*_warnings(cover), *doubts],
         }  # fmt: skip
-        solved: dict[str, float] = {}
-        for view in placed:
-            fov = float(np.degrees(view.fov_rad))
-            solved[view.vehicle] = min(fov, solved.get(view.vehicle, fov))
-        return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), solved)
+        return _Result(document, {"type": "FeatureCollection", "features": features}, cells_png(states), placed)
 
     def _missing(self, here: _Followed) -> tuple[list[MissingPicture], list[str]]:
         """Missing pictures, and doubts about the camera events."""

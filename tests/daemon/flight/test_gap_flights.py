@@ -104,13 +104,16 @@ class _Coverage:
 
     def __init__(self, plan: str | None, no_fly: dict[str, Any] | None = None) -> None:
         self.document = {"plan": plan}
-        self.solved_fov_deg = {"v1": 50.0, "v2": 48.0}
         self.battery = BatteryUse()
         self.no_fly = no_fly
         self.gaps = {
             "type": "FeatureCollection",
             "features": [self.square(0.0, 0.0, "not flown"), self.square(300.0, 200.0, "seen poorly")],
         }
+
+    @staticmethod
+    def planning_fovs_deg(heights_over_level_ground: bool) -> dict[str, float]:
+        return {"v1": 50.0, "v2": 48.0} if heights_over_level_ground else {"v1": 40.0, "v2": 38.0}
 
     @staticmethod
     def square(east: float, north: float, cause: str, side: float = 120.0) -> dict[str, Any]:
@@ -136,7 +139,7 @@ def _flights(tmp_path: Path, rows: list[dict[str, Any]], **coverage: Any) -> Gap
 def test_the_plan_over_gaps_takes_the_solved_lens_and_each_vehicles_own_time(tmp_path: Path) -> None:
     flights = _flights(tmp_path, [_landed("v1"), _landed("v2")])
     made = flights.plan({"vehicles": {"v1": 4.0, "v2": 9.0}, "altitude_m": 60.0})
-    assert made["footprint_m"][0] == pytest.approx(2 * 60 * np.tan(np.radians(0.995 * 48.0 / 2)), rel=1e-3)
+    assert made["footprint_m"][0] == pytest.approx(2 * 60 * np.tan(np.radians(48.0 / 2)), rel=1e-3)
     assert made["covered_share"] > 0.999 and made["method"] == "gaps"
     assert set(made["names"].values()) <= {"v1", "v2"} and made["names"]["v1"] == "v2"  # who can fly longest is first
     for part in made["vehicles"]:

@@ -24,7 +24,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("area", type=Path, nargs="?", metavar="AREA", help="polygon to cover, or line to follow")
     add("--gaps", type=Path, metavar="GAPS", help="instead of AREA: gaps.geojson of `orthoswarm coverage`, flown again")
-    add("--map", type=Path, metavar="OUT", help="take the field of view from this map, as solved, two sigma narrower")
+    add(
+        "--map",
+        type=Path,
+        metavar="OUT",
+        help="take the field of view from this map's pictures, two sigma narrower",
+    )
     add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
     add(
@@ -127,7 +132,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         terrain_items=args.terrain_items,
         vehicles=args.vehicles,
         altitude_m=args.altitude,
-        fov_min_deg=args.fov_min if args.map is None else _solved_fov(args.map),
+        fov_min_deg=args.fov_min if args.map is None else _fov_of_map(args.map, args.dem is None),
         no_fly=args.no_fly,
         method=args.method,
         autopilot=args.autopilot,
@@ -151,16 +156,16 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
     )
 
 
-def _solved_fov(folder: Path) -> float:
-    """The smallest field of view of a map's vehicles minus two sigma, degrees."""
-    try:
-        rows = json.loads((folder / "report.json").read_text(encoding="utf-8"))["vehicles"]
-        fov = [float(r["fov_deg"]) - 2.0 * float(r["fov_sigma_deg"] or 0.0) for r in rows if r["frames"]]
-        return min(fov)
-    except OSError as error:
-        raise InputError(f"{folder} has no report.json ({error.strerror}); give a map's folder with --map") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{folder / 'report.json'} has no field of view; give it with --fov-min") from None
+def _fov_of_map(folder: Path, heights_over_level_ground: bool) -> float:
+    """The smallest field of view to plan with of a map's vehicles, degrees; see `planning_fov_rad`."""
+    from orthoswarm.coverage.map_folder import read_map
+    from orthoswarm.coverage.planning_lens import planning_fovs_deg
+
+    flown = read_map(folder)
+    fovs = planning_fovs_deg(
+        flown.views, ground_z_m=flown.ground_z_m, heights_over_level_ground=heights_over_level_ground
+    )
+    return min(fovs.values())
 
 
 def _aspect(text: str) -> float:
