@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens
-from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
+from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
 

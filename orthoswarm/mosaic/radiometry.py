@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
-from orthoswarm.mosaic.lens_arrays import F, U, V
+from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
+from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
-from orthoswarm.mosaic.render_arrays import Shots
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]

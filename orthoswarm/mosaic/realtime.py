@@ -18,10 +18,10 @@ from orthoswarm.canvas.tile_store import Key
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Terrain
-from orthoswarm.mosaic.downsampling import pack, reduction
 from orthoswarm.mosaic.footprint import least_descent, reach, rejection
-from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
-from orthoswarm.mosaic.realtime_kernel import RUN, aim, fuse, touches
+from orthoswarm.mosaic.kernels.downsampling import pack, reduction
+from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
+from orthoswarm.mosaic.kernels.realtime_kernel import RUN, aim, fuse, touches
 from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Progress, RenderStats, Run, render, serial
 from orthoswarm.mosaic.seams.previews import PreviewFile

@@ -16,9 +16,9 @@ from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.downsampling import reduced
-from orthoswarm.mosaic.pixel_sampling import WEIGHTS, sample
-from orthoswarm.mosaic.render_arrays import Shots, heights
+from orthoswarm.mosaic.kernels.downsampling import reduced
+from orthoswarm.mosaic.kernels.pixel_sampling import WEIGHTS, sample
+from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
 from orthoswarm.mosaic.seams.previews import write_preview

@@ -25,10 +25,10 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
-from orthoswarm.mosaic.downsampling import reduction
 from orthoswarm.mosaic.footprint import rejections
+from orthoswarm.mosaic.kernels.downsampling import reduction
+from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
 from orthoswarm.mosaic.radiometry import Field, uniform
-from orthoswarm.mosaic.render_arrays import Shots, crop
 from orthoswarm.mosaic.render_passes import (
     FeatherTask,
     LabelTask,

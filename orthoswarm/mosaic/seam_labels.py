@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.mosaic.footprint import tan_limit
-from orthoswarm.mosaic.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.render_arrays import STEP, Shots, height_at, project
+from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
+from orthoswarm.mosaic.kernels.render_arrays import STEP, Shots, height_at, project
 
 Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]

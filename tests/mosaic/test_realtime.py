@@ -9,9 +9,9 @@ from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.mosaic.footprint import default_gsd, footprint, footprint_boxes, least_descent, rejection, rejections
-from orthoswarm.mosaic.lens_arrays import INNER, OUTER, lens_row
+from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
+from orthoswarm.mosaic.kernels.realtime_kernel import aim, row_span
 from orthoswarm.mosaic.realtime import RealtimeMosaic, ground_to_camera, mosaic
-from orthoswarm.mosaic.realtime_kernel import aim, row_span
 from tests.kit import mosaic_scene as scene
 
 

@@ -11,9 +11,9 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.pixel_sampling import UNIT, cubic_weights
+from orthoswarm.mosaic.kernels.pixel_sampling import UNIT, cubic_weights
+from orthoswarm.mosaic.kernels.render_arrays import crop, heights
 from orthoswarm.mosaic.radiometry import uniform
-from orthoswarm.mosaic.render_arrays import crop, heights
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.mosaic.visible_ground import coverage
 from orthoswarm.raster.picture_file import PictureError

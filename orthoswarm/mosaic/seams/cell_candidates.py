@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.mosaic.footprint import tan_limit
-from orthoswarm.mosaic.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.render_arrays import Shots, height_at, project
+from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
+from orthoswarm.mosaic.kernels.render_arrays import Shots, height_at, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 
 Array = NDArray[np.float64]

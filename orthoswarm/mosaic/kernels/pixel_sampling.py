@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.mosaic.lens_arrays import K1, K2, K3, F, U, V
-from orthoswarm.mosaic.render_arrays import height_at
+from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
+from orthoswarm.mosaic.kernels.render_arrays import height_at
 
 UNIT = 128
 """Sum of the weights, and number of steps of a fraction of a pixel."""

@@ -14,7 +14,7 @@ from orthoswarm.compute.jit import kernel
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.lens_arrays import K1, K2, K3, F, U, V, lens_row
+from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
 Array = NDArray[np.float64]
 STEP = 8
