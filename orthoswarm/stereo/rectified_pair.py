@@ -35,7 +35,7 @@ class View:
     factor: int = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Rectified:
     """The common frame of a pair.
 
