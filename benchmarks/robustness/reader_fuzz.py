@@ -70,10 +70,13 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     def bus(path: Path) -> None:
         test_can_logs.write(path, test_can_logs.bus_messages(1)[:80])
 
-    def video(path: Path) -> None:
+    def video(path: Path, codec: str = "libx264") -> None:
         with tempfile.TemporaryDirectory() as folder:
-            plain = test_video.make_video(Path(folder) / path.name, count=8)
+            plain = test_video.make_video(Path(folder) / path.name, codec, count=8)
             add_sei(plain, path, test_video.pose)
+
+    def hevc(path: Path) -> None:
+        video(path, "libx265")
 
     def decode(path: Path) -> None:
         found = scan(path)
@@ -112,9 +115,16 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
         },
         **{
             suffix[1:].upper(): ([made(video, f"a{suffix}")], file(scan, f"a{suffix}"))
-            for suffix in (".mp4", ".mov", ".ts")
+            for suffix in (".mp4", ".mov", ".ts", ".mkv", ".flv", ".h264")
         },
+        "H265": ([made(hevc, "a.h265")], file(scan, "a.h265")),
         "MP4 pictures": ([made(video, "a.mp4"), made(video, "b.mov")], file(decode, "a.mp4")),
+        "MKV pictures": ([made(video, "a.mkv")], file(decode, "a.mkv")),
+        "FLV pictures": ([made(video, "a.flv")], file(decode, "a.flv")),
+        "H264 pictures": ([made(video, "a.h264")], file(decode, "a.h264")),
+        "HEVC pictures": (
+            [made(hevc, "a.mp4"), made(hevc, "b.mkv"), made(hevc, "c.ts"), made(hevc, "d.h265")], file(decode, "a.mp4")
+        ),
         "TS pictures": ([made(video, "a.ts")], file(decode, "a.ts")),
     }  # fmt: skip
 

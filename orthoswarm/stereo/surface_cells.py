@@ -1,7 +1,7 @@
 """The heights of many pairs on the cells of a grid, and the surface that they agree on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,8 @@ class SurfaceCells:
             z, s, n = merge_heights(self._height[:, part], self._sigma[:, part], self._count[part])
             for target, values in ((height, z), (sigma, s), (pairs, n)):
                 target[rows] = values.reshape(-1, grid.width)
-        return SurfaceModel(grid, height, np.hypot(sigma, active().stereo.edge_share * _range_around(height)), pairs)
+        sigma = np.hypot(sigma, active().stereo.edge_share * _range_around(height))
+        return _known_part(SurfaceModel(grid, height, sigma, pairs))
 
 
 def merge_heights(
@@ -144,3 +145,18 @@ def _range_around(height_m: Float32) -> Float32:
     high = maximum_filter(np.where(known, height_m, -np.inf), 3)
     low = minimum_filter(np.where(known, height_m, np.inf), 3)
     return np.where(high >= low, high - low, 0.0).astype(np.float32)
+
+
+def _known_part(surface: SurfaceModel) -> SurfaceModel:
+    """The smallest window that holds all known cells."""
+    known = np.isfinite(surface.height_m)
+    rows, columns = np.flatnonzero(known.any(1)), np.flatnonzero(known.any(0))
+    if not len(rows):
+        return surface
+    window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    grid = replace(
+        surface.grid, west=surface.grid.west + int(columns[0]) * surface.grid.gsd_m,
+        north=surface.grid.north - int(rows[0]) * surface.grid.gsd_m,
+        width=int(columns[-1] - columns[0]) + 1, height=int(rows[-1] - rows[0]) + 1,
+    )  # fmt: skip
+    return SurfaceModel(grid, surface.height_m[window], surface.sigma_m[window], surface.pairs[window])

@@ -93,9 +93,11 @@ def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
     """The frames of a log; damaged places are skipped."""
     import can
 
+    from telemetry.formats.log.blf_reader import BlfReader
+
     log = None
     try:
-        log = can.LogReader(str(path))
+        log = BlfReader(str(path)) if path.suffix.lower() == ".blf" else can.LogReader(str(path))
         while reading.damaged < _MOST_DAMAGE:
             try:
                 yield from log

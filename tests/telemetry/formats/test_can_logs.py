@@ -1,6 +1,8 @@
 """Logs of CAN buses: candump, Vector, PEAK; alone, and beside the autopilot's log and photos."""
 
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -74,6 +76,19 @@ def test_a_damaged_log_gives_what_is_whole(tmp_path, suffix):
     assert len([s for s in log.samples if s.has_position]) > (100 if suffix == ".blf" else 200)
     errors = [abs(s.lat_deg - position(s.time_s - T0)[0]) for s in log.samples if s.has_position]
     assert np.median(errors) < 1e-8
+
+
+@pytest.mark.parametrize("version", [1, 2, 9])
+def test_an_object_that_states_no_size_does_not_hold_the_reader_for_ever(tmp_path, version):
+    path = tmp_path / "bus.blf"
+    write(path, bus_messages(2))
+    header = path.read_bytes()[: struct.unpack_from("<L", path.read_bytes(), 4)[0]]
+    endless = struct.pack("<4sHHLL", b"LOBJ", 32, version, 0, 1) + bytes(64)
+    container = struct.pack("<H6xL4x", 0, len(endless)) + endless
+    path.write_bytes(header + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container)
+    code = "import sys, pathlib, telemetry.formats.log.flight_logs as f; f.read_log(pathlib.Path(sys.argv[1]))"
+    read = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60)
+    assert "NotALog" in read.stderr and read.stderr.count("object header") == 0
 
 
 @pytest.mark.parametrize(("name", "text"), [("server.log", "12:00 started\n"), ("dem.asc", "ncols 4\nnrows 4\n")])
