@@ -6,7 +6,6 @@ The pyramid is KML's "super-overlay": each node is shown while it is small on th
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.mbtiles import encode_tile
+from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.model.errors import InputError
 
 Bytes = NDArray[np.uint8]
@@ -36,12 +36,12 @@ def write_kmz(
         InputError: if the raster cannot be read.
         OrthoSwarmError: if the disk is full.
     """
-    import rasterio
     from rasterio.errors import RasterioError
     from rasterio.warp import calculate_default_transform
 
     try:
-        with rasterio.open(source) as raster, written_whole(path) as part:
+        with ReducedRaster(source) as reduced, written_whole(path) as part:
+            raster = reduced.full
             # Latitude and longitude with pixels that are square on the ground keep the overlay's proportions.
             transform, width, height = calculate_default_transform(
                 raster.crs, "EPSG:4326", raster.width, raster.height, *raster.bounds
@@ -50,7 +50,7 @@ def write_kmz(
             box = (west, north + transform.e * height, west + transform.a * width, north)
             with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
                 _Pyramid(
-                    raster=raster, archive=archive, box=box, width=width, height=height, name=name, progress=progress
+                    raster=reduced, archive=archive, box=box, width=width, height=height, name=name, progress=progress
                 ).write()
     except RasterioError as error:
         raise InputError(f"{source} cannot be read ({error}); make the map again") from None
@@ -61,7 +61,7 @@ class _Pyramid:
 
     def __init__(
         self,
-        raster: Any,
+        raster: ReducedRaster,
         archive: zipfile.ZipFile,
         *,
         box: tuple[float, float, float, float],
@@ -135,13 +135,14 @@ class _Pyramid:
         span = side * factor
         width = max(1, (min((col + 1) * span, self.width) - col * span) // factor)
         height = max(1, (min((row + 1) * span, self.height) - row * span) // factor)
+        source, left = self.raster.at(factor)
         with WarpedVRT(
-            self.raster,
+            source,
             crs="EPSG:4326",
             transform=from_bounds(*box, width, height),
             width=width,
             height=height,
-            resampling=Resampling.average if factor > 1 else Resampling.bilinear,
+            resampling=Resampling.average if left > 1 else Resampling.bilinear,
             warp_mem_limit=64,
         ) as vrt:
             rgba = np.ascontiguousarray(vrt.read().transpose(1, 2, 0))

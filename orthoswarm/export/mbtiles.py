@@ -6,7 +6,8 @@ The finest zoom is warped tile by tile from the COG; each coarser tile is made o
 import errno
 import math
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ Format = Literal["png", "webp", "jpg"]
 _SIZE = 256
 _BATCH = 8
 _MAX_ZOOM = 23
+_ENCODERS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +144,7 @@ class _Writer:
         self.database, self.format, self.quality, self.levels = database, tile_format, quality, levels
         self.progress = progress
         self.done, self.total = 0, sum(level.count for level in levels)
+        self._encoders = ThreadPoolExecutor(_ENCODERS)
 
     def write(self, raster: Any, name: str, bounds: tuple[float, float, float, float]) -> None:
         self.database.executescript(
@@ -163,9 +166,10 @@ class _Writer:
             "maxzoom": str(self.levels[0].zoom),
         }
         self.database.executemany("INSERT INTO metadata VALUES (?, ?)", rows.items())
-        self._finest(raster)
-        for level in self.levels[1:]:
-            self._coarser(level)
+        with self._encoders:
+            self._finest(raster)
+            for level in self.levels[1:]:
+                self._coarser(level)
         self.database.commit()
 
     def _finest(self, raster: Any) -> None:
@@ -192,31 +196,36 @@ class _Writer:
                     warp_mem_limit=64,
                 ) as vrt:
                     block = vrt.read().transpose(1, 2, 0)
-                for r in range(rows):
-                    for c in range(cols):
-                        tile = block[r * _SIZE : (r + 1) * _SIZE, c * _SIZE : (c + 1) * _SIZE]
-                        self._put(level.zoom, left + c, top + r, np.ascontiguousarray(tile))
+                cut = block.reshape(rows, _SIZE, cols, _SIZE, 4).swapaxes(1, 2)
+                at = [(r, c) for r in range(rows) for c in range(cols)]
+                self._put(level.zoom, [(left + c, top + r) for r, c in at], [np.ascontiguousarray(cut[k]) for k in at])
 
     def _coarser(self, level: Range) -> None:
         from orthoswarm.canvas.overviews import reduce_rgba
 
         for y in range(level.top, level.bottom + 1):
-            for x in range(level.left, level.right + 1):
+            columns = range(level.left, level.right + 1)
+            halves = []
+            for x in columns:
                 four = np.zeros((2 * _SIZE, 2 * _SIZE, 4), np.uint8)
                 for i in (0, 1):
                     for j in (0, 1):
                         tile = self._get(level.zoom + 1, 2 * x + j, 2 * y + i)
                         if tile is not None:
                             four[i * _SIZE : (i + 1) * _SIZE, j * _SIZE : (j + 1) * _SIZE] = tile
-                self._put(level.zoom, x, y, reduce_rgba(four, 2))
+                halves.append(reduce_rgba(four, 2))
+            self._put(level.zoom, [(x, y) for x in columns], halves)
 
-    def _put(self, zoom: int, x: int, y: int, rgba: Bytes) -> None:
-        self.done += 1
-        if rgba[..., 3].any():
-            row = 2**zoom - 1 - y  # MBTiles counts rows from the south
-            self.database.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (zoom, x, row, self._encode(rgba)))
-        if self.progress is not None:
-            self.progress(self.done, self.total)
+    def _put(self, zoom: int, at: Sequence[tuple[int, int]], tiles: Sequence[Bytes]) -> None:
+        """Insert the tiles that are not empty; `at` gives their columns and rows from the north."""
+        encoded = self._encoders.map(lambda rgba: self._encode(rgba) if rgba[..., 3].any() else None, tiles)
+        for (x, y), data in zip(at, encoded, strict=True):
+            self.done += 1
+            if data is not None:
+                row = 2**zoom - 1 - y  # MBTiles counts rows from the south
+                self.database.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (zoom, x, row, data))
+            if self.progress is not None:
+                self.progress(self.done, self.total)
 
     def _get(self, zoom: int, x: int, y: int) -> Bytes | None:
         import cv2

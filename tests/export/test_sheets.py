@@ -13,6 +13,7 @@ import rasterio
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export.mbtiles import write_mbtiles
+from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
 from orthoswarm.export.sheets.pmtiles import tile_number, write_pmtiles
@@ -125,3 +126,13 @@ def test_every_form_is_written_by_the_command_line(folder, capsys):
 def test_without_places_the_command_line_says_where_they_come_from(folder, capsys):
     assert main(["export", str(folder), "--to", "tak"]) == 0
     assert "orthoswarm serve" in capsys.readouterr().out
+
+
+def test_a_reduced_raster_reads_the_overview_that_is_fine_enough(folder):
+    with rasterio.open(folder / "orthoimage.tif", "r+") as raster:
+        raster.build_overviews([2, 4], rasterio.enums.Resampling.average)
+    with ReducedRaster(folder / "orthoimage.tif") as reduced:
+        assert reduced.at(1.0) == (reduced.full, 1.0)
+        for asked, expected in ((2.0, 2), (3.0, 2), (4.0, 4), (7.9, 4)):
+            dataset, left = reduced.at(asked)
+            assert dataset.width == -(-reduced.full.width // expected) and left == asked / expected

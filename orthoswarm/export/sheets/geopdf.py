@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.mgrs import grid_zone, square, utm_zone
 from orthoswarm.export.sheets.stac_item import picture_times
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
@@ -63,18 +64,23 @@ def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str
         InputError: the COG cannot be read.
         OrthoSwarmError: the disk is full, or the PDF cannot be written.
     """
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.errors import RasterioError
+    from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
 
     try:
-        with rasterio.open(cog) as raster:
+        with ReducedRaster(cog) as reduced:
+            raster = reduced.full
             frame, epsg = _frame(_drawn(raster)), int(raster.crs.to_epsg())
             left, top, right, bottom = frame.box
-            transform = rasterio.transform.from_origin(frame.west, frame.north, frame.metres, frame.metres)
+            transform = from_origin(frame.west, frame.north, frame.metres, frame.metres)
             with WarpedVRT(
-                raster, transform=transform, width=right - left, height=bottom - top, resampling=Resampling.average
+                reduced.at(0.5 * frame.metres / raster.res[0])[0],
+                transform=transform,
+                width=right - left,
+                height=bottom - top,
+                resampling=Resampling.average,
             ) as vrt:
                 rgba = vrt.read().transpose(1, 2, 0)
     except RasterioError as error:

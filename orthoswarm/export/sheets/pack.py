@@ -1,11 +1,13 @@
 """The offline pack: one ZIP with the map in every form, and a page that shows it without a server and internet."""
 
+import itertools
 import json
 import shutil
 import sqlite3
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -59,9 +61,11 @@ def write_pack(
         folder = Path(name)
         tiles = folder / "orthoimage.mbtiles"
         title = cog.resolve().parent.name or "map"
-        steps: list[Callable[[], None]] = [
+        web: list[Callable[[], None]] = [
             lambda: write_mbtiles(cog, tiles, tile_format="webp"),
             lambda: write_pmtiles(tiles, folder / "orthoimage.pmtiles"),
+        ]
+        others: list[Callable[[], None]] = [
             lambda: write_kmz(cog, folder / "orthoimage.kmz"),
             lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
             lambda: write_data_package(places, folder / "places-tak.zip", title),
@@ -72,12 +76,20 @@ def write_pack(
             lambda: _copy(cog, folder),
             lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json"),
         ]
-        for number, step in enumerate(steps):
-            tell(number, len(steps) + 1)
-            step()
+        done = itertools.count(1)
+        count = len(web) + len(others) + 1
+
+        def run(steps: Sequence[Callable[[], None]]) -> None:
+            for step in steps:
+                step()
+                tell(next(done), count)
+
+        with ThreadPoolExecutor(2) as pool:  # the two that take longest beside each other
+            for running in [pool.submit(run, web), pool.submit(run, others)]:
+                running.result()
         with closing(sqlite3.connect(tiles)) as database, written_whole(path) as part:
             _zip(database, folder, part, places, title)
-        tell(len(steps) + 1, len(steps) + 1)
+        tell(count, count)
 
 
 def _copy(cog: Path, folder: Path) -> None:

@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from tests.kit.daemon_kit import GRID, form, line, serving
+from tests.kit.daemon_kit import GRID, Shot, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.sim_cameras import square
 
@@ -37,7 +37,8 @@ KEYS = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min",
     "side_overlap", "forward_overlap", "separation_m", "clearance_m",
     "method", "autopilot", "end", "starts", "settings", "version",
-    "lat_deg", "lon_deg", "sigma_m", "note", "image", "time",
+    "wait_min", "wind_m_s", "wind_from_deg", "relief", "height_tolerance_m", "terrain_items", "in_air",
+    "fly_not_arrived", "lat_deg", "lon_deg", "sigma_m", "note", "image", "time",
     "height_m", "yaw_deg", "pitch_deg", "roll_deg", "gps_fix", "type", "coordinates", "geometry", "features",
 )  # fmt: skip
 HEADERS = (
@@ -112,17 +113,23 @@ def test_no_request_ends_in_500_and_memory_stays_flat(tmp_path):
                 for method in methods
             ]
             assert len(routes) > 20
+            drawn = line(2)
             asked, sizes, began = dict.fromkeys(routes, 0), [], time.monotonic()
             for number in range(COUNT):
                 if number % STEP == STEP // 2:
                     sizes.append(resident_mb(client))
+                    print(number, sizes[-1], flush=True)
                 if time.monotonic() - began > LIMIT_S:
                     break
                 method, template = route = chance.choice(routes)
                 headers = dict(served.auth if chance.random() < 0.8 else {})
                 if chance.random() < 0.15:
                     headers.update([chance.choice(HEADERS)])
-                body = {} if method in ("GET", "HEAD") else content_of(chance, line(2))
+                body = (
+                    {}
+                    if method in ("GET", "HEAD")
+                    else content_of(chance, [Shot(dict(shot.pose), shot.data) for shot in drawn])
+                )
                 path = path_of(chance, template)
                 try:
                     encoded = {k.encode(): v.encode("latin-1") for k, v in headers.items()}
