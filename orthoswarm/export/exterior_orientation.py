@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.odm_folder import link_file, unique_names
+from orthoswarm.export.linked_pictures import link_file, unique_names
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid

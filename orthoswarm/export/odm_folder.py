@@ -1,13 +1,14 @@
-"""A folder for OpenDroneMap: the pictures, and a geo.txt with the refined positions and angles."""
+"""A folder for OpenDroneMap: the pictures, a geo.txt with the refined positions and angles, and the solved lens."""
 
-import os
-import re
-import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.export.atomic_file import disk_error, written_whole
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.exterior_orientation import camera_of
+from orthoswarm.export.linked_pictures import link_file, unique_names
+from orthoswarm.export.opensfm_folder import brown_camera
 from orthoswarm.model.errors import InputError
 
 
@@ -18,10 +19,12 @@ def write_odm(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Write `images/` and `geo.txt`.
+    """Write `images/`, `geo.txt` and `cameras.json`.
 
     geo.txt has longitude, latitude, altitude, yaw from true north, pitch (0 looks straight down, as ODM counts),
     roll, and one sigma of the position. If the photos have no altitude, the height above the takeoff level is used.
+    cameras.json, for ODM's `--cameras`, holds the solved lens. It is written where all photos share one: ODM tells
+    lenses apart by the photos' tags, which are the same for two drones of a kind.
 
     Args:
         rows: lines of frames.jsonl.
@@ -57,6 +60,10 @@ def write_odm(
         if len(lines) == 1:
             raise InputError("none of the pictures is where it was when the map was made; give --images FOLDER")
         (part / "geo.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        lenses = {camera_of(row).lens for row in placed if "focal_px" in row["camera"]}
+        if len(lenses) == 1:
+            cameras = {"all": brown_camera(lenses.pop())}
+            (part / "cameras.json").write_text(json.dumps(cameras, indent=1), encoding="utf-8")
     return gone
 
 
@@ -68,35 +75,3 @@ def _line(name: str, row: Mapping[str, Any]) -> str:
         f"{name} {camera['lon_deg']:.9f} {camera['lat_deg']:.9f} {altitude:.3f} "
         f"{camera['yaw_deg']:.4f} {camera['pitch_deg'] + 90.0:.4f} {camera['roll_deg']:.4f} {sigma:.3f} {2 * sigma:.3f}"
     )
-
-
-def unique_names(images: Iterable[str]) -> dict[str, str]:
-    """Plain file names without blanks for images of several folders (`v1/a b.jpg` -> `v1_a_b.jpg`), all different."""
-    images = list(images)
-    heads = [image.split("/")[-1] for image in images]
-    repeated = len(set(heads)) < len(heads)
-    out: dict[str, str] = {}
-    taken: set[str] = set()
-    for image, head in zip(images, heads, strict=True):
-        plain = re.sub(r"[^A-Za-z0-9._-]", "_", image if repeated else head)
-        stem, suffix = os.path.splitext(plain)
-        if not suffix or not re.fullmatch(r"\.(jpe?g|png|tiff?)", suffix.lower()):
-            stem, suffix = plain, ".jpg"
-        name, number = stem + suffix, 1
-        while name.lower() in taken:
-            number += 1
-            name = f"{stem}_{number}{suffix}"
-        taken.add(name.lower())
-        out[image] = name
-    return out
-
-
-def link_file(file: Path, target: Path) -> None:
-    """Link a file under another name, or copy it if the file system has no links."""
-    try:
-        os.link(file, target)
-    except OSError:
-        try:
-            shutil.copyfile(file, target)
-        except OSError as error:
-            raise disk_error(error, target) from None

@@ -46,7 +46,7 @@ def write_opensfm(
     lat, lon = (float(np.mean([getattr(p, name) for p in pictures])) for name in ("lat_deg", "lon_deg"))
     reference = {"latitude": lat, "longitude": lon, "altitude": 0.0}
     names = {lens: f"lens {number}" for lens, number in by_lens(pictures).items()}
-    cameras = {name: _camera(lens) for lens, name in names.items()}
+    cameras = {name: brown_camera(lens) for lens, name in names.items()}
     centres, rotations = _topocentric(pictures, lat, lon)
     shots = {
         p.name: _shot(p, names[p.camera.lens], centre, rotation)
@@ -64,8 +64,8 @@ def write_opensfm(
         return link_pictures(pictures, find, part / "images", progress)
 
 
-def _camera(lens: Lens) -> dict[str, Any]:
-    """OpenSfM's "brown" camera."""
+def brown_camera(lens: Lens) -> dict[str, Any]:
+    """OpenSfM's and OpenDroneMap's "brown" camera of a lens, as a JSON object."""
     size = float(max(lens.width, lens.height))
     return {
         "projection_type": "brown", "width": lens.width, "height": lens.height,

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from orthoswarm.export.colmap_folder import write_colmap
 from orthoswarm.export.exterior_orientation import camera_of
+from orthoswarm.export.odm_folder import write_odm
 from orthoswarm.export.opensfm_folder import write_opensfm
 from orthoswarm.export.product_files import frame_row
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
@@ -146,3 +147,19 @@ def test_a_map_without_lenses_is_refused(tmp_path):
         write_colmap(rows, lambda row: None, tmp_path / "colmap")
     with pytest.raises(InputError, match="no placed picture"):
         write_opensfm([{"image": "a.jpg", "stage": "rejected"}], lambda row: None, tmp_path / "sfm")
+
+
+def test_opendronemap_gets_the_lens_where_all_photos_share_one(tmp_path):
+    cameras, rows = flight(tmp_path)
+    write_odm(rows, lambda row: tmp_path / row["image"], tmp_path / "mixed")
+    assert not (tmp_path / "mixed" / "cameras.json").exists()
+    write_odm(rows[2::3], lambda row: tmp_path / row["image"], tmp_path / "odm")
+    (lens,) = json.loads((tmp_path / "odm" / "cameras.json").read_text()).values()
+    points, _ = ground_seen(cameras[2])
+    x, y, z = ((points - cameras[2].position) @ cameras[2].rotation).T
+    r2 = (x / z) ** 2 + (y / z) ** 2
+    bent = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens["k3"]))
+    size = max(lens["width"], lens["height"])
+    u = size * (lens["focal_x"] * bent * x / z + lens["c_x"]) + (lens["width"] - 1) / 2
+    v = size * (lens["focal_y"] * bent * y / z + lens["c_y"]) + (lens["height"] - 1) / 2
+    assert np.stack([u, v], 1) == pytest.approx(cameras[2].project(points), abs=1e-6)

@@ -19,8 +19,9 @@ from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, write_cog
 from orthoswarm.export.cog_conversion import convert_cog
 from orthoswarm.export.kmz import write_kmz
+from orthoswarm.export.linked_pictures import unique_names
 from orthoswarm.export.mbtiles import write_mbtiles
-from orthoswarm.export.odm_folder import unique_names, write_odm
+from orthoswarm.export.odm_folder import write_odm
 from orthoswarm.export.product_files import iso_time, simple_lens
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError, OrthoSwarmError
