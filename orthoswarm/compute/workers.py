@@ -174,7 +174,7 @@ class Processes:
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.count - 1, mp_context=spawn_context(), initializer=_prepare)
+            self._pool = ProcessPoolExecutor(self.count - 1, mp_context=spawn_context(), initializer=prepare_worker)
         return self._pool
 
     def _account(self, future: "Future[_Outcome[Result]]") -> Result:
@@ -242,8 +242,8 @@ def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Re
     return future
 
 
-def _prepare() -> None:
-    """First thing in a new process: the parent handles Ctrl-C, and threads would only fight over the cores."""
+def prepare_worker() -> None:
+    """First thing in a worker process: its parent handles Ctrl-C, and it ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     prepare_process()

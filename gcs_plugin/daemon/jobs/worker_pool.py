@@ -1,8 +1,6 @@
 """Worker processes of the daemon: started in advance, of low priority, ended with the daemon in any case."""
 
-import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
@@ -11,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from gcs_plugin.daemon.jobs.process_usage import used_by
-from orthoswarm.compute.workers import Usage, prepare_process, spawn_context
+from orthoswarm.compute.workers import Usage, prepare_worker, spawn_context
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
 Result = TypeVar("Result")
@@ -146,19 +144,10 @@ def _end(pool: ProcessPoolExecutor) -> list[Any]:
 
 
 def _prepare(nice: int) -> None:
-    """Prepare a worker: signals are left to the daemon, and the process ends with the daemon."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Prepare a worker of low priority."""
     if hasattr(os, "nice"):
         os.nice(nice)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    prepare_process()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()  # also returns when the daemon was killed
-        os._exit(1)
+    prepare_worker()
 
 
 def _import_all(_: int) -> None:
