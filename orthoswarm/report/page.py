@@ -35,6 +35,7 @@ from orthoswarm.report.report_pictures import (
     scale_bar,
     view_grid,
 )
+from orthoswarm.report.surface_picture import surface_picture
 
 Array = NDArray[np.float64]
 
@@ -109,6 +110,9 @@ def write_page(
             shifts = shifts_against_map(best, ortho, there, basemap, least)
             values["edges"] = _edge_crops(best, ortho, there, basemap)
         values |= _pictures(out, ortho, report, placed=placed, there=there, shifts=shifts)
+    if report.get("surface"):
+        shaded, text = surface_picture(report["surface"])
+        values["surface"] = Figure("Surface model", data_uri(shaded), text)
     values["verdict"] = _verdict(report, placed, shifts)
     values["facts"] = _facts(report, placed, shifts)
     values["fov"] = charts.fields_of_view(report["vehicles"])
@@ -291,11 +295,11 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
             "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m.",
         }
     if report.get("control"):
-        return _control_verdict(report["control"], usual)
+        return _control_verdict(report["control"], _expected(sigma))
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
-    text = f"Lies on the pre-disaster map; expected error against it {usual:.2f} m (one sigma)"
+    text = f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}"
     if shifts is not None and len(shifts.at) >= 10:
         median = float(np.median(shifts.size_m))
         text += f"; compared with it block by block {median:.2f} m (median), roofs that lean apart included"
@@ -316,13 +320,22 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     return {"kind": "good" if fine >= 0.9 * len(placed) else "rough", "text": text + "."}
 
 
-def _control_verdict(control: Mapping[str, Any], usual: float) -> dict[str, str]:
+def _expected(sigma_m: Sequence[float]) -> str:
+    """One sigma of a place on the map, and how it differs from picture to picture."""
+    low, usual, high = np.quantile(sigma_m, [0.05, 0.5, 0.95]) if sigma_m else [math.nan] * 3
+    text = f"{usual:.2f} m (one sigma an axis"
+    if f"{low:.2f}" != f"{high:.2f}":
+        text += f"; {low:.2f} to {high:.2f} m in nine of ten pictures"
+    return text + ")"
+
+
+def _control_verdict(control: Mapping[str, Any], expected: str) -> dict[str, str]:
     """The same for a map that surveyed points placed."""
     count, shift = control["points"], control["shift_m"]
     points = "one surveyed point" if count == 1 else f"{count} surveyed points"
     text = (
         f"Placed on {points}, which moved it by {math.hypot(shift['east'], shift['north']):.2f} m "
-        f"({shift['east']:+.2f} east, {shift['north']:+.2f} north); expected error {usual:.2f} m (one sigma)"
+        f"({shift['east']:+.2f} east, {shift['north']:+.2f} north); expected error {expected}"
     )
     if count > 1:
         text += f"; {control['residual_rms_m']:.2f} m (rms) are left at the points"

@@ -7,6 +7,7 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
+from orthoswarm.report.surface_picture import relief
 from tests.kit.scenes import tiny_twin
 
 
@@ -48,6 +49,22 @@ def test_the_report_says_what_was_made(made):
     surface = json.loads((made / "report.json").read_text())["surface"]
     assert surface["file"].endswith("dsm.tif") and surface["known_ha"] > 3.0
     assert 0.1 < surface["median_sigma_m"] < 1.0 < surface["cell_m"] < 2.0
+
+
+def test_the_page_shows_the_surface_and_the_range_of_the_expected_error(made):
+    page = (made / "report.html").read_text()
+    assert "Shaded heights of ground" in page
+    rows = [json.loads(line) for line in (made / "frames.jsonl").read_text().splitlines()]
+    low, usual, high = np.quantile([row["sigma_m"] for row in rows], [0.05, 0.5, 0.95])
+    assert f"expected error against it {usual:.2f} m (one sigma an axis" in page
+    assert low == pytest.approx(high, abs=0.01) or f"{low:.2f} to {high:.2f} m in nine of ten pictures" in page
+
+
+def test_relief_is_lit_from_the_north_west():
+    east, north = np.meshgrid(np.arange(40.0), -np.arange(40.0))
+    flat = relief(0.0 * east, 1.0)[20, 20, 0]
+    assert relief(east, 1.0)[20, 20, 0] > flat > relief(-east, 1.0)[20, 20, 0]  # east rising faces west
+    assert relief(-north, 1.0)[20, 20, 0] > flat > relief(north, 1.0)[20, 20, 0]
 
 
 def test_photos_without_common_ground_make_a_map_and_a_warning_but_no_surface(twin, tmp_path):
