@@ -86,6 +86,7 @@ def afterwards(browser: Any, served: Program, token: str, out: Path) -> None:
     shoot(page, out / "daemon-swipe.jpg")
     page.uncheck("#swipe-on")
     plan(page, out / "daemon-plan.jpg")
+    coverage(page, out / "coverage-page.jpg")
     page.context.close()
     page = opened(browser, served.url, TABLET, "sunlight")
     page.wait_for_selector(".tile >> nth=2", timeout=LIMIT_MS)
@@ -106,6 +107,14 @@ def plan(page: Any, path: Path) -> None:
     page.click("text=Make plan")
     page.wait_for_selector(".plan-result:not([hidden])", timeout=LIMIT_MS)
     page.locator(".plan-result").scroll_into_view_if_needed()
+    shoot(page, path)
+
+
+def coverage(page: Any, path: Path) -> None:
+    """What the flight saw of the area that was drawn for the plan, which is larger than what was flown."""
+    page.click("#tab-map")
+    page.wait_for_selector(".gaps li", timeout=LIMIT_MS)
+    page.locator(".coverage").scroll_into_view_if_needed()
     shoot(page, path)
 
 

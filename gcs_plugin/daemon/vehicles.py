@@ -15,6 +15,7 @@ For the HTTP API and the page, all in JSON values:
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
 - `alarm` in each row of `rows()`: what is wrong with where it flies, and what to do; empty if nothing is.
+- `fence` in each row of `rows()`: the geofence that the vehicle holds, see `Fences.of`.
 - `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
   its command was given, so that a delayed one is not executed late.
 """
@@ -28,6 +29,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from gcs_plugin.daemon.fences import Fences
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
@@ -107,6 +109,7 @@ class VehicleLinks:
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
+        self._fences = Fences(self.fleet)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [
@@ -408,6 +411,7 @@ class VehicleLinks:
         while not self._stop.wait(_WATCH_S):
             number += 1
             try:
+                self.fleet.call(self._fences.look).result(_SOON_S)
                 self._publish_rows(complete=number % _COMPLETE_EVERY == 0)
                 if self.traffic.changed():
                     self._events.publish("traffic", rows=self.traffic.rows())
@@ -451,6 +455,7 @@ class VehicleLinks:
             if not kept.trail or kept.trail[-1] != point:
                 kept.trail.append(point)
                 del kept.trail[:-_TRAIL]
+        row["fence"] = self._fences.of(vehicle.system)
         row["trail"], row["texts"] = kept.trail[-_TRAIL:], list(kept.texts)
         return row
 

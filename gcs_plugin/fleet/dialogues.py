@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from gcs_plugin.mission.control import CheckMission, InOrder
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import NEVER, Verdict
+from gcs_plugin.mission.exchange import MISSION, NEVER, Verdict
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.upload import MissionUpload
 
@@ -49,8 +49,15 @@ class Dialogues:
         self._reap()
 
     def busy(self, system: int) -> bool:
-        """True while a dialogue with this vehicle is active."""
-        return any(job.vehicle.system == system for job in self.jobs)
+        """True while a dialogue with this vehicle is active that somebody waits for."""
+        return any(job.vehicle.system == system and not _in_background(job) for job in self.jobs)
+
+    def end_background(self, system: int) -> None:
+        """End what nobody waits for, in favour of what somebody asks for."""
+        for job in self.jobs:
+            if job.vehicle.system == system and _in_background(job):
+                job.cancel("another request came in between")
+        self._reap()
 
     def make_way(self, system: int) -> None:
         """End an active command for a newer one (an upload may continue)."""
@@ -139,10 +146,14 @@ class Dialogues:
             vehicle.detector.uploaded(job.mission)
             return
         mission = None
-        if isinstance(job, MissionDownload) and job.items is not None:
+        if isinstance(job, MissionDownload) and job.list_type == MISSION and job.items is not None:
             mission = Mission(vehicle.autopilot, tuple(job.items))
         elif isinstance(job, InOrder) and isinstance(job.steps[0], CheckMission):
             mission = job.steps[0].mission
         if mission is not None and (vehicle.mission != mission or not vehicle.detector.knows):
             vehicle.mission = mission
             vehicle.detector.knows_mission(mission)
+
+
+def _in_background(job: "Exchange") -> bool:
+    return isinstance(job, MissionDownload) and job.background

@@ -26,6 +26,7 @@ from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import why_no_missions
+from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.upload import MissionUpload
 from orthoswarm.model.errors import OrthoSwarmError
@@ -35,6 +36,7 @@ Dialogue = TypeVar("Dialogue", bound=Exchange)
 
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
+_FENCE_S: Final = 10.0
 _SURE_S: Final = 2.5  # an older state of a vehicle does not override a command that ends its flight
 
 
@@ -193,6 +195,17 @@ class Fleet:
         """Read the mission of a vehicle."""
         return self.begin(MissionDownload(self._free(system).address, self.own))
 
+    def read_fence(self, system: int) -> MissionDownload:
+        """Read the geofence of a vehicle; any other request to it ends this.
+
+        Raises:
+            OrthoSwarmError: the vehicle is not there, or busy.
+        """
+        job = MissionDownload(
+            self._free(system).address, self.own, patience_s=_FENCE_S, list_type=FENCE, background=True
+        )
+        return self.begin(job)
+
     def start(self, system: int) -> Exchange:
         """Start a vehicle's mission from the beginning: check, mode, arm, MISSION_START."""
         return self._now("start", system)
@@ -223,6 +236,7 @@ class Fleet:
 
     def _free(self, system: int) -> Vehicle:
         vehicle = self.vehicle(system)
+        self._dialogues.end_background(system)
         if self.busy(system):
             raise OrthoSwarmError(f"vehicle {system} is busy with another request; wait until that has ended")
         return vehicle

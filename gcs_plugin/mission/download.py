@@ -1,4 +1,4 @@
-"""Reading the mission out of a vehicle: MISSION_REQUEST_LIST, COUNT, REQUEST_INT and ITEM_INT, one after the other."""
+"""Reading the mission, or the geofence, out of a vehicle: REQUEST_LIST, COUNT, REQUEST_INT and ITEM_INT in turn."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -6,7 +6,7 @@ from typing import Final
 from gcs_plugin.links.mavlink import Message, dialect
 from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip, Verdict
 from gcs_plugin.mission.items import MissionItem
-from gcs_plugin.mission.refusal import ACCEPTED, DENIED
+from gcs_plugin.mission.refusal import ACCEPTED, DENIED, UNSUPPORTED
 
 _BUSY_S: Final = 1.0
 _FORGOTTEN: Final = 9
@@ -21,10 +21,14 @@ class MissionDownload(Exchange):
 
     Attributes:
         patience_s: silence after which it gives up.
-        items: the stored mission, None until it is complete.
+        list_type: MAV_MISSION_TYPE of the list: the mission, or the geofence.
+        background: nobody waits for it; any other request to the vehicle ends it.
+        items: the stored list, None until it is complete.
     """
 
     patience_s: float = 30.0
+    list_type: int = MISSION
+    background: bool = False
     items: list[MissionItem] | None = field(default=None, init=False)
     _count: int | None = field(default=None, init=False)
     _got: dict[int, MissionItem] = field(default_factory=dict, init=False)
@@ -50,7 +54,9 @@ class MissionDownload(Exchange):
             return self._counted(int(message.count), now)
         if kind in ("MISSION_ITEM_INT", "MISSION_ITEM"):
             return self._received(message, now)
-        if kind == "MISSION_ACK" and message.type != ACCEPTED:
+        if kind == "MISSION_ACK" and message.type == UNSUPPORTED and self.list_type != MISSION:
+            self._end(False, f"vehicle {self.vehicle.system} keeps no such list")
+        elif kind == "MISSION_ACK" and message.type != ACCEPTED:
             # Busy with an upload, or it has dropped our download: start again a little later.
             self._refused, self._asks_list = int(message.type), True
             self.deadline = now + (_BUSY_S if message.type == DENIED else _BUSY_S / max(1.0, self.pace))
@@ -78,6 +84,11 @@ class MissionDownload(Exchange):
         return self._restart(now)
 
     @property
+    def mission_type(self) -> int:
+        """See Exchange."""
+        return self.list_type
+
+    @property
     def progress(self) -> float:
         """Share of the items received."""
         if self.outcome is not None:
@@ -95,9 +106,9 @@ class MissionDownload(Exchange):
         self.deadline = now + self._trip.wait_s
         to = self.vehicle
         if self._count is None or self._asks_list:
-            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, MISSION)]
+            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, self.list_type)]
         seq = next(seq for seq in range(self._count) if seq not in self._got)
-        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, MISSION)]
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, self.list_type)]
 
     def _heard(self, now: float) -> None:
         self._heard_at, self._unanswered = now, 0
@@ -124,4 +135,4 @@ class MissionDownload(Exchange):
         self.items = [self._got[seq] for seq in range(self._count or 0)]
         self._end(True, f"{len(self.items)} items were read from vehicle {self.vehicle.system}")
         to = self.vehicle
-        return [dialect.MAVLink_mission_ack_message(to.system, to.component, ACCEPTED, MISSION)]
+        return [dialect.MAVLink_mission_ack_message(to.system, to.component, ACCEPTED, self.list_type)]

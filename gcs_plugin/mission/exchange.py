@@ -119,6 +119,11 @@ class Exchange(abc.ABC):
         self.delivered += 1
 
     @property
+    def mission_type(self) -> int:
+        """Which list of the mission protocol this is about (MAV_MISSION_TYPE)."""
+        return MISSION
+
+    @property
     def progress(self) -> float:
         """How far it is, 0 to 1."""
         return 0.0 if self.outcome is None else 1.0
@@ -134,7 +139,7 @@ class Exchange(abc.ABC):
         kind = str(message.get_type())
         if self.outcome is not None or not kind.startswith("MISSION_") or not hasattr(message, "target_system"):
             return ""
-        if getattr(message, "mission_type", MISSION) != MISSION:
+        if getattr(message, "mission_type", MISSION) != self.mission_type:
             return ""
         return kind if self._for_us(message) else ""
 

@@ -104,11 +104,13 @@ class MissionItem:
         """The command in words."""
         return command_name(self.command)
 
-    def message(self, seq: int, system: int, component: int) -> Message:
-        """The MISSION_ITEM_INT that carries it to a vehicle."""
+    def message(
+        self, seq: int, system: int, component: int, mission_type: int = dialect.MAV_MISSION_TYPE_MISSION
+    ) -> Message:
+        """The MISSION_ITEM_INT that carries it to a vehicle, or from it."""
         return dialect.MAVLink_mission_item_int_message(
             system, component, seq, self.frame, self.command, 0, int(self.autocontinue), *self.params,
-            self.x, self.y, self.z, dialect.MAV_MISSION_TYPE_MISSION,
+            self.x, self.y, self.z, mission_type,
         )  # fmt: skip
 
     @classmethod

@@ -6,6 +6,7 @@ from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
 from gcs_plugin.mission.refusal import (
     ACCEPTED,
@@ -48,6 +49,7 @@ class MissionStore:
         autopilot: the dialect.
         home: ArduPilot's item 0.
         items: the stored mission; for ArduPilot item 0 is home.
+        fence: the items of its geofence, which can be read only.
         generation: rises whenever an upload or a clear has ended, so that the flight logic can notice.
         stored_at: when the last upload ended, in the time of `feed`.
     """
@@ -55,6 +57,7 @@ class MissionStore:
     autopilot: Autopilot
     home: MissionItem
     items: list[MissionItem] = field(default_factory=list)
+    fence: list[MissionItem] = field(default_factory=list)
     generation: int = 0
     stored_at: float = -math.inf
     _transfer: _Transfer | None = None
@@ -64,6 +67,8 @@ class MissionStore:
 
     def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
         """Process a message of the mission protocol for this vehicle; returns the answers."""
+        if getattr(message, "mission_type", _MISSION) == FENCE:
+            return self._hand_out_fence(message, sender)
         if getattr(message, "mission_type", _MISSION) != _MISSION:
             return [self._ack(sender, UNSUPPORTED, int(message.mission_type))]
         match message.get_type():
@@ -124,6 +129,16 @@ class MissionStore:
         if seq >= len(self.items) or self._transfer is not None:
             return [self._ack(to, ERROR)]
         return [self.items[seq].message(seq, to.system, to.component)]
+
+    def _hand_out_fence(self, message: Message, to: Address) -> list[Message]:
+        match message.get_type():
+            case "MISSION_REQUEST_LIST":
+                return [dialect.MAVLink_mission_count_message(to.system, to.component, len(self.fence), FENCE)]
+            case "MISSION_REQUEST" | "MISSION_REQUEST_INT" if message.seq < len(self.fence):
+                return [self.fence[message.seq].message(int(message.seq), to.system, to.component, FENCE)]
+            case "MISSION_ACK":
+                return []
+        return [self._ack(to, UNSUPPORTED, FENCE)]
 
     @property
     def receiving(self) -> bool:

@@ -243,3 +243,20 @@ def test_start_is_not_offered_in_the_air_and_the_details_do_not_cover_the_map(br
         page.wait_for_selector(".details")  # asked for here
         page.click("#tab-fly")
         page.wait_for_selector(".details")
+
+
+def test_the_geofence_that_a_vehicle_holds_is_drawn_and_its_source_is_said(browser):
+    ring = [[8.545, 47.397], [8.547, 47.397], [8.547, 47.399]]
+    zones = [
+        {"kind": "inclusion", "ring": ring},
+        {"kind": "exclusion", "center": [8.546, 47.398], "radius_m": 20.0},
+        {"kind": "exclusion", "ring": [["x", 900]]},
+    ]
+    fence = {"zones": zones, "read_s": 1_780_000_000.0}
+    rows = [vehicle(1, fence=fence), vehicle(2, fence=fence), vehicle(3, fence={"zones": []}), vehicle(4)]
+    with standing(*rows) as station, opened(browser, station.url) as page:
+        for number, words in enumerate(("1 to stay in, 1 to stay out of; read from", "1 to", "none on", "not read")):
+            page.click(f".tile >> nth={number}")
+            page.wait_for_selector(f".details dd:has-text('{words}')")
+        drawn = "orthoswarm.map.getSource('fences').serialize().data.features.map((f) => f.properties.inside)"
+        page.wait_for_function(f"() => JSON.stringify({drawn}) === '[true,false]'")

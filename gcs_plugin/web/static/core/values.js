@@ -53,8 +53,16 @@ export function vehicle(message, before, now, whole = false) {
     link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
     frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
     sortie: count(row.sortie), phase: text(object(row.mission).phase), takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
-    texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot),
+    texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot), fence: fence(row.fence),
   };
+}
+
+// The geofence that a vehicle holds; a circle as its centre and radius. Null until the vehicle has told it.
+function fence(given) {
+  if (!given || typeof given !== "object") return null;
+  const zones = (Array.isArray(given.zones) ? given.zones : []).map(object).map((zone) => ({ inside: zone.kind === "inclusion", ring: points(zone.ring),
+    center: Array.isArray(zone.center) ? position(zone.center[0], zone.center[1]) : null, radius_m: number(zone.radius_m, 0, 1e6) }));
+  return { read_s: number(given.read_s), zones: zones.filter((zone) => zone.ring.length > 2 || (zone.center && zone.radius_m)) };
 }
 
 // An aircraft that carries ADS-B, as the daemon heard of it.

@@ -14,8 +14,8 @@ import { map } from "/static/map/map.js";
 import { refine } from "/static/work/jobs.js";
 
 // What only a vehicle on a link can say.
-const OF_A_LINK = ["speed", "battery", "gps", "home", "mission"];
-const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "home", "mission", "pictures", "refined"];
+const OF_A_LINK = ["speed", "battery", "gps", "home", "fence", "mission"];
+const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "home", "fence", "mission", "pictures", "refined"];
 
 export function detailsPanel() {
   const name = make("h2", {});
@@ -61,6 +61,7 @@ export function detailsPanel() {
       gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
       link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("state.pictures"),
       home: row.home ? `${positionText(row.home[1], row.home[0], settings.coordinates)}${row.position ? `, ${t("details.away", { m: units.distance(lengthOf([row.home, row.position])) })}` : ""}` : "–",
+      fence: fenceText(row.fence),
       mission: row.flight.items ? t("details.item", { item: row.flight.item, items: row.flight.items }) : "–",
       pictures: t("details.counts", { taken: Math.max(row.photos, row.frames.frames), ...row.frames }),
       refined: refinedText(row.id),
@@ -71,6 +72,13 @@ export function detailsPanel() {
     draw(said.map((message, k) => [k, message]));
   });
   return box;
+}
+
+function fenceText(fence) {
+  if (!fence) return t("details.fence.unread");
+  if (!fence.zones.length) return t("details.fence.none");
+  const inside = fence.zones.filter((zone) => zone.inside).length;
+  return t("details.fence.read", { inside, outside: fence.zones.length - inside, time: fence.read_s == null ? "–" : new Date(fence.read_s * 1000).toTimeString().slice(0, 5) });
 }
 
 function refinedText(vehicle) {

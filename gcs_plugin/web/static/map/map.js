@@ -23,6 +23,9 @@ const OVERLAYS = [
   ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15 }],
   ["area-line", "line", { "line-color": "#fff", "line-width": 4 }, null, "area"],
   ["area-edge", "line", { "line-color": "#1c64b0", "line-width": 2.5 }, null, "area"],
+  ["fences", "fill", { "fill-color": "#c92a2a", "fill-opacity": ["case", ["get", "inside"], 0, 0.2] }],
+  ["fences-under", "line", { "line-color": "#000", "line-width": 4.5, "line-opacity": 0.55 }, null, "fences"],
+  ["fences-edge", "line", { "line-color": ["case", ["get", "inside"], "#ffc44d", "#ff8a80"], "line-width": 2.5, "line-dasharray": [4, 2] }, null, "fences"],
   ["no-fly", "fill", { "fill-color": "#c92a2a", "fill-opacity": 0.28 }],
   ["no-fly-edge", "line", { "line-color": "#c92a2a", "line-width": 2.5, "line-dasharray": [3, 1.5] }, null, "no-fly"],
   ["plan-edge", "line", { "line-color": "#fff", "line-width": 5, "line-opacity": 0.7 }, null, "plan"],
@@ -33,7 +36,7 @@ const OVERLAYS = [
   ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],
   ["measure-line", "line", { "line-color": "#ffd43b", "line-width": 3 }, null, "measure"],
 ];
-export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "homes"];
+export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "homes", "fences", "fences-under", "fences-edge"];
 export const FIRST_OVERLAY = OVERLAYS[0][0];
 
 // Where no layer has pixels: no glare at night.

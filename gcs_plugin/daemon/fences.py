@@ -1,0 +1,70 @@
+"""The vehicles' geofences: read from each when it is heard, and again now and then while it is on the ground."""
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from orthoswarm.model.errors import OrthoSwarmError
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.mission.download import MissionDownload
+
+_AT_ONCE: Final = 4
+_AGAIN_S: Final = 60.0
+_FAILED_S: Final = 15.0
+
+
+@dataclass(slots=True)
+class _Fence:
+    """What is known of a vehicle's fence.
+
+    Attributes:
+        read: under way. due: when to read (again), monotonic. document: for the vehicle's row, None until it was read.
+    """
+
+    due: float
+    read: "MissionDownload | None" = None
+    document: dict[str, Any] | None = None
+
+
+class Fences:
+    """Reads geofences, a few vehicles at once; whatever an operator asks for comes first and breaks the reading off.
+
+    Args:
+        fleet: the vehicles. clock: monotonic seconds.
+    """
+
+    def __init__(self, fleet: "Fleet", clock: Callable[[], float] = time.monotonic) -> None:
+        self._fleet, self._clock = fleet, clock
+        self._fences: dict[int, _Fence] = {}
+
+    def look(self) -> None:
+        """Take what has been read and begin what is due; in the fleet's thread."""
+        from gcs_plugin.mission.geofence import zones_of
+
+        now = self._clock()
+        for fence in self._fences.values():
+            if fence.read is None or fence.read.outcome is None:
+                continue
+            if fence.read.items is not None:
+                zones = [zone.document() for zone in zones_of(fence.read.items)]
+                if fence.document is None or fence.document["zones"] != zones:
+                    fence.document = {"zones": zones, "read_s": round(time.time(), 1)}
+            fence.due = now + (_AGAIN_S if fence.read.outcome.ok else _FAILED_S)
+            fence.read = None
+        under_way = sum(fence.read is not None for fence in self._fences.values())
+        for system, vehicle in self._fleet.vehicles.items():
+            fence = self._fences.setdefault(system, _Fence(now))
+            known_in_air = vehicle.armed and fence.document is not None
+            if under_way < _AT_ONCE and fence.read is None and now >= fence.due and not known_in_air:
+                with contextlib.suppress(OrthoSwarmError):  # lost, or busy with something else
+                    fence.read = self._fleet.read_fence(system)
+                    under_way += 1
+
+    def of(self, system: int) -> dict[str, Any] | None:
+        """`zones` and `read_s` (epoch seconds since when they are known so), None until the vehicle has told."""
+        fence = self._fences.get(system)
+        return None if fence is None else fence.document

@@ -1,0 +1,64 @@
+"""The geofence that a vehicle holds: zones out of the items of its fence list (MAV_MISSION_TYPE_FENCE)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from gcs_plugin.links.mavlink import dialect
+from gcs_plugin.mission.items import MissionItem
+
+FENCE: Final = int(dialect.MAV_MISSION_TYPE_FENCE)
+Kind = Literal["inclusion", "exclusion"]
+_POLYGONS: Final[dict[int, Kind]] = {
+    int(dialect.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION): "inclusion",
+    int(dialect.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION): "exclusion",
+}
+_CIRCLES: Final[dict[int, Kind]] = {
+    int(dialect.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION): "inclusion",
+    int(dialect.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION): "exclusion",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A zone that a vehicle must stay inside (inclusion) or outside of (exclusion).
+
+    Attributes:
+        kind: which of the two.
+        points: longitude and latitude in degrees of a polygon's corners without the closing one, or of a centre.
+        radius_m: of a circle, None for a polygon.
+    """
+
+    kind: Kind
+    points: tuple[tuple[float, float], ...]
+    radius_m: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """JSON: `kind`, and `ring` or `center` with `radius_m`."""
+        if self.radius_m is None:
+            return {"kind": self.kind, "ring": [list(point) for point in self.points]}
+        return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
+
+
+def zones_of(items: Sequence[MissionItem]) -> list[Zone]:
+    """The zones of a fence list; return points and polygons that are not complete are left out.
+
+    Args:
+        items: as downloaded. A polygon is a row of vertices that each state how many it has (param1).
+    """
+    zones: list[Zone] = []
+    k = 0
+    while k < len(items):
+        item = items[k]
+        place = (item.lon_deg, item.lat_deg)
+        if item.command in _CIRCLES:
+            zones.append(Zone(_CIRCLES[item.command], (place,), item.params[0]))
+        elif item.command in _POLYGONS:
+            count = int(item.params[0])
+            row = [i for i in items[k : k + count] if i.command == item.command and int(i.params[0]) == count]
+            if count >= 3 and len(row) == count:
+                zones.append(Zone(_POLYGONS[item.command], tuple((i.lon_deg, i.lat_deg) for i in row)))
+                k += count
+                continue
+        k += 1
+    return zones
