@@ -5,7 +5,6 @@ pre-arm checks, its filter) is included here, so that no vehicle takes off while
 """
 
 import enum
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -15,6 +14,7 @@ from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.control import unflyable
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
+from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
@@ -210,9 +210,7 @@ def _home(vehicle: "Vehicle") -> Item:
         return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
     if vehicle.lat_deg is None or vehicle.lon_deg is None:
         return Item("home", Level.WARNING, "set, but the vehicle does not say where it is")
-    north = math.radians(vehicle.lat_deg - vehicle.home[0]) * 6_371_000.0
-    east = math.radians(vehicle.lon_deg - vehicle.home[1]) * 6_371_000.0 * math.cos(math.radians(vehicle.lat_deg))
-    away = math.hypot(north, east)
+    away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *vehicle.home[:2])
     if away > _HOME_M and not vehicle.flying:
         return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
     return Item("home", Level.OK, "set")

@@ -33,6 +33,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 
+from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.sample import Sample, checked
 
 UUID = bytes.fromhex("0470547eac274f00856a5455b0eaf430")
@@ -252,9 +253,8 @@ def _dji_pose(value: bytes, sample: Sample) -> bool:
     metres = [(high << 16 | low) / 1000.0 for high, low in ((north, low_north), (east, low_east), (down, low_down))]
     if abs(home_lat) > 89.0 or max(map(abs, metres)) > 50_000.0:
         return False
-    degree_m = 111_194.93
-    sample.lat_deg = home_lat + metres[0] / degree_m
-    sample.lon_deg = home_lon + metres[1] / (degree_m * math.cos(math.radians(home_lat)))
+    sample.lat_deg = home_lat + metres[0] / DEGREE_M
+    sample.lon_deg = home_lon + metres[1] / (DEGREE_M * math.cos(math.radians(home_lat)))
     sample.altitude_m = -metres[2]
     sample.height_m = -metres[2] + home_altitude / 1000.0  # home altitude is stored with the opposite sign
     sample.yaw_deg = yaw * 1e-7
