@@ -260,3 +260,12 @@ def test_the_geofence_that_a_vehicle_holds_is_drawn_and_its_source_is_said(brows
             page.wait_for_selector(f".details dd:has-text('{words}')")
         drawn = "orthoswarm.map.getSource('fences').serialize().data.features.map((f) => f.properties.inside)"
         page.wait_for_function(f"() => JSON.stringify({drawn}) === '[true,false]'")
+
+
+def test_one_vehicle_is_no_vehicles_and_no_height_is_minus_zero(browser):
+    with standing(vehicle(1, height_m=-0.02)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector("text=1 vehicle, 1 in the air")
+        assert page.inner_text(".tile .height") == "0 m"
+        send(page, {"type": "vehicle"} | vehicle(2, height_m=-3.0))
+        page.wait_for_selector("text=2 vehicles, 2 in the air")
+        assert page.inner_text("li:nth-child(2) .tile .height") == "-3 m"

@@ -5,7 +5,7 @@ import { settings } from "/static/core/settings.js";
 const FOOT = 0.3048;
 const us = () => settings.units === "us";
 const none = "–";
-const show = (value, digits, unit) => (value == null ? none : `${value.toFixed(digits)} ${unit}`);
+const show = (value, digits, unit) => (value == null ? none : `${value.toFixed(digits).replace(/^-(0(?:\.0*)?)$/, "$1")} ${unit}`); // no "-0"
 
 export const height = (metres) => (us() ? show(metres == null ? null : metres / FOOT, 0, "ft") : show(metres, 0, "m"));
 export const speed = (m_s) => (us() ? show(m_s == null ? null : m_s * 2.236936, 0, "mph") : show(m_s, 1, "m/s"));

@@ -7,6 +7,7 @@ import { detailsPanel } from "/static/fly/details.js";
 import "/static/fly/overlays.js";
 import { preflightDialog } from "/static/fly/preflight.js";
 import { cursorLine } from "/static/map/cursor.js";
+import { circle } from "/static/map/geodesy.js";
 import { layerPanel, mappedBounds } from "/static/map/layers.js";
 import { legPanel } from "/static/map/legs.js";
 import { boundsOf, fit, isReady, map, ready } from "/static/map/map.js";
@@ -28,7 +29,8 @@ function showAll() {
   const vehicles = [...state.vehicles.values()].filter((row) => row.position).map((row) => row.position);
   const mapped = mappedBounds();
   const corners = mapped ? [mapped.slice(0, 2), mapped.slice(2)] : [];
-  const bounds = boundsOf([...vehicles, ...corners, ...(area.rings[0] ?? [])]);
+  const fences = [...state.vehicles.values()].flatMap((row) => row.fence?.zones ?? []).flatMap((zone) => (zone.center ? circle(zone.center, zone.radius_m) : zone.ring));
+  const bounds = boundsOf([...vehicles, ...fences, ...corners, ...(area.rings[0] ?? [])]);
   if (bounds) fit(bounds);
 }
 
