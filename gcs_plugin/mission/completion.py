@@ -270,6 +270,8 @@ class CompletionDetector:
         if self.phase is Phase.ACTIVE:
             return []
         if self.phase is Phase.SUSPENDED:
+            if self._airborne and self._landed == _ON_GROUND:  # PX4 after a failsafe, before it disarms
+                return []
             self.phase = Phase.ACTIVE
             return [MissionEvent.RESUMED]
         # After an end in the air a mission counts as flown again only once it is back before its last item.

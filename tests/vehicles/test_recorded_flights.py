@@ -1,7 +1,7 @@
 """Excerpts of real flights (ArduCopter 4.7, PX4; software in the loop, real time), fed through the fleet again.
 
 Each holds one flight: every change of mode, mission item, landed state, each text and acknowledgement, and a position
-every one and a half seconds.
+every one and a half seconds; those of failsafes were numbered anew, so that what was left out is no loss.
 """
 
 from pathlib import Path
@@ -101,6 +101,25 @@ def test_a_real_flight_in_words_and_events(name, events, words):
     assert "lost" not in seen
     if name not in ("arducopter_pause", "arducopter_operator_rtl"):  # the latter waits in LOITER_UNLIM
         assert "paused" not in seen, seen
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "text"),
+    [
+        ("px4_geofence", [*FLOWN, *RETURNS, "on ground"], "Geofence: exceeding maximum distance to Home"),
+        ("px4_battery", [*FLOWN, *RETURNS, "on ground"], "Critical battery"),
+        ("px4_gps_loss", [*FLOWN, "landing", "on ground"], "Failsafe activated"),
+    ],
+)
+def test_a_failsafe_of_px4_ends_the_mission_once_without_completing_it(name, words, text):
+    """PX4 calls the mission active again between its landing and its disarming: nothing was resumed."""
+    seen = []
+    vehicle, kinds = replay(name, lambda v: seen.append(flight_state(v).word.value))
+    assert kinds == ["started", "suspended", "aborted"]
+    rest = iter(seen)
+    assert all(word in rest for word in words), dict.fromkeys(seen)
+    assert "complete" not in seen and "lost" not in seen
+    assert any(text in said for said in vehicle.texts)
 
 
 def test_px4_says_complete_when_it_begins_to_return():
