@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon import views
+from gcs_plugin.daemon.airspace.terrain_data import TerrainData
 from gcs_plugin.daemon.coverage.event_requests import EventRequests
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
@@ -46,7 +47,6 @@ from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, pictu
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
-from gcs_plugin.daemon.terrain_data import TerrainData
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.compute.workers import peak_rss_mb, prepare_process

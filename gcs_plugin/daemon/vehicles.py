@@ -29,13 +29,13 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.daemon.fences import Fences
+from gcs_plugin.daemon.airspace.fences import Fences
+from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.traffic import Traffic
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict

@@ -5,11 +5,11 @@ import time
 
 import pytest
 
+from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
-from gcs_plugin.daemon.traffic import Traffic
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect

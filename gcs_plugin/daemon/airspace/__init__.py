@@ -1,0 +1,1 @@
+"""What bounds the flight: other aircraft, geofences, and the terrain that vehicles follow."""
