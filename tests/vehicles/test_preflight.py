@@ -1,5 +1,6 @@
 """Before a start: the check as data, takeoffs that wait for each other, and vehicles in the air that come too near."""
 
+import itertools
 import json
 
 import pytest
@@ -180,6 +181,24 @@ def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys): 
             f"vehicle {number} flies its mission" for number in (1, 2, 3)
         ]
         assert swarm.now >= 130.0
+
+
+def test_what_vehicles_wait_for_is_said_once_for_those_that_it_is_new_for(folder, capsys):  # noqa: F811
+    vehicles = make_swarm(3, autopilots=(AP,), home=HOME)
+    for vehicle, ready_s in zip(vehicles, (50.0, 130.0, 130.0), strict=True):
+        vehicle.ready_s = ready_s
+    swarm, link = swarm_of(vehicles)
+    with swarm:
+        assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        assert main(["fleet", "start", "--plan", str(folder), "--link", link]) == 0
+        lines = capsys.readouterr().out.splitlines()
+    said = [line for line in lines if line.startswith(("waiting: ", "ready: "))]
+    assert "ready: v1" in said
+    after = said[said.index("ready: v1") + 1 :]
+    assert not any("v1" in line for line in after)
+    for name in ("v1", "v2", "v3"):
+        mine = [line.partition(" v")[2].partition(" ")[2] for line in said if name in line]
+        assert all(one != other for one, other in itertools.pairwise(mine)), said
 
 
 def test_nobody_takes_off_where_one_does_not_become_ready(folder, capsys):  # noqa: F811

@@ -5,7 +5,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -345,17 +345,17 @@ def _ready(
 
     allowed = _overrides(args.override, systems, ITEMS)
     missions, stored, starts = _missions(backend, prepared, systems)
-    end, said = time.monotonic() + args.ready, ""
+    end = time.monotonic() + args.ready
+    said: dict[int, str] = {}
     while True:
         checks = backend.check(systems, missions, stored, starts, args.max_height)
         red = red_text(checks, allowed)
         waits = all(item.name in _PASSING for check in checks for item in check.red(allowed.get(check.system, ())))
         if not red or not waits or time.monotonic() >= end:
             break
-        text = "; ".join(f"v{system} {why}" for system, why in sorted(red.items()))
-        if text != said:
-            said = text
-            _say(args, f"waiting: {text}")
+        for line in _changes(said, red):
+            _say(args, line)
+        said = red
         backend.pump(0.5)
     if red:
         others = "was not started, because others are not ready"
@@ -367,6 +367,17 @@ def _ready(
             for failure in (Verdict.REFUSED if s in red else Verdict.NOT_SENT,)
         }
     return Airspace.of({s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None})
+
+
+def _changes(before: Mapping[int, str], red: Mapping[int, str]) -> list[str]:
+    """A line for each reason that vehicles have got, and one for those that have become ready."""
+    changed: dict[str, list[str]] = {}
+    for system, why in sorted(red.items()):
+        if before.get(system) != why:
+            changed.setdefault(why, []).append(f"v{system}")
+    lines = [f"waiting: {', '.join(names)} {why}" for why, names in changed.items()]
+    ready = [f"v{system}" for system in sorted(before.keys() - red.keys())]
+    return [*lines, f"ready: {', '.join(ready)}"] if ready else lines
 
 
 def _missions(
