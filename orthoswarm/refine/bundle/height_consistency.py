@@ -50,6 +50,20 @@ def contradicted_heights(adjustment: Adjustment) -> Flags:
     return np.asarray((np.abs(offset) > limit) & (sigma < config.unknown_height_sigma_m), np.bool_)
 
 
+def predicted_height_offset(adjustment: Adjustment) -> tuple[float, float]:
+    """Offset of the recorded heights that an adjustment without their prior should come to, and its tolerance, metres.
+
+    Median of the groups; the tolerance is the limit beyond which an offset contradicts the record. A result farther off
+    is no solution of the normal equations that predicted it: the pictures determine no height.
+    """
+    offset, sigma = offsets_without_height_prior(adjustment)
+    config = active().bundle
+    tolerance = max(
+        config.contradiction_sigmas * float(np.median(sigma)), config.contradiction_share * _height(adjustment)
+    )
+    return float(np.median(offset)), tolerance
+
+
 def release_heights(adjustment: Adjustment) -> Flags:
     """Loosen the prior on heights that the pictures contradict; run some more steps if there were any.
 

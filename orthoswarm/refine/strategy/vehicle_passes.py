@@ -17,7 +17,12 @@ from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import frame_sigmas
-from orthoswarm.refine.bundle.height_consistency import contradicted_heights, height_disagreement, release_heights
+from orthoswarm.refine.bundle.height_consistency import (
+    contradicted_heights,
+    height_disagreement,
+    predicted_height_offset,
+    release_heights,
+)
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
     Flight,
@@ -226,13 +231,15 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     """Drop recorded heights that the pictures contradict; keep them where the pictures alone determine no height.
 
     The contradiction must remain once the adjustment has converged, and the adjustment must also converge without the
-    heights: few pictures of a levelled camera over flat ground hardly determine the focal length, which then drifts.
+    heights, near the height that the normal equations predicted for that: few pictures of a levelled camera over flat
+    ground hardly determine the focal length, which then drifts to another minimum.
     """
     config = active().strategy
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
     surface, _ = _steps(flight, surface, config.rest_steps)
     with_heights, calibration, ground_with_heights = flight.adjustment.copy(), flight.calibration, surface
+    predicted_m, tolerance_m = predicted_height_offset(flight.adjustment)
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
@@ -243,7 +250,8 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
             break
     recorded_m = float(np.median(flight.records.position[flight.records.has_height, 2]))
     solved_m = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
-    if not converged or abs(solved_m - recorded_m) < config.agreeing_share * recorded_m:
+    drifted = abs(solved_m - recorded_m - predicted_m) > tolerance_m
+    if not converged or drifted or abs(solved_m - recorded_m) < config.agreeing_share * recorded_m:
         flight.adjustment, flight.calibration = with_heights, calibration
         return ground_with_heights
     flight.warnings.append(contradiction(flight.frames[0].vehicle, recorded_m, solved_m))

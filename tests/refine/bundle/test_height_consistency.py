@@ -14,6 +14,7 @@ from orthoswarm.refine.bundle.height_consistency import (
     height_disagreement,
     log_focal_sigmas,
     offsets_without_height_prior,
+    predicted_height_offset,
 )
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse, trusted_heights
@@ -72,6 +73,13 @@ def test_wrong_heights_are_said_and_do_not_bend_the_field_of_view(factor):
     said = float(found[0].split("which say ")[1].split()[0])
     assert said == pytest.approx(60.0, rel=0.05)
     assert fov_deg(adjustment) == pytest.approx(80.0, abs=max(1.5, 2.0 * sigma_deg(adjustment)))
+
+
+def test_the_height_that_an_adjustment_comes_to_is_predicted_while_it_still_has_the_prior():
+    world = crosshatch(tilt_deg=10.0)
+    offset_m, tolerance_m = predicted_height_offset(solved(world, world.frames)[0])
+    assert abs(offset_m) < 2.0
+    assert 0.15 * 55.0 < tolerance_m < 0.3 * 65.0
 
 
 def test_heights_that_are_twice_too_much_are_not_believed_any_more():

@@ -94,6 +94,35 @@ def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_
         assert doubted(flight.adjustment).all() and height_disagreement(flight.adjustment) < 0.05
 
 
+def test_a_height_far_from_the_one_that_was_predicted_is_another_minimum(made_up, monkeypatch):
+    """Pictures of a level camera on ArduCopter: 32 m were predicted for 40 m, and the free adjustment came to 14 m."""
+    frames, _ = made_up
+    steps = vehicle_passes._steps
+
+    def doubted(adjustment):
+        return np.array([m.height_sigma < active().bundle.unknown_height_sigma_m for m in adjustment.priors.models])
+
+    def elsewhere(flight, surface, count):
+        surface, focal_px = steps(flight, surface, count)
+        if not doubted(flight.adjustment).any():
+            flight.adjustment.cameras.position[:, 2] *= 0.35
+            flight.adjustment.cameras.lens[:, 0] *= 0.35
+        return surface, focal_px
+
+    for module in (vehicle_passes, height_consistency):
+        monkeypatch.setattr(module, "contradicted_heights", doubted)
+    monkeypatch.setattr(vehicle_passes, "_steps", elsewhere)
+    height_m = frames[0].fix.height_m
+    for share, believed in ((-0.2, True), (-0.65, False)):
+        monkeypatch.setattr(
+            vehicle_passes, "predicted_height_offset", lambda _, s=share: (s * height_m, 0.15 * height_m)
+        )
+        flight = opened(frames)
+        adjust_without_map(flight)
+        assert flight.calibration.trusted_height is believed
+        assert (fov_deg(flight) == pytest.approx(70.0, abs=0.5)) is believed
+
+
 def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):
     frames, basemap = made_up
     orient_on_map = vehicle_passes.orient_on_map
