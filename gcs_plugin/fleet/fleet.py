@@ -37,6 +37,7 @@ Dialogue = TypeVar("Dialogue", bound=Exchange)
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
 _FENCE_S: Final = 10.0
+_PAUSE_SHOWS_S: Final = 5.0
 _SURE_S: Final = 2.5  # an older state of a vehicle does not override a command that ends its flight
 
 
@@ -84,6 +85,7 @@ class Fleet:
         )
         self._clock = clock
         self._listeners: list[Callable[[FleetEvent], None]] = []
+        self._pauses: dict[int, tuple[Exchange, float]] = {}
         self._dialogues = Dialogues(self.vehicles, self.hub, clock, signed=self.signed)
         self._reception = Reception(
             self.vehicles,
@@ -180,7 +182,7 @@ class Fleet:
                 another upload or start.
         """
         vehicle = self._flies_missions(system)
-        if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
+        if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed and not self._was_just_paused(system):
             raise OrthoSwarmError(f"vehicle {system} is flying its mission; pause it or let it return first")
         if mission.autopilot is not vehicle.autopilot:
             kind = vehicle.autopilot.value
@@ -274,9 +276,19 @@ class Fleet:
         if verb == "pause" and sure and not vehicle.armed:
             raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
         self._dialogues.make_way(system)
+        self._pauses.pop(system, None)
+        if verb == "pause":
+            self._pauses[system] = (vehicle.pilot.pause(), self._clock())
+            return self._pauses[system][0]
         if verb == "resume":
             return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
-        return {"pause": vehicle.pilot.pause, "rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
+        return {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
+
+    def _was_just_paused(self, system: int) -> bool:
+        """True between a vehicle's acknowledgement of a pause and the report of its mission's state that shows it."""
+        exchange, given = self._pauses.get(system, (None, 0.0))
+        done = exchange is not None and exchange.outcome is not None and exchange.outcome.ok
+        return done and self._clock() - given < _PAUSE_SHOWS_S
 
     def _known(self, system: int) -> Vehicle:
         vehicle = self.vehicles.get(system)

@@ -215,3 +215,15 @@ def test_a_row_has_the_autopilots_words_and_home(open_links):
     row = links.rows()[0]
     assert any(said["text"] == "EKF3 IMU0 is using GPS" for said in row["texts"])
     assert row["home"] == pytest.approx([HOME[0], HOME[1]], abs=1e-5)
+
+
+def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_links, folder):  # noqa: F811
+    links = open_links(make_swarm(1, autopilots=(AP,), home=HOME))
+    ready(links, 1)
+    upload_all(links, folder)
+    assert [row["outcome"] for row in links.commands("start")] == ["done"]
+    wait(lambda: links.rows()[0]["flight"]["state"] == "on mission")
+    with pytest.raises(OrthoSwarmError, match="flying its mission"):
+        upload_all(links, folder)
+    assert [row["outcome"] for row in links.commands("pause")] == ["done"]
+    upload_all(links, folder)

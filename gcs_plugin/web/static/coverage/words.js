@@ -2,7 +2,7 @@
 
 export const coverageWords = {
   "coverage.title": "Coverage", "coverage.none": "No area yet: plan one, or draw it.", "coverage.show": "Show on the map",
-  "coverage.seen": "seen", "coverage.poor": "seen poorly", "coverage.missed": "missed", "coverage.planned": "not flown yet",
+  "coverage.seen": "seen", "coverage.poor": "seen poorly", "coverage.missed": "missed", "coverage.planned": "not flown",
   "coverage.recorded": "By recorded poses alone: {seen} seen. {placed} pictures are placed, {left} lie as recorded.",
   "coverage.gaps": "{n} {n|gap|gaps}, {size} together", "coverage.nogaps": "No gap so far.",
   "coverage.gap": "{size}: {cause}", "coverage.sure": "{sure} sure", "coverage.more": "and {n} smaller ones",
