@@ -27,14 +27,14 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import gap_feature
-from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares
+from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares, State
 from orthoswarm.coverage.gaps import below_legs, find_gaps
 from orthoswarm.coverage.missing_pictures import MissingPicture
 from orthoswarm.coverage.planning_lens import planning_fovs_deg
 from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.raster.picture_quality import PictureQuality
 
@@ -324,7 +324,7 @@ class LiveCoverage:
             "recorded": _shares(here.recorded.shares(self._due)),
             "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
             "area_m2": cover.cells.area_m2, "cell_m": cover.cells.grid.gsd_m,
-            "offers": _offers(here.legs),
+            "offers": _offers(here.legs, states, cover.cells.grid),
             "legs": {"planned": len(here.legs.flown), "over": int(here.legs.over.sum())},
             "corners": picture_corners(cover.cells.grid, states),
             "gaps": [f["properties"] | {"polygon": f["geometry"]} for f in features],
@@ -360,14 +360,29 @@ def _shares(shares: Shares) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _offers(legs: FlownLegs) -> list[dict[str, Any]]:
-    """Unflown legs of vehicles that have left their mission, to be flown by others: a row per vehicle."""
+def _offers(legs: FlownLegs, states: NDArray[np.uint8], grid: GroundGrid) -> list[dict[str, Any]]:
+    """Unflown legs of vehicles that have left their mission, to be flown by others: a row per vehicle.
+
+    Legs whose ground has been seen meanwhile, in another's flight, are left out.
+    """
     rows = []
-    for vehicle, left in legs.remaining().items():
+    for vehicle, unflown in legs.remaining().items():
+        left = [leg for leg in unflown if _is_unseen(legs.legs.ends[leg], states, grid)]
         if left:
             length_m = float(np.hypot(*(legs.legs.ends[left, 1] - legs.legs.ends[left, 0]).T).sum())
             rows.append({"vehicle": vehicle, "legs": len(left), "length_m": round(length_m, 1)})
     return rows
+
+
+def _is_unseen(ends: NDArray[np.float64], states: NDArray[np.uint8], grid: GroundGrid) -> bool:
+    """True if a cell below a leg was not seen, or none is in the area; `ends` are two points, metres of the grid."""
+    steps = np.linspace(0.0, 1.0, 2 + int(np.hypot(*(ends[1] - ends[0])) / grid.gsd_m))
+    east, north = (ends[0] + steps[:, None] * (ends[1] - ends[0])).T
+    rows, columns = ((grid.north - north) / grid.gsd_m).astype(int), ((east - grid.west) / grid.gsd_m).astype(int)
+    inside = (rows >= 0) & (columns >= 0) & (rows < states.shape[0]) & (columns < states.shape[1])
+    below = states[rows[inside], columns[inside]]
+    below = below[below != State.OUTSIDE]
+    return bool(not below.size or np.isin(below, (State.MISSED, State.PLANNED)).any())
 
 
 def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
