@@ -1,7 +1,7 @@
 """Where two frames show the same ground, and the ratio of their colours there.
 
 Places are taken at the seams of the orthoimage, a little to either side of them (there one frame sees steeply, the
-other obliquely), and on a grid over consecutive frames of a vehicle.
+other obliquely), and on a grid over each frame and its nearest neighbours, of any vehicle.
 """
 
 from collections.abc import Sequence
@@ -37,11 +37,14 @@ class OverlapColors:
         ratio: float32 (M, 3), log of the first one's colour over the other's.
         place: float32 (M, 2, 4), for either frame: where in the picture (x, y from its centre, half its width being 1),
             and how it is seen (tangents of the view direction, east and north).
+        sigma: float32 (M,), of the ratio: great where the thumbnails change much from one pixel to the next, so that a
+            small displacement matters; small on meadows, water and roads, where steps are seen most.
     """
 
     frame: Ints
     ratio: NDArray[np.float32]
     place: NDArray[np.float32]
+    sigma: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +57,12 @@ class _Meetings:
 
 
 def overlap_colors(
-    cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.intp], small: Bytes, terrain: Terrain
+    cameras: Sequence[Camera], shots: Shots, small: Bytes, terrain: Terrain
 ) -> tuple[OverlapColors, Array]:
     """Compare the frames' colours where they overlap.
 
     Args:
-        cameras: N cameras; shots: the same as arrays. vehicle: int (N,). small: uint8 (N, rows, columns, 3) thumbnails.
+        cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails.
         terrain: the ground.
 
     Returns:
@@ -68,7 +71,7 @@ def overlap_colors(
     labels, grid = _coarse_labels(cameras, shots, terrain)
     seams = _seams(labels, grid)
     towards = [_towards(seams, side, shots) for side in (seams.a, seams.b)]
-    meetings = [*(_thinned(m, len(cameras)) for m in (seams, *towards)), _consecutive(cameras, shots, vehicle, terrain)]
+    meetings = [*(_thinned(m, len(cameras)) for m in (seams, *towards)), _neighbours(cameras, shots, terrain)]
     some = _Meetings(*(np.concatenate([getattr(m, name) for m in meetings]) for name in ("a", "b", "ground")))
     area = np.bincount(labels[labels > 0] - 1, minlength=len(cameras)).astype(float)
     return _compared(some, shots, small, terrain), area
@@ -108,8 +111,10 @@ def _seams(labels: Ints, grid: GroundGrid) -> _Meetings:
     return _Meetings(*(np.concatenate([p[k] for p in parts]) for k in range(3)))
 
 
-def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.intp], terrain: Terrain) -> _Meetings:
-    """A 3 x 2 grid of points of each frame with the next one of its vehicle and with the one before: alike in both."""
+def _neighbours(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> _Meetings:
+    """A 3 x 2 grid of points of each frame, with each of the frames that have the nearest nadirs."""
+    from scipy.spatial import cKDTree
+
     u, v = np.meshgrid([0.2, 0.5, 0.8], [0.3, 0.7])
     share = np.stack([u.ravel(), v.ravel()], 1)
     by_lens: dict[Lens, Array] = {}
@@ -122,8 +127,11 @@ def _consecutive(cameras: Sequence[Camera], shots: Shots, vehicle: NDArray[np.in
     descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
     ground = shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
 
-    same = np.nonzero(vehicle[1:] == vehicle[:-1])[0]
-    a, b = np.concatenate([same, same + 1]), np.concatenate([same + 1, same])
+    nearest = min(active().radiometry.neighbours + 1, len(cameras))
+    others = cKDTree(shots.position[:, :2]).query(shots.position[:, :2], nearest)[1].reshape(len(cameras), nearest)
+    a = np.repeat(np.arange(len(cameras)), nearest)
+    b = others.ravel()
+    a, b = a[a != b], b[a != b]
     points = len(share)
     return _Meetings(
         np.repeat(a, points).astype(np.int32), np.repeat(b, points).astype(np.int32), ground[a].reshape(-1, 2)
@@ -146,6 +154,7 @@ def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain)
     """The samples at places of which both frames tell a colour."""
     count = len(meetings.a)
     ratio, usable = np.zeros((count, 3), np.float32), np.zeros(count, bool)
+    contrast = np.zeros(count, np.float32)
     seen = np.zeros((count, 2, 4), np.float32)
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
@@ -156,14 +165,15 @@ def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain)
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
             meetings.a[some], meetings.b[some], place, position, rotation, shots.lens, shots.size, small,
-            config.dark_level, config.bright_level, ratio[some], usable[some], seen[some],
+            config.dark_level, config.bright_level, ratio[some], usable[some], seen[some], contrast[some],
         )  # fmt: skip
     usable &= np.asarray(np.isfinite(meetings.ground).all(axis=1))
-    return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable])
+    sigma = np.sqrt(config.ratio_sigma**2 + np.square(config.misplaced * contrast))
+    return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
 
 
 @kernel
-def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen):  # type: ignore[no-untyped-def]
+def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
     rows, columns = small.shape[1], small.shape[2]
     for m in range(len(a)):
         clear = 0
@@ -181,6 +191,11 @@ def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, r
                 top = small[k, i, j, channel] * (1.0 - fx) + small[k, i, j + 1, channel] * fx
                 low = small[k, i + 1, j, channel] * (1.0 - fx) + small[k, i + 1, j + 1, channel] * fx
                 value = top * (1.0 - fy) + low * fy
+                if channel == 1:
+                    falling = float(small[k, i + 1, j + 1, 1]) - float(small[k, i, j, 1])
+                    rising = float(small[k, i, j + 1, 1]) - float(small[k, i + 1, j, 1])
+                    across, down = falling + rising, falling - rising
+                    contrast[m] += 0.5 * np.hypot(across, down) / max(value, 1.0)
                 good = good and value > dark and value < bright
                 ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
             half = 0.5 * size[k, 0]

@@ -5,15 +5,17 @@ Where two frames show the same ground, the logarithm of the ratio of their colou
     log factor = gain of the vehicle + gain of the frame                       (exposure, white balance)
                + polynomial of the place in the picture, one a vehicle          (vignetting)
                + polynomial of the view direction, one a vehicle                (hot spot, haze)
-               + slopes across the picture, one a frame                         (clouds, what is left)
+               + polynomial of the place in the picture, one a frame            (clouds; meadows, water, what is left)
 
-All differences are solved together by robust least squares (Geman-McClure), every unknown held near 0 by a prior, which
-also keeps tones from drifting over a large area. Brightness and hue are solved side by side; hue is held tighter, since
-meadows and shadows differ in it by themselves. The solution of a frame is a quadratic polynomial of the place in the
-picture, which the renderer evaluates at each pixel that it takes.
+Each difference counts by its sigma, which grows where the thumbnails change much from pixel to pixel: even ground
+counts most. All are solved together by robust least squares (Geman-McClure), every unknown held near 0 by a prior,
+which also keeps tones from drifting over a large area. Brightness and hue are solved side by side; hue is held
+tighter, since meadows and shadows differ in it by themselves. The solution of a frame is a quadratic polynomial of the
+place in the picture, which the renderer evaluates at each pixel that it takes.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +34,9 @@ the place in the picture from its centre, half the picture's width being 1."""
 
 _BRIGHTNESS_HUE = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 """Red, green, blue to brightness and two differences of hue, an orthonormal change of axes."""
-_COMMON, _OWN = 11, 3
-"""Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain and two slopes."""
+_COMMON, _OWN = 11, 6
+"""Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain, two slopes, three
+curvatures."""
 
 
 def uniform(gain: Sequence[float] | NDArray[np.floating]) -> Field:
@@ -74,7 +77,7 @@ def estimate_fields(
     some = np.array(known)
     small = np.stack([thumbnails[frames[i].frame.image] for i in known])
     cameras = [frames[i].camera for i in known]
-    colors, area = overlap_colors(cameras, shots.take(some), vehicle[some], small, terrain)
+    colors, area = overlap_colors(cameras, shots.take(some), small, terrain)
     fixed = np.array([frames[i].frame.image in held for i in known], bool)
     if fixed.any():
         colors = _with_held(colors, [held.get(frames[i].frame.image) for i in known])
@@ -100,21 +103,22 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
         basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
         factor = np.einsum("mk,mck->mc", basis, coefficients[colors.frame[:, side]])
         ratio += sign * np.log(np.maximum(factor, 0.1))
-    return OverlapColors(colors.frame, ratio.astype(np.float32), colors.place)
+    return replace(colors, ratio=ratio.astype(np.float32))
 
 
 def _solve(
     colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Unknowns of vehicles (V, 11, 3) and of frames (N, 3, 3), by conjugate gradients within reweighting rounds."""
+    """Unknowns of vehicles (V, 11, 3) and of frames (N, 6, 3), by conjugate gradients within reweighting rounds."""
     config = active().radiometry
     prior_v = np.array([config.vehicle_sigma, *config.lens_sigmas, *config.view_sigmas]) ** -2.0
-    prior_f = np.array([config.picture_sigma, config.slope_sigma, config.slope_sigma]) ** -2.0
+    prior_f = np.array([config.picture_sigma, *[config.slope_sigma] * 2, *[config.curve_sigma] * 3]) ** -2.0
     prior = np.concatenate([np.tile(prior_v, vehicles), np.tile(prior_f, len(vehicle))])[:, None] * np.ones(3)
     of_hue = np.ones(len(prior), bool)
     of_hue[: vehicles * _COMMON : _COMMON] = False
     prior[of_hue, 1:] /= config.hue_share**2
     measured = colors.ratio @ _BRIGHTNESS_HUE.T
+    precision = np.square(colors.sigma.astype(np.float64)) ** -1
     x = np.zeros((len(prior), 3))
     free = (~fixed).astype(np.float64)
     sample = (colors.frame, colors.place, vehicle, free, vehicles)
@@ -131,8 +135,8 @@ def _solve(
 
     for _ in range(config.reweightings):
         residual = differences(x) + measured
-        error2 = np.square(residual).mean(1) / config.ratio_sigma**2
-        weight = ((1.0 + error2 / config.robust_sigmas**2) ** -2 / config.ratio_sigma**2)[:, None]
+        error2 = np.square(residual).mean(1) * precision
+        weight = ((1.0 + error2 / config.robust_sigmas**2) ** -2 * precision)[:, None]
         diagonal = np.zeros(len(prior))
         _diagonal(*sample, weight[:, 0], diagonal)
         scale = 1.0 / (diagonal[:, None] + prior)
@@ -159,12 +163,13 @@ def _solve(
 
 @kernel
 def _bases(place, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
-    """Factors of a side's unknowns: (11,) of the vehicle, (3,) of the frame."""
+    """Factors of a side's unknowns: (11,) of the vehicle, (6,) of the frame."""
     x, y, e, n = place[0], place[1], place[2], place[3]
     of_vehicle[0], of_vehicle[1], of_vehicle[2] = 1.0, x, y
     of_vehicle[3], of_vehicle[4], of_vehicle[5] = x * x, x * y, y * y
     of_vehicle[6], of_vehicle[7], of_vehicle[8], of_vehicle[9], of_vehicle[10] = e, n, e * e, e * n, n * n
     of_frame[0], of_frame[1], of_frame[2] = 1.0, x, y
+    of_frame[3], of_frame[4], of_frame[5] = x * x, x * y, y * y
 
 
 @kernel
@@ -233,7 +238,7 @@ def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
 
 
 def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shots: Shots, terrain: Terrain) -> Array:
-    """Log factors (N, nodes, 3) of frames with their vehicles' unknowns (N, 11, 3) and their own (N, 3, 3)."""
+    """Log factors (N, nodes, 3) of frames with their vehicles' unknowns (N, 11, 3) and their own (N, 6, 3)."""
     half = 0.5 * shots.size[:, :1]
     u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5
     rays = np.stack([(u - shots.lens[:, [U]]) / shots.lens[:, [F]], (v - shots.lens[:, [V]]) / shots.lens[:, [F]]], -1)
@@ -242,7 +247,7 @@ def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shot
     e, n = np.moveaxis(rays[..., :2] / down, -1, 0)
     one = np.ones_like(y)
     common = np.stack([one, x, y, x * x, x * y, y * y, e, n, e * e, e * n, n * n], -1)
-    own = np.stack([one, x, y], -1)
+    own = np.stack([one, x, y, x * x, x * y, y * y], -1)
     return np.asarray(common @ of_vehicle + own @ of_frame)
 
 

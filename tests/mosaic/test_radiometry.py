@@ -112,6 +112,19 @@ def test_a_picture_that_is_darker_on_one_side_is_evened_out():
     assert -0.15 < slopes[odd] - others < -0.03
 
 
+def test_a_picture_with_a_bright_middle_is_evened_out():
+    flight = scene.survey(3, tilt_deg=1.0)
+    y, x = (np.indices((120, 160)) - np.array([59.5, 79.5])[:, None, None]) / 80.0
+    small = thumbnails_of(flight)
+    odd = flight.frames[len(flight.frames) // 2].frame.image
+    bright = flight.pictures[odd] * np.exp(-0.12 * (x**2 + y**2))[..., None]
+    small[odd] = thumbnail(bright.astype(np.uint8))
+    gains = estimate_fields(flight.frames, small, FLAT)
+    rise = {name: float(np.log(at_corner(g) / g[:, 0]).mean()) for name, g in gains.items()}
+    others = np.median([value for name, value in rise.items() if name != odd])
+    assert 0.2 * 0.12 * 0.74 < rise[odd] - others < 0.12 * 0.74
+
+
 def test_frame_without_thumbnail_gets_its_vehicles_gain():
     flight, _ = uneven_flight()
     small = thumbnails_of(flight)
