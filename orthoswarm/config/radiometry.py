@@ -13,7 +13,7 @@ class RadiometryConfig:
     kinds of ground, once solved: half within 0.05, 90 % within 0.19; tried: 0.08 and 0.15)."""
     misplaced: float = 0.7
     """Displacement of the two thumbnails against each other, in their pixels: a ratio's sigma grows by it times the
-    contrast from pixel to pixel (of 0.35 and 0.7 the better on two lawns)."""
+    contrast from pixel to pixel (0.35 and 0.7 tried)."""
     robust_sigmas: float = 3.0
     """Scale of the Geman-McClure kernel on these ratios, sigmas (chosen; not measured)."""
     dark_level: float = 8.0
@@ -26,7 +26,7 @@ class RadiometryConfig:
     ratios_per_picture: int = 48
     """Most ratios a picture at seams and beside them, those with neighbours not counted (chosen for cost)."""
     neighbours: int = 6
-    """Nearest pictures, of any vehicle, with which each is compared on a grid; 6 leaves lower steps than 2, 3."""
+    """Nearest pictures, of any vehicle, with which each is compared on a grid; with 2 or 3 a lawn's steps stay."""
     label_cells: int = 64
     """Cells across a picture on which the seams for this comparison are found (chosen for cost)."""
     label_most_cells: int = 2_000_000
@@ -43,7 +43,7 @@ class RadiometryConfig:
     view_sigmas: tuple[float, float, float, float, float] = (0.15, 0.15, 0.10, 0.10, 0.10)
     """e, n, e^2, en, n^2 of the view direction's tangents; chosen (two suburbs: 0.14 to 0.22 a tangent found)."""
     slope_sigma: float = 0.07
-    """A picture's own slopes; of 0.04, 0.05, 0.07 and 0.1 the one with the lowest steps on two lawns."""
+    """A picture's own slopes; chosen by steps on even ground of three flights, other values changed with it."""
     curve_sigma: float = 0.06
     """A picture's own curvatures, x^2, xy, y^2; chosen with the slopes."""
     hue_share: float = 0.35
