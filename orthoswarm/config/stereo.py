@@ -13,8 +13,9 @@ class StereoConfig:
     city had ground heights within (68 %) 1.4, 0.64, 0.49 and 0.21 m at 0.13, 0.25, 0.4 and 0.7 at 0.67 m a pixel; the
     higher, the more lies hidden behind roofs."""
     least_base: float = 0.12
+    """Pairs with a smaller ratio tell little of heights (chosen)."""
     most_base: float = 0.9
-    """Pairs with a smaller ratio say little, with a larger one the two views differ too much to be matched (chosen)."""
+    """With a larger ratio the two views differ too much to be matched (chosen)."""
     least_overlap: float = 0.4
     """Share of a picture's footprint that the other one sees, too, at least (chosen)."""
     most_turn_deg: float = 40.0
@@ -39,9 +40,9 @@ class StereoConfig:
     depth_m: float = 10.0
     """How far below the terrain heights are sought, metres (chosen)."""
     tallest_m: float = 60.0
+    """How far above the terrain heights are sought, metres (chosen: a tower block)."""
     tallest_heights: float = 0.45
-    """How far above the terrain heights are sought: metres, or the share of the camera's height if that is less
-    (chosen: a tower block)."""
+    """The same as a share of the camera's height above the ground; the lower of both counts (chosen)."""
 
     # One surface of all pairs
     cell_pixels: float = 2.0
