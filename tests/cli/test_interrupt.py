@@ -13,6 +13,14 @@ from gcs_plugin.cli.interrupt import safe_interrupts
 COMPILER = "def compile(raise_signal, sleep):\n    raise_signal()\n    sleep(0.2)\n    return 'compiled'\n"
 
 
+@pytest.fixture(autouse=True)
+def _as_at_a_terminal():
+    """What runs behind a shell ignores interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def _interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
 
