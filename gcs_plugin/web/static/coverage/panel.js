@@ -45,7 +45,8 @@ export function coveragePanel() {
   const drawGaps = keyedList(list, () => { const row = make("li", {}, button("", () => zoom(row.gap))); return row; }, (row, gap) => {
     row.gap = gap;
     const cause = [gap.cause, gap.detail && `(${gap.detail})`, gap.vehicle && nameOf(gap.vehicle)].filter(Boolean).join(" ");
-    setText(row.firstChild, `${t("coverage.gap", { size: units.area(gap.area_m2), cause })}, ${t("coverage.sure", { sure: percent(gap.confidence) })}`);
+    const sure = gap.confidence < 0.995 ? `, ${t("coverage.sure", { sure: units.percent(gap.confidence) })}` : "";
+    setText(row.firstChild, t("coverage.gap", { size: units.area(gap.area_m2), cause }) + sure);
     setAttribute(row, "data-poor", gap.detail ? "true" : "false");
   });
   const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.n > 1 ? t("coverage.missing.first", { image: group.image }) : group.image })));
