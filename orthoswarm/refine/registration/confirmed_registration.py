@@ -47,15 +47,16 @@ def confirmed(
     """
     before = flight.adjustment.copy()
     config = active().registration
-    limit = np.log10(config.false_matches)
+    limit, tests = np.log10(config.false_matches), 0
     for fit in fits:
         shift_cameras(flight, fit.correction)
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         matches = first_ties(flight, surface, ground)
-        chance = _false_matches_log10(flight, matches, config.tie_half_m)
+        tests += 1  # each test is one more chance to agree
+        chance = _false_matches_log10(flight, matches, config.tie_half_m) + np.log10(tests)
         if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
-            half_m = config.evidence_small_half_m
-            chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m)
+            half_m, tests = config.evidence_small_half_m, tests + 1
+            chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
         if chance <= limit:
             return ConfirmedFit(fit, ground, matches, float(10.0**chance))
         flight.adjustment = before.copy()
