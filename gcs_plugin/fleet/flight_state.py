@@ -116,7 +116,8 @@ def _word(vehicle: Observed) -> Word:
         return _on_mission(vehicle)
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.HOLDING
-    if mode in _HOLDS and vehicle.detector.phase is Phase.SUSPENDED:
+    # active as well: at a pause and a resume PX4's mission state and mode arrive up to a second apart
+    if mode in _HOLDS and vehicle.detector.phase in (Phase.SUSPENDED, Phase.ACTIVE):
         return Word.PAUSED
     return Word.FLYING
 

@@ -81,6 +81,11 @@ RETURNS = ["returning", "landing"]
             ["started", "suspended", "resumed", "complete"],
             [*FLOWN, "paused", "on mission", "complete"],
         ),
+        (
+            "px4_pause",
+            ["started", "suspended", "resumed", "complete"],
+            [*FLOWN, "paused", "on mission", *RETURNS, "complete"],
+        ),
         ("px4_rtl", ["started", "complete"], [*FLOWN, *RETURNS, "complete"]),
         ("px4_land", ["started", "complete"], [*FLOWN, "landing", "complete"]),
         ("px4_waypoint", ["started", "complete"], [*FLOWN, "holding", *RETURNS, "complete"]),
@@ -98,20 +103,23 @@ def test_a_real_flight_in_words_and_events(name, events, words):
     assert kinds == events
     rest = iter(seen)
     assert all(word in rest for word in words), seen  # in this order
-    assert "lost" not in seen
-    if name not in ("arducopter_pause", "arducopter_operator_rtl"):  # the latter waits in LOITER_UNLIM
+    assert "lost" not in seen and "flying" not in seen, seen
+    if name not in ("arducopter_pause", "px4_pause", "arducopter_operator_rtl"):  # the latter waits in LOITER_UNLIM
         assert "paused" not in seen, seen
 
 
 @pytest.mark.parametrize(
     ("name", "words", "text"),
     [
+        ("arducopter_geofence", [*FLOWN, *RETURNS, "on ground"], "Circle fence breached"),
+        ("arducopter_battery", [*FLOWN, *RETURNS, "on ground"], "Battery Failsafe"),
+        ("arducopter_gps_loss", [*FLOWN, "landing", "on ground"], "EKF Failsafe: changed to LAND Mode"),
         ("px4_geofence", [*FLOWN, *RETURNS, "on ground"], "Geofence: exceeding maximum distance to Home"),
         ("px4_battery", [*FLOWN, *RETURNS, "on ground"], "Critical battery"),
         ("px4_gps_loss", [*FLOWN, "landing", "on ground"], "Failsafe activated"),
     ],
 )
-def test_a_failsafe_of_px4_ends_the_mission_once_without_completing_it(name, words, text):
+def test_a_failsafe_ends_the_mission_once_without_completing_it(name, words, text):
     """PX4 calls the mission active again between its landing and its disarming: nothing was resumed."""
     seen = []
     vehicle, kinds = replay(name, lambda v: seen.append(flight_state(v).word.value))
