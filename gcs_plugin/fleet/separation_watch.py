@@ -95,7 +95,7 @@ def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = n
     """An alarm in words; `name` gives the names of vehicles."""
     one, other = name(near.one), name(near.other)
     return (
-        f"{one} and {other} are {near.metres:.0f} m apart and {near.height_m:.0f} m in height "
+        f"{one} and {other} are {near.metres:.1f} m apart and {near.height_m:.1f} m in height "
         f"(they should keep {watch.distance_m:.0f} m, or {watch.height_m:.0f} m in height): pause {other}"
     )
 

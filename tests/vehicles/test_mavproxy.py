@@ -345,7 +345,7 @@ def test_what_goes_wrong_is_said_once():
     answers.rows[0]["takeoff"] = {"failed": "refuses to arm"}
     answers.rows[1]["takeoff"] = {"failed": "held on the ground, because v1 did not take off"}
     assert commands.news() == ["v1: refuses to arm", "falcon: held on the ground, because v1 did not take off"]
-    near = "v1 and v2 are 6 m apart and 0 m in height (they should keep 10 m, or 5 m in height): pause v2"
+    near = "v1 and v2 are 6.2 m apart and 0.0 m in height (they should keep 10 m, or 5 m in height): pause v2"
     for row in answers.rows:
         row["alarm"] = near
     assert commands.news() == [near]

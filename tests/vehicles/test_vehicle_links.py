@@ -174,7 +174,7 @@ def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_link
     assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
     watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)})
     for system in (1, 2):
-        assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4 m apart and 1 m in height")
+        assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
 
 
 def adsb(number, lat_deg, *, flags=0xFF, tslc=0, callsign=b"SWR12"):

@@ -4,6 +4,7 @@ The vehicle's own failsafes act; the station has to show what happens, say once 
 completing, and never call it complete. Each test prints its figures (`-rP`).
 """
 
+import contextlib
 import math
 import struct
 import threading
@@ -20,7 +21,7 @@ from gcs_plugin.mission.mission_files import MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from tests.kit.daemon_kit import start, stop
 from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site
-from tests.vehicles.autopilots.test_twin_camera import small_area
+from tests.vehicles.autopilots.test_twin_camera import free_port, small_area
 
 pytestmark = pytest.mark.sitl
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
@@ -158,8 +159,49 @@ def test_a_mission_is_flown_in_wind_of_twelve_metres_a_second(site, parameters):
     print(f"complete after {time.monotonic() - began:.0f} s, leaning up to {math.degrees(max(leans)):.0f} degrees")
 
 
+@contextlib.contextmanager
+def radio(address):
+    """The address of a link that the autopilot feeds as it feeds a radio of 57,600 baud.
+
+    PX4 sends 18 kB/s on the links of its simulation. Its shell opens one on which it sends 57,600 / 20 bytes a second.
+    ArduPilot sends what it is asked for.
+    """
+    if not address.startswith("udp"):
+        yield address
+        return
+    port = free_port()
+    place = Real(address)
+    try:
+        Site(place)
+        shell(place, f"mavlink start -u {port} -o {port + 1} -b 57600")
+        yield f"udpin:127.0.0.1:{port + 1}"
+    finally:
+        shell(place, f"mavlink stop -u {port}")
+        place.close()
+
+
+def shell(place, line):
+    """Type a line into the shell of a PX4 (SERIAL_CONTROL)."""
+    data, said = line.encode() + b"\n", []
+    assert len(data) <= 70
+    place.fleet.subscribe(
+        lambda vehicle, message, utc: said.append(bytes(message.data[: message.count])), "SERIAL_CONTROL"
+    )
+    flags = dialect.SERIAL_CONTROL_FLAG_RESPOND | dialect.SERIAL_CONTROL_FLAG_EXCLUSIVE
+    typed = dialect.MAVLink_serial_control_message(
+        dialect.SERIAL_CONTROL_DEV_SHELL, flags, 0, 0, len(data), list(data.ljust(70, b"\0"))
+    )
+    place.fleet._dialogues.send(min(place.fleet.vehicles), [typed])
+    assert place.until(lambda: b"mavlink]" in b"".join(said), 20.0), said
+
+
 @pytest.mark.parametrize("address", REAL)
 def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(address):
+    with radio(address) as slow:
+        fly_over_a_radio(slow)
+
+
+def fly_over_a_radio(address):
     place = Real(address, [Faults(loss=0.05, delay_s=(0.02, 0.08), bytes_s=5760.0, seed=seed) for seed in (1, 2)])
     try:
         site = Site(place)
