@@ -5,9 +5,10 @@
 
 For each seam between two photos (`seamlines.gpkg`) the mean brightness of strips to either side is compared; strips are
 1.5 m wide, seams shorter than 5 m do not count. Printed, for all ground and for even ground, in grey levels of 255 and
-weighed by length: median and 95 % of the absolute step. Sharpness is the mean absolute Laplacian away from seams.
-Against the truth: root mean square and 95 % of the log ratio of means over 10 m, less its median. The picture shows
-means over 3 m, less those over 60 m, times 10.
+weighed by length: median and 95 % of the absolute step, and the same across lines of the same shapes 6 m beside the
+seams: so much the ground itself changes, and a seam that steps no more cannot be told from it. Sharpness is the mean
+absolute Laplacian away from seams. Against the truth: root mean square and 95 % of the log ratio of means over 10 m,
+less its median. The picture shows means over 3 m, less those over 60 m, times 10.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from rasterio.warp import transform_geom
 from shapely import from_wkb
 from shapely.geometry import mapping
 
-_STRIP_M, _SEAM_M, _LOW_M, _BLOCK_M, _WIDE_M = 1.5, 5.0, 3.0, 10.0, 60.0
+_STRIP_M, _SEAM_M, _BESIDE_M, _LOW_M, _BLOCK_M, _WIDE_M = 1.5, 5.0, 6.0, 3.0, 10.0, 60.0
 _EVEN = 8.0
 """Ground is even where the standard deviation across a strip is less, in grey levels: steps show there."""
 _PIXEL_M = 0.25
@@ -41,13 +42,18 @@ def main() -> None:
     rgb, mask, labels, transform, crs = _read(args.out)
     pixel = transform.a
     for ground, limit in (("all ground", np.inf), ("even ground", _EVEN)):
-        step, length = seam_steps(rgb.mean(2), np.where(mask, labels, 0), pixel, limit)
-        if not len(step):
+        grey, drawn = rgb.mean(2), np.where(mask, labels, 0)
+        at = [seam_steps(grey, drawn, pixel, limit)]
+        if not len(at[0][0]):
             continue
-        order = np.argsort(step)
-        share = np.cumsum(length[order]) / length.sum()
-        middle, most = (step[order[np.searchsorted(share, q)]] for q in (0.5, 0.95))
-        print(f"{ground}: steps of {len(step)} seams: median {middle:.2f}, 95 % {most:.2f} grey levels")
+        by = round(_BESIDE_M / pixel)
+        shifts = ((0, by), (0, -by), (by, 0), (-by, 0))
+        beside = [seam_steps(grey, np.where(mask, np.roll(drawn, s, (0, 1)), 0), pixel, limit) for s in shifts]
+        (middle, most), (plain, plain_most) = _quantiles(at), _quantiles(beside)
+        print(
+            f"{ground}: steps of {len(at[0][0])} seams: median {middle:.2f}, 95 % {most:.2f} grey levels"
+            f" (beside the seams {plain:.2f}, {plain_most:.2f})"
+        )
     print(f"sharpness {sharpness(rgb.mean(2), mask, labels):.2f}")
     if args.truth:
         with (
@@ -131,6 +137,14 @@ def _read(out):
     shapes = [(transform_geom(meta["crs"], crs, mapping(from_wkb(wkb))), k + 1) for k, wkb in enumerate(outlines)]
     labels = rasterize(shapes, out_shape=(height, width), transform=transform, dtype=np.int32)
     return np.moveaxis(image[:3], 0, 2).astype(np.float32), image[3] == 255, labels, transform, crs
+
+
+def _quantiles(found):
+    """Median and 95 % of steps, weighed by length; found: pairs of steps and lengths."""
+    step, length = (np.concatenate(parts) for parts in zip(*found))
+    order = np.argsort(step)
+    share = np.cumsum(length[order]) / length.sum()
+    return [step[order[min(np.searchsorted(share, q), len(order) - 1)]] for q in (0.5, 0.95)]
 
 
 def _means(values, mask, side):

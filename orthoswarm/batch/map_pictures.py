@@ -164,7 +164,7 @@ def draw(
 
 def _seams(run: RunContext, state: RunState) -> Seams | None:
     """How the seams of the orthoimage are chosen."""
-    return None if state.previews is None else Seams(state.previews, run.options.blend)
+    return None if state.previews is None else Seams(state.previews, run.options.blend, level=run.options.gains)
 
 
 def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState) -> Canvas:

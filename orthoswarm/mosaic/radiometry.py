@@ -184,13 +184,16 @@ def _forward(frame, place, vehicle, free, vehicles, values, out):  # type: ignor
             if sign == 0.0:
                 continue
             _bases(place[m, side], of_vehicle, of_frame)
-            for channel in range(3):
-                total = 0.0
-                for q in range(_COMMON):
-                    total += of_vehicle[q] * values[_COMMON * vehicle[k] + q, channel]
-                for q in range(_OWN):
-                    total += of_frame[q] * values[_COMMON * vehicles + _OWN * k + q, channel]
-                out[m, channel] += sign * total
+            first = _COMMON * vehicle[k]
+            for q in range(_COMMON):
+                factor = sign * of_vehicle[q]
+                for channel in range(3):
+                    out[m, channel] += factor * values[first + q, channel]
+            first = _COMMON * vehicles + _OWN * k
+            for q in range(_OWN):
+                factor = sign * of_frame[q]
+                for channel in range(3):
+                    out[m, channel] += factor * values[first + q, channel]
 
 
 @kernel
@@ -204,12 +207,16 @@ def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ig
             if sign == 0.0:
                 continue
             _bases(place[m, side], of_vehicle, of_frame)
-            for channel in range(3):
-                value = sign * weighted[m, channel]
-                for q in range(_COMMON):
-                    out[_COMMON * vehicle[k] + q, channel] += of_vehicle[q] * value
-                for q in range(_OWN):
-                    out[_COMMON * vehicles + _OWN * k + q, channel] += of_frame[q] * value
+            first = _COMMON * vehicle[k]
+            for q in range(_COMMON):
+                factor = sign * of_vehicle[q]
+                for channel in range(3):
+                    out[first + q, channel] += factor * weighted[m, channel]
+            first = _COMMON * vehicles + _OWN * k
+            for q in range(_OWN):
+                factor = sign * of_frame[q]
+                for channel in range(3):
+                    out[first + q, channel] += factor * weighted[m, channel]
 
 
 @kernel

@@ -21,6 +21,7 @@ from orthoswarm.mosaic.kernels.pixel_sampling import WEIGHTS, sample
 from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
+from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_colors
 from orthoswarm.mosaic.seams.previews import write_preview
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
@@ -178,11 +179,47 @@ def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
     return [(int(mark) - 1, Window.of(task.key, box)) for mark, box in zip(wanted, boxes)]
 
 
-def mix_pass(task: FeatherTask) -> None:
-    """Mix the pictures near a tile's seams, once all are drawn."""
+@dataclass(frozen=True, slots=True)
+class ColorTask:
+    """Sum the colours of a tile. place: where. key: the tile. cell_px: side of the cells."""
+
+    place: Place
+    key: Key
+    cell_px: int
+
+
+def color_pass(task: ColorTask) -> tuple[Key, TileColors]:
+    """What a tile shows by cell, and at its seams, once all are drawn."""
+    tile = task.place.store().get(task.key)
+    assert tile is not None
+    return task.key, tile_colors(task.key, tile, task.place.other_pictures().get(task.key), task.cell_px)
+
+
+@dataclass(frozen=True, slots=True)
+class FinishTask:
+    """Level and mix a tile.
+
+    Attributes:
+        place: where. key: the tile. factors: of its pictures, None to leave them.
+        width_px: how far from a seam pictures are mixed, 0 not to.
+    """
+
+    place: Place
+    key: Key
+    factors: TileFactors | None
+    width_px: int
+
+
+def finish_pass(task: FinishTask) -> None:
+    """Level the pictures of a tile and mix them near its seams, once all are drawn."""
     store = task.place.store()
     tile, second = store.get(task.key), task.place.other_pictures().get(task.key)
-    if tile is not None and second is not None:
+    assert tile is not None
+    if task.factors is not None:
+        for drawn in (tile, second):
+            if drawn is not None:
+                task.factors.apply(drawn)
+    if second is not None and task.width_px:
         other, share = transition(labels_around(store, task.key, task.width_px), task.width_px)
         mix(tile.rgba, second.plane, second.rgba, other, share)
 

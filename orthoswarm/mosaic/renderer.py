@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,9 @@ from orthoswarm.mosaic.kernels.downsampling import reduction
 from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
 from orthoswarm.mosaic.radiometry import Field, uniform
 from orthoswarm.mosaic.render_passes import (
+    ColorTask,
     FeatherTask,
+    FinishTask,
     LabelTask,
     Place,
     PreviewTask,
@@ -40,12 +43,14 @@ from orthoswarm.mosaic.render_passes import (
     Shot,
     TaskLayer,
     Window,
+    color_pass,
     feather_pass,
+    finish_pass,
     label_pass,
-    mix_pass,
     preview_pass,
     sample_pass,
 )
+from orthoswarm.mosaic.seams.leveling import Leveling, cell_size
 from orthoswarm.mosaic.seams.previews import PreviewFile, unwritten
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, cell_size_px
 from orthoswarm.mosaic.visible_ground import by_tile, coverage
@@ -99,10 +104,13 @@ class Seams:
     Attributes:
         previews: of all its frames; those that are missing are made first.
         blend: "seam" mixes the two pictures over a few pixels at each seam, "none" takes every pixel from one.
+        level: take out the steps of tone that are left at the seams, see seams.leveling; over all tiles that are drawn,
+            so not together with `Layer.bounds`.
     """
 
     previews: PreviewFile
     blend: Blend = "seam"
+    level: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,7 +189,7 @@ def render_layers(
         jobs = [_Job(layer, folder, run) for layer, folder in zip(layers, staging, strict=True)]
         _draw(jobs, read, run, progress)
         for job in jobs:
-            job.mix()
+            job.finish()
             job.adopt()
         return [job.stats() for job in jobs]
     finally:
@@ -317,19 +325,37 @@ class _Job:
         self.windows = _by_frame(result for turn in turns for result in self.run(label_pass, tasks(turn)))
         for i, own in self.windows.items():
             self.pixels[i] += sum(w.pixels for w in own)
-        first = self.seams is not None and self.seams.blend == "seam" and not len(again)
+        first = self.seams is not None and (self.seams.blend == "seam" or self.seams.level) and not len(again)
         self.near_seams = _by_frame(self.run(feather_pass, self.feather_tasks())) if first else {}
 
     def feather_tasks(self) -> Iterator[FeatherTask]:
         width = active().mosaic.feather_px
         yield from (FeatherTask(self.place, key, width) for key in self.place.store().existing())
 
-    def mix(self) -> None:
-        """Mix pictures at the seams, where wanted."""
-        if self.seams is not None and self.seams.blend == "seam":
-            for _ in self.run(mix_pass, self.feather_tasks()):
-                pass
-            shutil.rmtree(self.place.other_pictures().folder, ignore_errors=True)
+    def finish(self) -> None:
+        """Level the pictures at their seams, and mix them there, where wanted."""
+        if self.seams is None or not (self.seams.level or self.seams.blend == "seam"):
+            return
+        keys = list(self.place.store().existing())
+        leveling = self.leveling(keys) if self.seams.level else None
+        width = active().mosaic.feather_px if self.seams.blend == "seam" else 0
+        tasks = (FinishTask(self.place, k, None if leveling is None else leveling.of_tile(k), width) for k in keys)
+        for _ in self.run(finish_pass, tasks):
+            pass
+        shutil.rmtree(self.place.other_pictures().folder, ignore_errors=True)
+
+    def leveling(self, keys: Sequence[Key]) -> Leveling:
+        """The steps at the seams of all tiles, solved together."""
+        grid, tile_px = self.canvas.grid, self.place.tile_px
+        wide = [
+            f.camera.lens.width / f.camera.lens.focal_px * float(f.camera.position[2] - z)
+            for f, z, good in zip(self.frames, self.ground, self.usable)
+            if good
+        ]
+        cells = cell_size(float(np.median(wide or [0.0])) / grid.gsd_m, tile_px, grid.width * grid.height)
+        found = self.run(color_pass, (ColorTask(self.place, key, cells.px) for key in keys))
+        colors = [color for _, color in sorted(found, key=itemgetter(0))]
+        return Leveling(colors, self.canvas.tile_cols * cells.across_tile, cells)
 
     def make_previews(self, read: Read) -> None:
         """Previews of the usable frames that have none."""

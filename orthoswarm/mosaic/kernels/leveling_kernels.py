@@ -1,0 +1,153 @@
+"""The compiled parts of seam leveling: what a tile's seams show of both pictures, the solution, and its application."""
+
+import numpy as np
+
+from orthoswarm.compute.jit import kernel
+
+SLOTS = 8
+"""Most pictures, and pairs of them, in a cell; any beyond are left as they are."""
+OWN = 4
+"""What is summed of a picture in a cell: pixels, red, green, blue."""
+BOTH = 9
+"""What is summed of two pictures at the seams in a cell: pixels, three colours of the first, three of the second, log
+ratio of their brightness and its square."""
+
+
+@kernel
+def _slot(labels, wanted):  # type: ignore[no-untyped-def]
+    """Place of a label in a list that ends with zeros; it is added if there is room, else -1."""
+    for k in range(len(labels)):
+        if labels[k] == wanted:
+            return k
+        if labels[k] == 0:
+            labels[k] = wanted
+            return k
+    return -1
+
+
+@kernel
+def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, own, pairs, both):  # type: ignore[no-untyped-def]
+    """Sum the colours of a tile's pictures by cell, and those of two pictures at the same ground near seams.
+
+    Args:
+        rgba: uint8 (T, T, 4); label: int32 (T, T), whose colours these are, 0 = none.
+        other_rgba: uint8 (T, T, 4) and other: int32 (T, T), the same of the other picture near seams.
+        cell: side of the cells, pixels. dark, bright: levels outside of which a colour is clipped.
+        labels: int32 (R, C, SLOTS), own: float64 (R, C, SLOTS, OWN); pairs: int32 (R, C, SLOTS, 2), the lesser label
+            first, both: float64 (R, C, SLOTS, BOTH): zeros, are filled.
+    """
+    for r in range(label.shape[0]):
+        i = r // cell
+        last, last_j, at = -1, -1, -1
+        for c in range(label.shape[1]):
+            a, b, j = label[r, c], other[r, c], c // cell
+            if a == 0 or rgba[r, c, 3] == 0:
+                continue
+            if a != last or j != last_j:
+                at = _slot(labels[i, j], a)
+                last, last_j = a, j
+            if at >= 0:
+                own[i, j, at, 0] += 1.0
+                for channel in range(3):
+                    own[i, j, at, 1 + channel] += rgba[r, c, channel]
+            if b == 0 or b == a or other_rgba[r, c, 3] == 0:
+                continue
+            _slot(labels[i, j], b)
+            clear = True
+            for channel in range(3):
+                clear = clear and dark < rgba[r, c, channel] < bright and dark < other_rgba[r, c, channel] < bright
+            if not clear:
+                continue
+            less, more = min(a, b), max(a, b)
+            for k in range(SLOTS):
+                if pairs[i, j, k, 0] == 0:
+                    pairs[i, j, k, 0], pairs[i, j, k, 1] = less, more
+                if pairs[i, j, k, 0] == less and pairs[i, j, k, 1] == more:
+                    swapped = a > b
+                    one, two = 0.0, 0.0
+                    both[i, j, k, 0] += 1.0
+                    for channel in range(3):
+                        here, there = float(rgba[r, c, channel]), float(other_rgba[r, c, channel])
+                        if swapped:
+                            here, there = there, here
+                        both[i, j, k, 1 + channel] += here
+                        both[i, j, k, 4 + channel] += there
+                        one += here
+                        two += there
+                    log = np.log(one / two)
+                    both[i, j, k, 7] += log
+                    both[i, j, k, 8] += log * log
+                    break
+
+
+@kernel
+def apply_factors(rgba, label, cell, labels, factors):  # type: ignore[no-untyped-def]
+    """Multiply a tile's colours by their pictures' factors, bilinear between the centres of cells.
+
+    Args:
+        rgba: uint8 (T, T, 4), changed in place. label: int32 (T, T). cell: side of the cells, pixels.
+        labels: int32 (R + 2, C + 2, SLOTS), of the cells of the tile and one beyond each border.
+        factors: float32 (R + 2, C + 2, SLOTS, 3), and their factors.
+    """
+    half = np.float32(0.5)
+    corner = np.ones((2, 2, 3), np.float32)
+    left, rise = np.ones(3, np.float32), np.zeros(3, np.float32)
+    for r in range(label.shape[0]):
+        y = (r + 0.5) / cell + 0.5
+        i = int(y)
+        fy = np.float32(y - i)
+        last, last_j = 0, -1
+        for c in range(label.shape[1]):
+            a = label[r, c]
+            if a == 0 or rgba[r, c, 3] == 0:
+                continue
+            x = (c + 0.5) / cell + 0.5
+            j = int(x)
+            if a != last or j != last_j:
+                last, last_j = a, j
+                _corners(labels, factors, i, j, a, corner)
+                for channel in range(3):
+                    west = corner[0, 0, channel] + fy * (corner[1, 0, channel] - corner[0, 0, channel])
+                    east = corner[0, 1, channel] + fy * (corner[1, 1, channel] - corner[0, 1, channel])
+                    left[channel], rise[channel] = west, east - west
+            fx = np.float32(x - j)
+            for channel in range(3):
+                value = np.float32(rgba[r, c, channel]) * (left[channel] + fx * rise[channel]) + half
+                rgba[r, c, channel] = np.uint8(min(value, np.float32(255.0)))
+
+
+@kernel
+def _corners(labels, factors, i, j, wanted, corner):  # type: ignore[no-untyped-def]
+    """A picture's factors in four cells; where it has none, the mean of those that it has."""
+    found = 0
+    total = np.zeros(3, np.float32)
+    has = np.zeros((2, 2), np.bool_)
+    for p in range(2):
+        for q in range(2):
+            for k in range(SLOTS):
+                if labels[i + p, j + q, k] == wanted:
+                    has[p, q] = True
+                    found += 1
+                    for channel in range(3):
+                        corner[p, q, channel] = factors[i + p, j + q, k, channel]
+                        total[channel] += corner[p, q, channel]
+                    break
+    for p in range(2):
+        for q in range(2):
+            if not has[p, q]:
+                for channel in range(3):
+                    corner[p, q, channel] = total[channel] / found if found else 1.0
+
+
+@kernel
+def laplacian(first, second, weight, anchor, x, out):  # type: ignore[no-untyped-def]
+    """The normal matrix of differences and anchors times x, float64 (M, 3)."""
+    for m in range(len(x)):
+        for channel in range(3):
+            out[m, channel] = anchor[m] * x[m, channel]
+    for e in range(len(first)):
+        i, j, w = first[e], second[e], weight[e]
+        for channel in range(3):
+            d = w * (x[i, channel] - x[j, channel])
+            out[i, channel] += d
+            out[j, channel] -= d

@@ -1,0 +1,205 @@
+"""Steps of tone that are left at seams are taken out: a smooth correction of each picture where it is drawn.
+
+Seam leveling (Lempitsky and Ivanov 2007; Waechter, Moehrle and Goesele 2014). The unknowns are the logarithms of
+factors of red, green and blue for each picture in each cell of the map where it is drawn. Three kinds of equations are
+solved together by least squares:
+
+    at a seam              factor of one picture - factor of the other = - log ratio of their colours at the same ground
+    inside a picture       difference of neighbouring cells = 0
+    everywhere             factor = 0, weakly, so that nothing drifts
+
+The ratios are those of the finished seams at full resolution, since near a seam both pictures are drawn. A ratio counts
+by its sigma, which grows with the spread of the ratio from pixel to pixel: on lawns, water and roads the step
+vanishes; roofs and crowns, where the two pictures do not fit, hardly count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.canvas.tile_store import Key, Tile
+from orthoswarm.config import active
+from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, OWN, SLOTS, apply_factors, laplacian, sum_colors
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class CellSize:
+    """The cells of a map: side in pixels, a divisor of the tiles' side, and cells across a picture and a tile."""
+
+    px: int
+    across_picture: float
+    across_tile: int
+
+
+def cell_size(picture_px: float, tile_px: int, map_px: int) -> CellSize:
+    """Cells for a map: about `level_cells` of the configuration across a picture.
+
+    Args:
+        picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
+    """
+    config = active().radiometry
+    wanted = max(picture_px / config.level_cells, float(np.sqrt(map_px / config.level_most_cells)), 4.0)
+    fitting = [px for px in range(1, tile_px + 1) if tile_px % px == 0]
+    px = min(fitting, key=lambda px: abs(np.log(px / wanted)))
+    return CellSize(px, picture_px / px, tile_px // px)
+
+
+@dataclass(frozen=True, slots=True)
+class TileColors:
+    """What a tile shows, by cell and picture.
+
+    Attributes:
+        place: int64 (M, 3), row and column of a cell of the whole map, and the label of a picture there.
+        own: float64 (M, 4), its pixels there and the sums of red, green and blue over them.
+        seam: int64 (S, 4), row, column, and two labels, where two pictures meet.
+        both: float64 (S, 9), sums over the pixels that both show, see sum_colors.
+    """
+
+    place: Integers
+    own: Array
+    seam: Integers
+    both: Array
+
+
+def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileColors:
+    """Sum the colours of a tile, and of the other pictures near its seams, if there are any."""
+    side = len(tile.plane) // cell_px
+    labels, own = np.zeros((side, side, SLOTS), np.int32), np.zeros((side, side, SLOTS, OWN))
+    pairs, both = np.zeros((side, side, SLOTS, 2), np.int32), np.zeros((side, side, SLOTS, BOTH))
+    second = (np.zeros_like(tile.rgba), np.zeros_like(tile.plane)) if other is None else (other.rgba, other.plane)
+    config = active().radiometry
+    sum_colors(
+        tile.rgba, tile.plane, *second, cell_px, config.dark_level, config.bright_level, labels, own, pairs, both
+    )
+    corner = np.array(key) * side
+    cells = np.nonzero(labels)
+    place = np.column_stack([np.stack(cells[:2], 1) + corner, labels[cells]]).astype(np.int64)
+    met = np.nonzero(both[..., 0])
+    seam = np.column_stack([np.stack(met[:2], 1) + corner, pairs[met]]).astype(np.int64)
+    return TileColors(place, own[cells], seam, both[met])
+
+
+@dataclass(frozen=True, slots=True)
+class TileFactors:
+    """Factors of the pictures of a tile.
+
+    Attributes:
+        cell_px: side of the cells.
+        labels: int32 (R + 2, C + 2, SLOTS), pictures in the tile's cells and one beyond each border, 0 = none.
+        factors: float32 (R + 2, C + 2, SLOTS, 3), of their red, green and blue.
+    """
+
+    cell_px: int
+    labels: NDArray[np.int32]
+    factors: NDArray[np.float32]
+
+    def apply(self, tile: Tile) -> None:
+        """Multiply a tile's colours."""
+        apply_factors(tile.rgba, tile.plane, self.cell_px, self.labels, self.factors)
+
+
+class Leveling:
+    """The correction of a whole map.
+
+    Args:
+        tiles: of all its tiles. columns: cells across the map (whole tiles). cells: their size.
+    """
+
+    def __init__(self, tiles: Sequence[TileColors], columns: int, cells: CellSize) -> None:
+        self._columns, self._cells = columns + 1, cells  # a column of no picture ends each row of cells
+        place = np.concatenate([np.empty((0, 3), np.int64), *(t.place for t in tiles)])
+        self._labels = int(place[:, 2].max(initial=0)) + 1
+        key = self._key(place[:, 0], place[:, 1], place[:, 2])
+        order = np.argsort(key)
+        self._keys = key[order]
+        own = np.concatenate([np.empty((0, OWN)), *(t.own for t in tiles)])[order]
+        self._pixels = own[:, 0]
+        seam = np.concatenate([np.empty((0, 4), np.int64), *(t.seam for t in tiles)])
+        both = np.concatenate([np.empty((0, BOTH)), *(t.both for t in tiles)])
+        self._log = self._solved(*self._steps(seam, both)) if len(self._keys) else np.empty((0, 3))
+
+    def of_tile(self, key: Key) -> TileFactors:
+        """The factors for a tile."""
+        side, limit = self._cells.across_tile, float(np.log(active().radiometry.greatest_factor))
+        labels = np.zeros((side + 2, side + 2, SLOTS), np.int32)
+        factors = np.ones((side + 2, side + 2, SLOTS, 3), np.float32)
+        west, east = max(key[1] * side - 1, 0), min((key[1] + 1) * side + 1, self._columns)
+        for row in range(max(key[0] * side - 1, 0), (key[0] + 1) * side + 1):
+            ends = np.array([row * self._columns + west, row * self._columns + east]) * self._labels
+            part = slice(*np.searchsorted(self._keys, ends).tolist())
+            cell, label = np.divmod(self._keys[part], self._labels)
+            slot = np.arange(len(cell)) - np.searchsorted(cell, cell)
+            at = (row - key[0] * side + 1, cell % self._columns - key[1] * side + 1, slot)
+            labels[at] = label
+            factors[at] = np.exp(np.clip(self._log[part], -limit, limit))
+        return TileFactors(self._cells.px, labels, factors)
+
+    def _key(self, row: Integers, column: Integers, label: Integers) -> Integers:
+        return (row * self._columns + column) * self._labels + label
+
+    def _index(self, key: Integers) -> tuple[Integers, NDArray[np.bool_]]:
+        """Where keys are among the unknowns, and whether."""
+        at = np.searchsorted(self._keys, key).clip(0, len(self._keys) - 1)
+        return at, self._keys[at] == key
+
+    def _steps(self, seam: Integers, both: Array) -> tuple[Integers, Integers, Array, Array]:
+        """Pairs of unknowns at seams (S,), the log ratio of their colours (S, 3), and its weight (S,)."""
+        config = active().radiometry
+        one, found = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 2]))
+        other, too = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 3]))
+        good = found & too & (both[:, 0] >= config.level_least_px)
+        one, other, both = one[good], other[good], both[good]
+        ratio = np.log(both[:, 1:4] / both[:, 4:7])
+        n = both[:, 0]
+        variance = np.maximum(both[:, 8] / n - np.square(both[:, 7] / n), 0.0)
+        sigma2 = config.level_sigma**2 + variance * config.level_correlated_px / n
+        robust = np.exp(-0.5 * np.square(ratio.mean(1) / config.level_step))  # Welsch's kernel
+        return one, other, ratio, config.level_rise**2 / sigma2 * robust
+
+    def _solved(self, one: Integers, other: Integers, ratio: Array, weight: Array) -> Array:
+        """Log factors (M, 3), by conjugate gradients."""
+        firsts, seconds, weights = [one], [other], [weight]
+        for ahead in (self._labels, self._columns * self._labels):  # the next cell to the east and to the south
+            at, found = self._index(self._keys + ahead)
+            firsts.append(np.nonzero(found)[0])
+            seconds.append(at[found])
+            weights.append(np.ones(int(found.sum())))
+        first, second = (np.concatenate(parts).astype(np.int32) for parts in (firsts, seconds))
+        links, count = np.concatenate(weights), len(self._keys)
+        reach = active().radiometry.level_reach * self._cells.across_picture
+        anchor = np.maximum(self._pixels / self._cells.px**2, 1e-3) / reach**2
+        right = np.zeros((count, 3))
+        for channel in range(3):
+            pull = weight * ratio[:, channel]
+            right[:, channel] = np.bincount(other, pull, count) - np.bincount(one, pull, count)
+        diagonal = anchor + np.bincount(first, links, count) + np.bincount(second, links, count)
+        log = _conjugate_gradients(first, second, links, anchor, diagonal, right)
+        return np.asarray(log - self._pixels @ log / self._pixels.sum())
+
+
+def _conjugate_gradients(
+    first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, anchor: Array, diagonal: Array, right: Array
+) -> Array:
+    """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
+    config = active().radiometry
+    x, left, image = np.zeros_like(right), right.copy(), np.empty_like(right)
+    z = left / diagonal[:, None]
+    towards, product = z.copy(), (left * z).sum(0)
+    enough = config.level_tolerance**2 * product
+    for _ in range(config.level_steps):
+        if (product <= enough).all():
+            break
+        laplacian(first, second, weight, anchor, towards, image)
+        curve = (towards * image).sum(0)
+        alpha = product / np.where(curve > 0.0, curve, 1.0)
+        x += alpha * towards
+        left -= alpha * image
+        z = left / diagonal[:, None]
+        last, product = product, (left * z).sum(0)
+        towards = z + product / np.where(last > 0.0, last, 1.0) * towards
+    return x
