@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _FRESH_S: Final = 2.0
 _OVER: Final = 1.2
+_HELD_M: Final = 0.5
+"""How well vehicles hold their height, metres: those that a plan puts `height_m` apart are a little less apart."""
 _PAD: Final = 1.5
 """Radius about a start that vehicles share, in separation distances: there the plan keeps them apart by time alone."""
 
@@ -66,7 +68,7 @@ class SeparationWatch:
                     apart = math.hypot(north - north2, east - east2)
                     over = _OVER if (one, other) in self.alarms else 1.0
                     height = abs(first.height_m - second.height_m)
-                    if apart >= over * self.distance_m or height >= over * self.height_m:
+                    if apart >= over * self.distance_m or height >= over * (self.height_m - _HELD_M):
                         continue
                     if not self._at_start(first, second):
                         found[one, other] = Near(*_proposal(first, second), apart, height)

@@ -279,6 +279,21 @@ def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
     assert sum(e.kind == "near" for e in world.events) == 1  # said once
 
 
+@pytest.mark.parametrize(("apart_m", "alarms"), [(4.95, 0), (4.0, 1)])
+def test_heights_that_a_plan_keeps_five_metres_apart_are_apart_within_what_vehicles_hold(make_world, apart_m, alarms):
+    """Of 32 ArduCopters in one plan four pairs crossed 4.99 m above each other."""
+    world = make_world(
+        SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP, home=(*CHART.to_degrees(0, 80.0), 488.0))
+    )
+    world.meet()
+    for system, home_east in ((1, 0.0), (2, 80.0)):
+        height = 30.0 + apart_m * (system - 1)
+        world.finish(world.fleet.upload(system, line(AP, 40, 60, home_east=home_east, height=height)))
+    world.finish(world.fleet.start(1), world.fleet.start(2))
+    world.wait(60.0)
+    assert sum(event.kind == "near" for event in world.events) == alarms
+
+
 def test_neighbours_that_take_off_side_by_side_raise_no_alarm(make_world):
     world = make_world(
         SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP, home=(*CHART.to_degrees(0, 5.0), 488.0))
