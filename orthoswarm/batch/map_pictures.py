@@ -20,7 +20,7 @@ from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrai
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
-from orthoswarm.mosaic.radiometry import estimate_fields
+from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warning
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
 from orthoswarm.raster.height_model import read_dem
@@ -59,7 +59,10 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
         state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
     if run.options.gains:
         with run.clock.stage("final: gains", len(fine)):
-            state.gains = estimate_fields(fine, state.thumbnails, terrain or Terrain.flat())
+            tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
+            state.gains = estimate_fields(fine, state.thumbnails, terrain or Terrain.flat(), tone=tone)
+        if run.options.tone == "map":
+            state.warnings.append(tone_warning(state.gains) if tone else NO_MAP_TONE)
     if run.options.until != "fine":
         _picture(run, state, COARSE, fine, terrain)
     elif with_map:

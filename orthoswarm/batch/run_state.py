@@ -55,7 +55,9 @@ class Options:
         gsd_m: ground pixel of the products; None for the median ground pixel at nadir.
         surface: where to write a surface model; None for none.
         dem: raster of ground heights. split_legs: treat each leg of a vehicle as a separate vehicle.
-        gains: balance brightness between pictures. blend: mix the two pictures at each seam, see Seams.
+        gains: balance brightness between pictures. tone: where brightness and hue of large areas come from, used with
+            gains and a basemap on which pictures were found.
+        blend: mix the two pictures at each seam, see Seams.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         config: thresholds that replace the defaults.
@@ -70,6 +72,7 @@ class Options:
     dem: Path | None = None
     split_legs: bool = False
     gains: bool = True
+    tone: Literal["photos", "map"] = "photos"
     blend: Blend = "seam"
     control: Path | None = None
     checkpoints: Path | None = None

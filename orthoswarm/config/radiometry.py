@@ -16,6 +16,9 @@ class RadiometryConfig:
     contrast from pixel to pixel (0.35 and 0.7 tried)."""
     robust_sigmas: float = 3.0
     """Scale of the Geman-McClure kernel on these ratios, sigmas (chosen; not measured)."""
+    map_sigma: float = 0.25
+    """Log ratio of a picture's block to a map: another season, light and sensor, local changes (chosen; not
+    measured)."""
     dark_level: float = 8.0
     """Thumbnail levels from 0 to here are partly clipped and say nothing about a gain (chosen)."""
     bright_level: float = 247.0

@@ -117,15 +117,7 @@ def _neighbours(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> _M
 
     u, v = np.meshgrid([0.2, 0.5, 0.8], [0.3, 0.7])
     share = np.stack([u.ravel(), v.ravel()], 1)
-    by_lens: dict[Lens, Array] = {}
-    for lens in {camera.lens for camera in cameras}:
-        pixels = share * (lens.width - 1.0, lens.height - 1.0)
-        xy = lens.undistort((pixels - lens.principal_point) / lens.focal_px)
-        by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
-    rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
-    height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
-    descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
-    ground = shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent)
+    ground = grid_on_ground(cameras, shots, terrain, share)
 
     nearest = min(active().radiometry.neighbours + 1, len(cameras))
     others = cKDTree(shots.position[:, :2]).query(shots.position[:, :2], nearest)[1].reshape(len(cameras), nearest)
@@ -136,6 +128,19 @@ def _neighbours(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> _M
     return _Meetings(
         np.repeat(a, points).astype(np.int32), np.repeat(b, points).astype(np.int32), ground[a].reshape(-1, 2)
     )
+
+
+def grid_on_ground(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, share: Array) -> Array:
+    """Ground points (N, P, 2) of N frames at shares (P, 2) of their width and height; NaN above the horizon."""
+    by_lens: dict[Lens, Array] = {}
+    for lens in {camera.lens for camera in cameras}:
+        pixels = share * (lens.width - 1.0, lens.height - 1.0)
+        xy = lens.undistort((pixels - lens.principal_point) / lens.focal_px)
+        by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
+    rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
+    height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
+    descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
+    return np.asarray(shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent))
 
 
 def _towards(seams: _Meetings, frame: Ints, shots: Shots) -> _Meetings:

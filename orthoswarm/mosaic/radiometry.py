@@ -25,6 +25,7 @@ from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import Shots
+from orthoswarm.mosaic.map_colors import ColorMap, map_colors
 from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
 
 Array = NDArray[np.float64]
@@ -46,16 +47,38 @@ def uniform(gain: Sequence[float] | NDArray[np.floating]) -> Field:
     return field
 
 
+NO_MAP_TONE = "the tones are those of the photos, since no vehicle was found on the basemap"
+
+
+def tone_warning(fields: Mapping[str, Field]) -> str:
+    """By how much pictures were changed to have a map's tone."""
+    factors = np.array([field[:, 0] for field in fields.values()]).reshape(-1, 3)
+    if len(factors) == 0:
+        return "the tones are those of the photos: there is nothing to compare"
+    red, green, blue = np.median(factors, axis=0)
+    text = f"the tones follow the basemap: red, green and blue times {red:.2f}, {green:.2f} and {blue:.2f} (median)"
+    greatest = active().radiometry.greatest_factor
+    at_limit = float((np.abs(np.log(factors)).max(1) > 0.95 * np.log(greatest)).mean())
+    if at_limit > 0.02:
+        text += (
+            f"; {at_limit:.0%} of the photos would need more than {greatest:g}, the greatest factor, and differ from it"
+        )
+    if max(red, green, blue) > 1.15 * min(red, green, blue):
+        text += "; the map has another tint than the photos (season, light, sensor), which the orthoimage now has, too"
+    return text
+
+
 def estimate_fields(
     frames: Sequence[PlacedFrame],
     thumbnails: Mapping[str, Bytes],
     terrain: Terrain,
     held: Mapping[str, Field] | None = None,
+    tone: ColorMap | None = None,
 ) -> dict[str, Field]:
     """Factors that make neighbouring frames alike.
 
     The mean logarithm of the mosaic's brightness stays as it was, channel by channel; where some fields are held, the
-    others follow those instead.
+    others follow those instead, and with a map its tone.
 
     Args:
         frames: placed frames in order of vehicle and time.
@@ -63,6 +86,7 @@ def estimate_fields(
             rendering); a frame without one gets what its vehicle has in common.
         terrain: the ground's height.
         held: image -> field of frames that are drawn already and stay as they are.
+        tone: a map that the mosaic's tone is to follow at low frequency.
 
     Returns:
         image -> field for every frame; factors lie within `greatest_factor` and its inverse.
@@ -81,9 +105,14 @@ def estimate_fields(
     fixed = np.array([frames[i].frame.image in held for i in known], bool)
     if fixed.any():
         colors = _with_held(colors, [held.get(frames[i].frame.image) for i in known])
-    of_vehicle, of_known = _solve(colors, vehicle[some], len(names), fixed)
+    of_some = vehicle[some]
+    shared = None if tone is None else map_colors(cameras, shots.take(some), small, terrain, tone)
+    if shared is not None and len(shared.frame):  # the map is one more frame, which is held
+        colors = _together(colors, shared)
+        of_some, fixed = np.append(of_some, of_some[:1]), np.append(fixed, True)
+    of_vehicle, of_known = _solve(colors, of_some, len(names), fixed)
     of_frame = np.zeros((len(frames), _OWN, 3))
-    of_frame[some] = of_known
+    of_frame[some] = of_known[: len(known)]
     x, y = _nodes(shots.size)
     log = _log_factors(of_vehicle[vehicle], of_frame, x=x, y=y, shots=shots, terrain=terrain)
     if not fixed.any() and area.sum() > 0:
@@ -92,6 +121,12 @@ def estimate_fields(
     limit = float(np.log(active().radiometry.greatest_factor))
     fields = _as_polynomials(np.exp(np.clip(log, -limit, limit)), x, y)
     return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
+
+
+def _together(one: OverlapColors, other: OverlapColors) -> OverlapColors:
+    """All samples of two kinds."""
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("frame", "ratio", "place", "sigma")]
+    return OverlapColors(*(np.concatenate(pair) for pair in pairs))
 
 
 def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapColors:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.radiometry import estimate_fields, uniform
+from orthoswarm.mosaic.radiometry import estimate_fields, tone_warning, uniform
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.mosaic.renderer import render
 from tests.kit import mosaic_scene as scene
@@ -148,3 +149,52 @@ def test_nothing_to_compare_gives_no_gains():
     flight = scene.survey(0, count=1)
     assert estimate_fields(flight.frames, thumbnails_of(flight), FLAT) == {}
     assert estimate_fields([], {}, FLAT) == {}
+
+
+class TintedMap:
+    """The scene's ground as a map of another season or sensor; nothing west of a line."""
+
+    def __init__(self, tint=(1.0, 1.0, 1.0), west=-1e9, *, grey=False):
+        self.tint, self.west, self.grey = np.array(tint), west, grey
+
+    def rgb(self, bounds, gsd_m):
+        grid = GroundGrid.around(0, bounds, gsd_m)
+        ground = scene.pixel_centres(grid)
+        fine = [scene.colour(ground + gsd_m * np.array([e, n])) for e in (-0.3, 0.0, 0.3) for n in (-0.3, 0.0, 0.3)]
+        colour = np.mean(fine, axis=0)
+        if self.grey:
+            colour = colour.mean(-1, keepdims=True).repeat(3, -1)
+        return np.clip(colour * self.tint, 0, 255).astype(np.uint8), ground[..., 0] > scene.EAST + self.west
+
+
+def test_the_tone_of_a_map_is_taken_over(tmp_path):
+    flight, truth = uneven_flight(3)
+    tint = np.array([0.8, 1.0, 1.1])
+    fields = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=TintedMap(tint))
+    applied = np.log(middle(fields, flight)) + truth + np.log(0.85)  # of the ground's true colours
+    assert applied.mean(0) == pytest.approx(np.log(tint), abs=0.06)
+    assert applied.std(0).max() < 0.05
+    assert "another tint" in tone_warning(fields)
+
+
+def test_a_map_of_a_part_of_the_area_is_enough_for_its_tone():
+    flight, truth = uneven_flight(3)
+    fields = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=TintedMap((0.9, 0.9, 0.9), west=0.0))
+    applied = np.log(middle(fields, flight)) + truth + np.log(0.85)
+    assert applied.mean() == pytest.approx(np.log(0.9), abs=0.08)
+    assert applied.std(0).max() < 0.07  # and where there is none pictures still agree with the others
+
+
+def test_a_grey_map_gives_no_hue():
+    flight = scene.survey(2)
+    fields = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=TintedMap((0.8, 0.8, 0.8), grey=True))
+    red, green, blue = middle(fields).mean(0)
+    assert max(red, green, blue) - min(red, green, blue) < 0.04
+    assert green == pytest.approx(0.8, abs=0.05)
+
+
+def test_a_map_that_shows_nothing_here_changes_nothing():
+    flight, _ = uneven_flight(4)
+    alone = estimate_fields(flight.frames, thumbnails_of(flight), FLAT)
+    beside = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=TintedMap(west=1e6))
+    assert middle(beside) == pytest.approx(middle(alone))

@@ -45,6 +45,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
+    add(
+        "--tone", choices=("photos", "map"), default="photos",
+        help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
+    )  # fmt: skip
     add("--blend", choices=("none", "seam"), default="seam", help="mix the pictures over a few pixels at seams, or not")
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
     add(
@@ -88,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         dem=args.dem,
         split_legs=args.split == "legs",
         gains=not args.no_gains,
+        tone=args.tone,
         blend=args.blend,
         control=args.control,
         checkpoints=args.checkpoints,
@@ -147,6 +152,11 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")
     if args.workers is not None and args.workers < 1:
         raise InputError(f"--workers {args.workers} is too few; give 1 or more")
+    if args.tone == "map":
+        if args.basemap is None:
+            raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")
+        if args.no_gains or args.until != "fine":
+            raise InputError("--tone map needs balanced, refined pictures; leave out --no-gains and --until")
     if args.surface is not None:
         if args.surface.suffix.lower() not in (".tif", ".tiff") or args.surface.is_dir():
             raise InputError(f"--surface {args.surface} is not the name of a GeoTIFF; end it in .tif")

@@ -1,0 +1,78 @@
+"""The tone of a map at low frequency: the map takes part in the balancing like one more picture, which stays as it is.
+
+Means over blocks of a picture (a fourth of its width) are compared with those of the map at the same ground. Cars,
+leaves and shadows vanish in such means; seasons do not, therefore the ratios have a large sigma: single pictures hardly
+follow them, the mean of many does.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.camera import Camera
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.kernels.render_arrays import Shots
+from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, grid_on_ground
+
+_BLOCK_PX = 4
+"""Side of a block in pixels of the thumbnails."""
+
+
+class ColorMap(Protocol):
+    """A map in colour (raster.basemap.Basemap)."""
+
+    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, NDArray[np.bool_]]:
+        """Colours (rows, columns, 3) and validity of a window; see GroundGrid.around for its frame."""
+
+
+def map_colors(
+    cameras: Sequence[Camera], shots: Shots, small: Bytes, terrain: Terrain, tone: ColorMap
+) -> OverlapColors:
+    """Compare frames with a map; the map's index as a frame is the number of cameras.
+
+    Args:
+        cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails.
+        terrain: the ground. tone: the map; where it is grey its hue says nothing.
+    """
+    config, count = active().radiometry, len(cameras)
+    rows, columns = small.shape[1] // _BLOCK_PX, small.shape[2] // _BLOCK_PX
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    share = np.stack([u.ravel(), v.ravel()], 1)
+    blocks = small[:, : rows * _BLOCK_PX, : columns * _BLOCK_PX].astype(np.float64)
+    seen = blocks.reshape(count, rows, _BLOCK_PX, columns, _BLOCK_PX, 3).mean((2, 4)).reshape(count, -1, 3)
+    ground = grid_on_ground(cameras, shots, terrain, share)
+    drawn, valid = _at(tone, ground, columns)
+    valid &= ((seen > config.dark_level) & (seen < config.bright_level)).all(-1)
+    valid &= ((drawn > config.dark_level) & (drawn < config.bright_level)).all(-1)
+    ratio = np.log(np.maximum(seen, 1.0)) - np.log(np.maximum(drawn, 1.0))
+    if not (drawn[valid] != drawn[valid][:, :1]).any():
+        ratio[:] = ratio.mean(-1, keepdims=True)
+    place = np.zeros((*ratio.shape[:2], 2, 4), np.float32)
+    place[:, :, 0, :2] = 2.0 * share - 1.0
+    place[:, :, 0, 1] *= (shots.size[:, 1] / shots.size[:, 0])[:, None]
+    rise = np.maximum(shots.position[:, 2] - terrain.height(shots.position[:, :2]), 1e-3)
+    place[:, :, 0, 2:] = (ground - shots.position[:, None, :2]) / rise[:, None, None]
+    frame = np.stack(np.broadcast_arrays(np.arange(count)[:, None], count), -1).astype(np.int32)
+    frame = np.broadcast_to(frame, (count, len(share), 2))
+    sigma = np.full(int(valid.sum()), config.map_sigma, np.float32)
+    return OverlapColors(frame[valid], ratio[valid].astype(np.float32), place[valid], sigma)
+
+
+def _at(tone: ColorMap, ground: NDArray[np.float64], columns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The map's means (N, P, 3) about places (N, P, 2), and where there are any."""
+    known = np.asarray(np.isfinite(ground).all(axis=-1))
+    if not known.any():
+        return np.zeros((*ground.shape[:2], 3)), known
+    across = np.hypot(*(ground[:, columns - 1] - ground[:, 0]).T)
+    block = max(float(np.nanmedian(across)) / max(columns - 1, 1), 0.1)
+    low, high = ground[known].min(0) - block, ground[known].max(0) + block
+    bounds = BoundingBox(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    colors, mask = tone.rgb(bounds, block)
+    cell = np.rint(GroundGrid.around(0, bounds, block).to_pixel(np.where(known[..., None], ground, low))).astype(int)
+    column, row = cell[..., 0].clip(0, mask.shape[1] - 1), cell[..., 1].clip(0, mask.shape[0] - 1)
+    return colors[row, column].astype(np.float64), known & mask[row, column]
