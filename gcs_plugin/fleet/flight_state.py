@@ -116,9 +116,10 @@ def _word(vehicle: Observed) -> Word:
         return _on_mission(vehicle)
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.HOLDING
-    # active as well: at a pause and a resume PX4's mission state and mode arrive up to a second apart
-    if mode in _HOLDS and vehicle.detector.phase in (Phase.SUSPENDED, Phase.ACTIVE):
+    if mode in _HOLDS and vehicle.detector.phase is Phase.SUSPENDED:
         return Word.PAUSED
+    if mode in _HOLDS and vehicle.detector.phase is Phase.ACTIVE:
+        return Word.ON_MISSION  # it pauses, resumes or ends: PX4's mode and mission state arrive up to a second apart
     return Word.FLYING
 
 

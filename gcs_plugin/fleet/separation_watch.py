@@ -14,23 +14,30 @@ _FRESH_S: Final = 2.0
 _OVER: Final = 1.2
 _HELD_M: Final = 0.5
 """How well vehicles hold their height, metres: those that a plan puts `height_m` apart are a little less apart."""
+_AHEAD_S: Final = 3.0
+"""How far ahead vehicles are followed on straight lines, seconds. Of 35 real autopilots in simulation three pairs came
+within 10 m: known 3.2 to 3.4 s before they were nearest, as of two pairs that turned away (at 12 and 20 m). With 4 s
+there were five of those."""
+_LOOK_S: Final = 0.5
 _PAD: Final = 1.5
 """Radius about a start that vehicles share, in separation distances: there the plan keeps them apart by time alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """Two vehicles that are too near each other.
+    """Two vehicles that are too near each other, or will be.
 
     Attributes:
         one: system id. other: system id of the one that should be paused.
         metres: horizontal distance. height_m: difference in height.
+        ahead_s: in how many seconds, if both fly straight on; 0 for now.
     """
 
     one: int
     other: int
     metres: float
     height_m: float
+    ahead_s: float = 0.0
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -45,11 +52,11 @@ def number_name(system: int) -> str:
 
 @dataclass(slots=True)
 class SeparationWatch:
-    """Compares the positions of vehicles in the air.
+    """Compares the positions of vehicles in the air, now and in the next seconds.
 
     Attributes:
         distance_m: horizontally, or height_m: vertically, they keep at least so far apart.
-        alarms: pairs that are too near now, by their system ids in order.
+        alarms: pairs that are too near now or soon, by their system ids in order.
     """
 
     distance_m: float = 10.0
@@ -62,16 +69,15 @@ class SeparationWatch:
         found: dict[tuple[int, int], Near] = {}
         if len(flying) > 1:
             shrink = math.cos(math.radians(flying[0].lat_deg or 0.0))
-            places = sorted((v.system, *_metres(v, shrink), v) for v in flying)
-            for index, (one, north, east, first) in enumerate(places):
-                for other, north2, east2, second in places[index + 1 :]:
-                    apart = math.hypot(north - north2, east - east2)
-                    over = _OVER if (one, other) in self.alarms else 1.0
-                    height = abs(first.height_m - second.height_m)
-                    if apart >= over * self.distance_m or height >= over * (self.height_m - _HELD_M):
-                        continue
-                    if not self._at_start(first, second):
-                        found[one, other] = Near(*_proposal(first, second), apart, height)
+            places = sorted((v.system, *_metres(v, shrink), self._reach(v), v) for v in flying)
+            for index, (one, north, east, reach, first) in enumerate(places):
+                for other, north2, east2, reach2, second in places[index + 1 :]:
+                    if abs(north2 - north) >= reach + reach2 or abs(east2 - east) >= reach + reach2:
+                        continue  # most pairs: they cannot meet
+                    apart = north2 - north, east2 - east, first.height_m - second.height_m
+                    met = self._meeting(apart, first, second, _OVER if (one, other) in self.alarms else 1.0)
+                    if met is not None:
+                        found[one, other] = Near(*_proposal(first, second), *met)
         new = [near for pair, near in found.items() if pair not in self.alarms]
         ended = [pair for pair in self.alarms if pair not in found]
         self.alarms = found
@@ -84,20 +90,42 @@ class SeparationWatch:
                 return near_text(near, self, name)
         return ""
 
-    def _at_start(self, one: "Vehicle", other: "Vehicle") -> bool:
-        """Both are above a start that they share."""
+    def _reach(self, vehicle: "Vehicle") -> float:
+        """Half the distance from which two vehicles can come too near in the time that is looked ahead, metres."""
+        return 0.5 * _OVER * self.distance_m + _AHEAD_S * math.hypot(*vehicle.velocity_m_s[:2])
+
+    def _meeting(
+        self, apart: tuple[float, float, float], one: "Vehicle", other: "Vehicle", over: float
+    ) -> tuple[float, float, float] | None:
+        """Distance, difference in height and when, where they are nearest while too near; None if they never are.
+
+        `apart` is from one to the other: north, east, down.
+        """
+        closing = [b - a for a, b in zip(one.velocity_m_s, other.velocity_m_s, strict=True)]
+        reach, step = over * self.distance_m, over * (self.height_m - _HELD_M)
+        met = []
+        for look in range(1 + round(_AHEAD_S / _LOOK_S)):
+            ahead = look * _LOOK_S
+            north, east, down = (a + ahead * v for a, v in zip(apart, closing, strict=True))
+            metres, height = math.hypot(north, east), abs(down)
+            if metres < reach and height < step and not self._at_start(one, other, ahead):
+                met.append((metres, height, ahead))
+        return min(met, default=None)
+
+    def _at_start(self, one: "Vehicle", other: "Vehicle", ahead_s: float) -> bool:
+        """Both are above a start that they share, so many seconds ahead."""
         reach = _PAD * self.distance_m
         if one.launch is None or other.launch is None or distance_m(*one.launch, *other.launch) > reach:
             return False
-        here = [((v.lat_deg or 0.0, v.lon_deg or 0.0), v.launch) for v in (one, other)]
-        return all(launch is not None and distance_m(*place, *launch) < reach for place, launch in here)
+        return all(distance_m(*_place(v, ahead_s), *(v.launch or (0.0, 0.0))) < reach for v in (one, other))
 
 
 def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = number_name) -> str:
     """An alarm in words; `name` gives the names of vehicles."""
     one, other = name(near.one), name(near.other)
+    when = f"will be in {near.ahead_s:.0f} s" if near.ahead_s >= 1.0 else "are"
     return (
-        f"{one} and {other} are {near.metres:.1f} m apart and {near.height_m:.1f} m in height "
+        f"{one} and {other} {when} {near.metres:.1f} m apart and {near.height_m:.1f} m in height "
         f"(they should keep {watch.distance_m:.0f} m, or {watch.height_m:.0f} m in height): pause {other}"
     )
 
@@ -111,6 +139,12 @@ def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
     """Which vehicle should be paused: the faster of the two, as it approaches the other."""
     fast, slow = sorted((one, other), key=lambda v: -math.hypot(*v.velocity_m_s[:2]))
     return slow.system, fast.system
+
+
+def _place(vehicle: "Vehicle", ahead_s: float) -> tuple[float, float]:
+    """Latitude and longitude so many seconds ahead, degrees."""
+    lat, lon, (north, east, _) = vehicle.lat_deg or 0.0, vehicle.lon_deg or 0.0, vehicle.velocity_m_s
+    return lat + ahead_s * north / DEGREE_M, lon + ahead_s * east / (DEGREE_M * math.cos(math.radians(lat)))
 
 
 def _metres(vehicle: "Vehicle", shrink: float) -> tuple[float, float]:

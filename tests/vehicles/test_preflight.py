@@ -16,6 +16,7 @@ from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.model.earth import distance_m
 from tests.vehicles.test_fleet_cli import HOME, fleet, folder, free_port  # noqa: F401
 from tests.vehicles.test_sim import mission
 
@@ -274,6 +275,10 @@ def test_vehicles_that_come_too_near_raise_an_alarm_with_a_proposal(make_world):
     assert world.until(lambda: any(e.kind == "near" for e in world.events), 100.0)
     alarm = next(e for e in world.events if e.kind == "near")
     assert "they should keep 10 m" in alarm.text and "pause v" in alarm.text
+    near = fleet_.separation.alarms[1, 2]  # said while a pause still helps: two to three seconds before
+    assert near.ahead_s >= 2.0 and "will be in" in alarm.text
+    places = [(v.lat_deg, v.lon_deg) for v in fleet_.vehicles.values()]
+    assert distance_m(*places[0], *places[1]) > 10.0
     assert alarm.pair == (1, 2)
     assert fleet_.separation.text(1) and fleet_.separation.text(2)
     assert sum(e.kind == "near" for e in world.events) == 1  # said once

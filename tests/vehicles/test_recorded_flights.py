@@ -15,6 +15,7 @@ from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.sim.memory_link import VirtualClock
+from orthoswarm.model.earth import distance_m
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 
@@ -46,8 +47,8 @@ class Replay(Link):
             yield "log", self.packets.pop(0)[1].raw
 
 
-def replay(name, look):
-    """Feed a log through a fleet, calling `look` ten times a second; gives its only vehicle and the mission events."""
+def replay_all(name, look):
+    """Feed a log through a fleet, calling `look(fleet, seconds)` ten times a second; gives vehicles and events."""
     clock = VirtualClock()
     link = Replay(FLIGHTS / f"{name}.tlog", clock)
     with Fleet([link], clock=clock, wall=clock.utc) as fleet:
@@ -56,9 +57,13 @@ def replay(name, look):
         while link.packets:
             clock.now += 0.1
             fleet.poll(0.0)
-            for vehicle in fleet.vehicles.values():
-                look(vehicle)
-        (vehicle,) = fleet.vehicles.values()
+            look(fleet, clock.now)
+        return list(fleet.vehicles.values()), events
+
+
+def replay(name, look):
+    """The same with the log of one vehicle: `look(vehicle)`; gives it and the mission events."""
+    (vehicle,), events = replay_all(name, lambda fleet, _: [look(vehicle) for vehicle in fleet.vehicles.values()])
     missions = {event.value for event in MissionEvent}
     return vehicle, [event.kind for event in events if event.kind in missions]
 
@@ -162,3 +167,22 @@ def test_arducopter_is_not_ready_for_most_of_a_minute_after_its_start():
     assert (True, True, True) in states and (False, True, False) in states
     assert any("PreArm:" in reason for reason in reasons)
     assert vehicle.home is not None
+
+
+def test_vehicles_that_are_about_to_meet_are_named_while_a_pause_still_helps():
+    """A PX4 24 s behind its plan and an ArduCopter 9 s behind cross each other's way, 4 m apart at one height."""
+    apart, alarms = [], []
+
+    def look(fleet, now):
+        if len(fleet.vehicles) == 2:
+            one, other = fleet.vehicles.values()
+            if one.lat_deg and other.lat_deg:
+                apart.append((distance_m(one.lat_deg, one.lon_deg, other.lat_deg, other.lon_deg), now))
+        alarms.extend((now, near) for near in fleet.separation.alarms.values() if not alarms)
+
+    _, events = replay_all("arducopter_px4_meeting", look)
+    nearest_m, nearest_s = min(apart)
+    (said_s, near) = alarms[0]
+    assert nearest_m < 6.0 and nearest_s - said_s > 2.5
+    assert near.pair == (2, 3) and near.metres < 10.0 and near.height_m < 1.0
+    assert [event.kind for event in events if event.kind in ("near", "apart")] == ["near", "apart"]
