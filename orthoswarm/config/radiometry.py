@@ -59,7 +59,7 @@ class RadiometryConfig:
     level_cells: int = 32
     """Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (chosen: the factor
     of a lawn must not reach the road beside it)."""
-    level_most_cells: int = 2_000_000
+    level_most_cells: int = 300_000
     """Most of these cells in a map; they grow beyond it (chosen for memory)."""
     level_least_px: float = 8.0
     """Fewest pixels that two pictures share in a cell for their ratio to count (chosen)."""

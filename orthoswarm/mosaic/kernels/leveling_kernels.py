@@ -6,8 +6,6 @@ from orthoswarm.compute.jit import kernel
 
 SLOTS = 8
 """Most pictures, and pairs of them, in a cell; any beyond are left as they are."""
-OWN = 4
-"""What is summed of a picture in a cell: pixels, red, green, blue."""
 BOTH = 9
 """What is summed of two pictures at the seams in a cell: pixels, three colours of the first, three of the second, log
 ratio of their brightness and its square."""
@@ -26,14 +24,14 @@ def _slot(labels, wanted):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, own, pairs, both):  # type: ignore[no-untyped-def]
-    """Sum the colours of a tile's pictures by cell, and those of two pictures at the same ground near seams.
+def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, pixels, pairs, both):  # type: ignore[no-untyped-def]
+    """Count the pixels of a tile's pictures by cell, and sum the colours of two pictures at the same ground near seams.
 
     Args:
         rgba: uint8 (T, T, 4); label: int32 (T, T), whose colours these are, 0 = none.
         other_rgba: uint8 (T, T, 4) and other: int32 (T, T), the same of the other picture near seams.
         cell: side of the cells, pixels. dark, bright: levels outside of which a colour is clipped.
-        labels: int32 (R, C, SLOTS), own: float64 (R, C, SLOTS, OWN); pairs: int32 (R, C, SLOTS, 2), the lesser label
+        labels: int32 (R, C, SLOTS), pixels: float32 (R, C, SLOTS); pairs: int32 (R, C, SLOTS, 2), the lesser label
             first, both: float64 (R, C, SLOTS, BOTH): zeros, are filled.
     """
     for r in range(label.shape[0]):
@@ -47,9 +45,7 @@ def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, own, 
                 at = _slot(labels[i, j], a)
                 last, last_j = a, j
             if at >= 0:
-                own[i, j, at, 0] += 1.0
-                for channel in range(3):
-                    own[i, j, at, 1 + channel] += rgba[r, c, channel]
+                pixels[i, j, at] += 1.0
             if b == 0 or b == a or other_rgba[r, c, 3] == 0:
                 continue
             _slot(labels[i, j], b)

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile
 from orthoswarm.config import active
-from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, OWN, SLOTS, apply_factors, laplacian, sum_colors
+from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 
@@ -55,33 +56,33 @@ class TileColors:
 
     Attributes:
         place: int64 (M, 3), row and column of a cell of the whole map, and the label of a picture there.
-        own: float64 (M, 4), its pixels there and the sums of red, green and blue over them.
+        pixels: float32 (M,), how many it has there.
         seam: int64 (S, 4), row, column, and two labels, where two pictures meet.
-        both: float64 (S, 9), sums over the pixels that both show, see sum_colors.
+        both: float32 (S, 9), sums over the pixels that both show, see sum_colors.
     """
 
     place: Integers
-    own: Array
+    pixels: Floats
     seam: Integers
-    both: Array
+    both: Floats
 
 
 def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileColors:
-    """Sum the colours of a tile, and of the other pictures near its seams, if there are any."""
+    """Sum what a tile, and the other pictures near its seams, if there are any, show."""
     side = len(tile.plane) // cell_px
-    labels, own = np.zeros((side, side, SLOTS), np.int32), np.zeros((side, side, SLOTS, OWN))
+    labels, pixels = np.zeros((side, side, SLOTS), np.int32), np.zeros((side, side, SLOTS), np.float32)
     pairs, both = np.zeros((side, side, SLOTS, 2), np.int32), np.zeros((side, side, SLOTS, BOTH))
     second = (np.zeros_like(tile.rgba), np.zeros_like(tile.plane)) if other is None else (other.rgba, other.plane)
     config = active().radiometry
     sum_colors(
-        tile.rgba, tile.plane, *second, cell_px, config.dark_level, config.bright_level, labels, own, pairs, both
+        tile.rgba, tile.plane, *second, cell_px, config.dark_level, config.bright_level, labels, pixels, pairs, both
     )
     corner = np.array(key) * side
     cells = np.nonzero(labels)
     place = np.column_stack([np.stack(cells[:2], 1) + corner, labels[cells]]).astype(np.int64)
     met = np.nonzero(both[..., 0])
     seam = np.column_stack([np.stack(met[:2], 1) + corner, pairs[met]]).astype(np.int64)
-    return TileColors(place, own[cells], seam, both[met])
+    return TileColors(place, pixels[cells], seam, both[met].astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,7 @@ class TileFactors:
 
     cell_px: int
     labels: NDArray[np.int32]
-    factors: NDArray[np.float32]
+    factors: Floats
 
     def apply(self, tile: Tile) -> None:
         """Multiply a tile's colours."""
@@ -117,10 +118,9 @@ class Leveling:
         key = self._key(place[:, 0], place[:, 1], place[:, 2])
         order = np.argsort(key)
         self._keys = key[order]
-        own = np.concatenate([np.empty((0, OWN)), *(t.own for t in tiles)])[order]
-        self._pixels = own[:, 0]
+        self._pixels = np.concatenate([np.empty(0, np.float32), *(t.pixels for t in tiles)])[order]
         seam = np.concatenate([np.empty((0, 4), np.int64), *(t.seam for t in tiles)])
-        both = np.concatenate([np.empty((0, BOTH)), *(t.both for t in tiles)])
+        both = np.concatenate([np.empty((0, BOTH), np.float32), *(t.both for t in tiles)]).astype(np.float64)
         self._log = self._solved(*self._steps(seam, both)) if len(self._keys) else np.empty((0, 3))
 
     def of_tile(self, key: Key) -> TileFactors:
