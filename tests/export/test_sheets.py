@@ -12,13 +12,13 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
-from orthoswarm.export.mbtiles import write_mbtiles
 from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
-from orthoswarm.export.sheets.pmtiles import tile_number, write_pmtiles
 from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
+from orthoswarm.export.tiles.mbtiles import write_mbtiles
+from orthoswarm.export.tiles.pmtiles import tile_number, write_pmtiles
 
 WEST, NORTH, GSD = 465_500.0, 5_249_600.0, 0.25
 FIND = Place(uid="f", kind="find", name="Roof", lat_deg=47.3975, lon_deg=8.5437, time_s=1.78e9, note="</script>")

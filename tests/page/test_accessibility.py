@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.kit.page_kit import DESK, PHONE, ok_for_all, opened, standing, vehicle
+from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, standing, vehicle
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 SMALL = """() => [...document.querySelectorAll("button, select, summary, input:not([type=checkbox])")]
@@ -31,3 +31,33 @@ def test_nothing_stands_in_the_way(browser, theme, size):
             report = axe.Axe().run(page)
             assert report.violations_count == 0, report.generate_report()
             assert page.evaluate(SMALL) == []
+
+
+@pytest.mark.parametrize("dem", [None, "relief.tif"], ids=["no-dem", "dem"])
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_every_field_of_a_plan_unfolded(browser, size, dem):
+    with standing(vehicle(1, name="Falcon")) as station:
+        station.gets["/api/plan"] = {
+            "version": 1,
+            "area": None,
+            "settings": {},
+            "plan": None,
+            "vehicles": {},
+            "dem": dem,
+        }
+        with opened(browser, station.url, size) as page:
+            page.click("#tab-plan")
+            for group in page.locator("#panel-plan details > summary").all():
+                group.click()
+            fields = ["wait_min", "wind_m_s", "wind_from_deg", "side_overlap"]
+            fields += ["relief", "height_tolerance_m", "terrain_items"] if dem else []
+            for name in fields:
+                page.locator(f"[name={name}]").scroll_into_view_if_needed()
+                assert page.locator(f"[name={name}]").is_visible(), name
+            for theme in ("dark", "sunlight"):
+                page.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+                page.wait_for_timeout(300)
+                report = axe.Axe().run(page)
+                assert report.violations_count == 0, report.generate_report()
+                assert page.evaluate(SMALL) == []
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

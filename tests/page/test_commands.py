@@ -1,5 +1,6 @@
 """Commands: always on the screen, confirmed once, and each ends visibly."""
 
+import re
 import threading
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, send, standing, vehicle
 
 ALL = ("pause", "rtl", "land")
+PLURAL = re.compile(r"\b1 (vehicle|picture|satellite|corner|flight|leg|gap|job|item|alarm|polygon)s\b")
 
 
 def confirm(page):
@@ -214,3 +216,18 @@ def test_on_a_phone_the_panel_can_be_made_taller_and_the_scale_is_free(browser):
         scale = page.locator(".maplibregl-ctrl-scale").bounding_box()
         fold = page.locator(".grow").bounding_box()
         assert scale["x"] + scale["width"] <= fold["x"]
+
+
+def test_one_is_said_in_the_singular(browser):
+    """Every text of the page with 1 for each of its values: no "1 vehicles"."""
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        texts = page.evaluate("""async () => {
+          const { t } = await import("/static/core/strings.js");
+          const { english } = await import("/static/core/english.js");
+          const ones = new Proxy({}, { get: () => 1 });
+          return Object.keys(english).map((key) => t(key, ones));
+        }""")
+        assert len(texts) > 300
+        assert [text for text in texts if PLURAL.search(text)] == []
+        page.click(".command[data-verb=pause]")
+        assert page.inner_text("#confirm-question").startswith("Pause 1 vehicle where it is?")

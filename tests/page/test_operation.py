@@ -1,5 +1,6 @@
 """A whole operation on the page of the real daemon with simulated vehicles, from an area's file to the offline pack."""
 
+import contextlib
 import json
 import re
 import zipfile
@@ -13,6 +14,7 @@ from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.page_kit import DESK, PHONE, TABLET, opened
 from tests.kit.sim_cameras import Cameras, square
 from tests.page.test_commands import confirm
+from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess, free_port, small_area
 
 playwright = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
@@ -24,17 +26,19 @@ def accessible(page):
     assert report.violations_count == 0, report.generate_report()
 
 
-def until(page, condition):
+def until(page, count, condition):
     """Wait until a condition holds on the words of all tiles."""
     try:
-        page.wait_for_function(f"() => {{ const w = {WORDS}; return w.length === 2 && w.every((t) => {condition}); }}")
+        page.wait_for_function(
+            f"() => {{ const w = {WORDS}; return w.length === {count} && w.every((t) => {condition}); }}"
+        )
     except playwright.TimeoutError:
         pytest.fail(f"not {condition}: {page.evaluate(WORDS)}, {page.locator('.outcomes li').all_inner_texts()}")
 
 
-def ended_done(page):
-    """Both vehicles have acknowledged; the list is dismissed."""
-    page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length >= 2")
+def ended_done(page, count):
+    """All vehicles have acknowledged; the list is dismissed."""
+    page.wait_for_function(f"() => document.querySelectorAll('[data-outcome=done]').length >= {count}")
     page.click("footer >> text=Dismiss")
 
 
@@ -51,40 +55,76 @@ def test_from_an_area_to_the_pack(browser, tmp_path, size):
             cameras.served = served
             served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
             with opened(browser, f"{served.url}/#token={served.token}", size, fake=False) as page:
-                operate(page, tmp_path)
+                operate(page, tmp_path, square(260), vehicles=2, altitude_m=60, fov_deg=65)
             cameras.over = True
 
 
-def operate(page, folder):
+@pytest.mark.sitl
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("address", ADDRESSES or ["no address in ORTHOSWARM_SITL"])
+def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address):
+    """The same under a real autopilot that carries the twin's camera; see test_twin_camera."""
+    if not ADDRESSES:
+        pytest.skip("ORTHOSWARM_SITL names no autopilot")
+    relay, stream, twin = free_port(), free_port(), tmp_path / "twin"
+    with contextlib.ExitStack() as opened_here:
+        camera = CameraProcess(
+            "--link", address, "--relay", f"tcpin:127.0.0.1:{relay}", "--stream", f"tcp://127.0.0.1:{stream}",
+            "--set", str(twin), "--rate", "1",
+        )  # fmt: skip
+        opened_here.callback(camera.close)
+        camera.wait_for("map: ")
+        source = camera.wait_for(r"camera of (v\d+) \(\w+\): --source (v\d+=\S+)")[2]
+        arguments = ["--link", f"tcp:127.0.0.1:{relay}", "--source", source]
+        arguments += ["--basemap", str(twin / "basemap.tif"), "--fov-min", "75"]
+        served = opened_here.enter_context(serving(tmp_path / "flood", *arguments))
+        rows = served.until("/api/vehicles", lambda rows: any(map(has_position, rows)))
+        row = next(filter(has_position, rows))
+        page = opened_here.enter_context(opened(browser, f"{served.url}/#token={served.token}", DESK, fake=False))
+        page.set_default_timeout(600_000)
+        operate(page, tmp_path, small_area(row["lat_deg"], row["lon_deg"]), vehicles=1, altitude_m=60, fov_deg=75)
+
+
+def has_position(row):
+    return bool(row.get("lat_deg")) and (row.get("gps_fix") or 0) >= 3
+
+
+def operate(page, folder, area, *, vehicles, altitude_m, fov_deg):
+    """Plan, check, fly, pause, resume, complete, mark a find, take the pack; leaves a picture of each in the folder."""
     page.click("#tab-plan")
-    file = {"name": "area.geojson", "mimeType": "application/json", "buffer": json.dumps(square(260)).encode()}
+    file = {"name": "area.geojson", "mimeType": "application/json", "buffer": json.dumps(area).encode()}
     page.set_input_files("input[type=file]", files=[file])
     page.wait_for_selector(".notice:has-text('area.geojson')")
-    for name, value in (("vehicles", "2"), ("altitude_m", "60"), ("fov_min_deg", "65")):
-        page.fill(f"[name={name}]", value)
+    for name, value in (("vehicles", vehicles), ("altitude_m", altitude_m), ("fov_min_deg", fov_deg)):
+        page.fill(f"[name={name}]", str(value))
     page.click("text=Make plan")
     page.wait_for_selector(".plan-result:not([hidden])")
+    page.screenshot(path=folder / "1-plan.png")
     page.click("text=Upload missions")
-    ended_done(page)
+    ended_done(page, vehicles)
     page.click("text=Check and start")
-    page.wait_for_selector(".checks section >> nth=1")
+    page.wait_for_selector(f".checks section >> nth={vehicles - 1}")
     accessible(page)
     page.wait_for_function("() => !document.querySelector('.preflight .primary').disabled")
+    page.screenshot(path=folder / "2-preflight.png")
     page.click(".preflight .primary")
     page.wait_for_selector(".preflight", state="hidden")
 
     page.click("#tab-fly")
-    until(page, "t.startsWith('on mission')")
+    until(page, vehicles, "t.startsWith('on mission')")
+    page.screenshot(path=folder / "3-on-mission.png")
     page.click(".command[data-verb=pause]")
     confirm(page)
-    until(page, "t.startsWith('paused')")
-    ended_done(page)
+    until(page, vehicles, "t.startsWith('paused')")
+    page.screenshot(path=folder / "4-paused.png")
+    ended_done(page, vehicles)
     accessible(page)
     page.click(".command[data-verb=resume]")
     confirm(page)
-    ended_done(page)
-    until(page, "t === 'complete' || t === 'on ground' || t === 'returning' || t === 'landing'")
+    ended_done(page, vehicles)
+    until(page, vehicles, "t === 'complete' || t === 'on ground' || t === 'returning' || t === 'landing'")
 
+    page.screenshot(path=folder / "5-flown.png")
     page.click("#tab-map")
     page.click("text=Show all")
     page.fill("input[aria-label='Note of the find']", "Collapsed roof")
@@ -94,16 +134,18 @@ def operate(page, folder):
     page.wait_for_selector(".finds li:has-text('Collapsed roof')")
     page.click(".finds >> text=Pictures")
     page.wait_for_function("() => [...document.querySelectorAll('.pictures img')].some((i) => i.naturalWidth > 0)")
+    page.screenshot(path=folder / "6-find.png")
     accessible(page)
     page.click(".find-pictures button[aria-label=Close]")
     page.click("#panel-map form button:text-is('Export')")
     link = page.locator(".files a:has-text('map.zip')")
     link.wait_for(timeout=240_000)
+    page.screenshot(path=folder / "7-pack.png")
     with page.expect_download() as download:
         link.click()
     download.value.save_as(folder / "pack.zip")
     with zipfile.ZipFile(folder / "pack.zip") as archive:
         names = archive.namelist()
         page_html = archive.read("flood-map/index.html").decode()
-    assert "flood-map/orthoimage.tif" in names or "flood-map/realtime.tif" in names
+    assert "flood-map/orthoimage.tif" in names and "flood-map/orthoimage.kmz" in names
     assert re.search(r'"finds": \[\{"name": "Collapsed roof"', page_html)

@@ -217,10 +217,10 @@ def _report(
 
 def _converted(task: ExportTask, picture: Path, formats: list[str], placed: list[PlacedFrame]) -> dict[str, str]:
     """The other formats, in the workspace's folder `export`."""
-    from orthoswarm.export.kmz import write_kmz
-    from orthoswarm.export.mbtiles import write_mbtiles
     from orthoswarm.export.odm_folder import write_odm
     from orthoswarm.export.product_files import read_frames
+    from orthoswarm.export.tiles.kmz import write_kmz
+    from orthoswarm.export.tiles.mbtiles import write_mbtiles
 
     dest = task.workspace / "export"
     files: dict[str, str] = {}

@@ -1,1 +1,1 @@
-"""The map as others file or print it: STAC item, PMTiles, GeoPDF sheet, and an offline pack with a page."""
+"""The map as others file or print it: STAC item, GeoPDF sheet, and an offline pack with a page."""

@@ -5,14 +5,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from orthoswarm.export.mbtiles import write_mbtiles
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.pack import write_pack
-from orthoswarm.export.sheets.pmtiles import write_pmtiles
 from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
 from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
 from orthoswarm.export.tactical.places import Place, write_geojson
+from orthoswarm.export.tiles.mbtiles import write_mbtiles
+from orthoswarm.export.tiles.pmtiles import write_pmtiles
 
 Tell = Callable[[int, int], None]
 FORMS: Final = ("stac", "pmtiles", "pdf", "places", "tak", "pack")

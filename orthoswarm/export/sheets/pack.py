@@ -13,15 +13,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from orthoswarm.export.atomic_file import written_whole
-from orthoswarm.export.kmz import write_kmz
-from orthoswarm.export.mbtiles import write_mbtiles
 from orthoswarm.export.sheets.geopdf import write_geopdf
-from orthoswarm.export.sheets.pmtiles import write_pmtiles
 from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
 from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
 from orthoswarm.export.tactical.places import Place, write_geojson
+from orthoswarm.export.tiles.kmz import kmz_file
+from orthoswarm.export.tiles.mbtiles import mbtiles_file
+from orthoswarm.export.tiles.pmtiles import write_pmtiles
+from orthoswarm.export.tiles.tile_pyramid import draw_tiles
 
 _PAGE: Final = Path(__file__).with_name("pack_page.html")
 _PURPOSES: Final = {
@@ -62,11 +63,10 @@ def write_pack(
         tiles = folder / "orthoimage.mbtiles"
         title = cog.resolve().parent.name or "map"
         web: list[Callable[[], None]] = [
-            lambda: write_mbtiles(cog, tiles, tile_format="webp"),
+            lambda: _draw_tiles(cog, tiles, folder / "orthoimage.kmz"),
             lambda: write_pmtiles(tiles, folder / "orthoimage.pmtiles"),
         ]
         others: list[Callable[[], None]] = [
-            lambda: write_kmz(cog, folder / "orthoimage.kmz"),
             lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
             lambda: write_data_package(places, folder / "places-tak.zip", title),
             lambda: write_geojson(places, folder / "places.geojson"),
@@ -84,12 +84,18 @@ def write_pack(
                 step()
                 tell(next(done), count)
 
-        with ThreadPoolExecutor(2) as pool:  # the two that take longest beside each other
+        with ThreadPoolExecutor(2) as pool:  # the tiles take longest
             for running in [pool.submit(run, web), pool.submit(run, others)]:
                 running.result()
         with closing(sqlite3.connect(tiles)) as database, written_whole(path) as part:
             _zip(database, folder, part, places, title)
         tell(count, count)
+
+
+def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> None:
+    """Both files of one drawing."""
+    with mbtiles_file(mbtiles, tile_format="webp") as web, kmz_file(kmz) as globe:
+        draw_tiles(cog, [web, globe])
 
 
 def _copy(cog: Path, folder: Path) -> None:

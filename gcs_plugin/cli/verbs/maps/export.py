@@ -99,7 +99,7 @@ def _layer(args: argparse.Namespace) -> Path:
 
 
 def _mbtiles(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
-    from orthoswarm.export.mbtiles import write_mbtiles
+    from orthoswarm.export.tiles.mbtiles import write_mbtiles
 
     layer = _layer(args)
     path = dest / f"{layer.stem}.mbtiles"
@@ -108,7 +108,7 @@ def _mbtiles(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str])
 
 
 def _kmz(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
-    from orthoswarm.export.kmz import write_kmz
+    from orthoswarm.export.tiles.kmz import write_kmz
 
     layer = _layer(args)
     path = dest / f"{layer.stem}.kmz"

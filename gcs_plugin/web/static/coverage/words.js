@@ -3,7 +3,7 @@
 export const coverageWords = {
   "coverage.title": "Coverage", "coverage.none": "No area yet: plan one, or draw it.", "coverage.show": "Show on the map",
   "coverage.seen": "seen", "coverage.poor": "seen poorly", "coverage.missed": "missed", "coverage.planned": "not flown",
-  "coverage.recorded": "By recorded poses alone: {seen} seen. {placed} pictures are placed, {left} lie as recorded.",
+  "coverage.recorded": "By recorded poses alone: {seen} seen. {placed} {placed|picture is|pictures are} placed, {left} {left|lies|lie} as recorded.",
   "coverage.gaps": "{n} {n|gap|gaps}, {size} together", "coverage.nogaps": "No gap so far.",
   "coverage.gap": "{size}: {cause}", "coverage.sure": "{sure} sure", "coverage.more": "and {n} smaller ones",
   "coverage.missing.first": "the first: {image}", "coverage.missing.row": "{name}: {n} {cause} ({first})",
@@ -13,5 +13,5 @@ export const coverageWords = {
   "gapflight.plan": "Plan", "gapflight.confirm": "Upload, then check and start…", "gapflight.minutes": "Minutes that {name} can fly", "gapflight.left": "battery {battery}; minutes by what its flight has cost",
   "gapflight.ask": "battery {battery}; how many minutes it can fly is not known: enter them", "gapflight.unknown": "Enter how many minutes {name} can fly.", "gapflight.nobody": "No vehicle is on the links.",
   "gapflight.inair": "In the air: tick it to pause it and give it these legs in place of its mission.", "gapflight.pauses": "{name} is in the air: it is paused before it gets the new mission, and flies on when you start it.",
-  "gapflight.failed": "Not planned: {why}", "gapflight.uploading": "Uploading…", "gapflight.refused": "Not uploaded: {list}", "gapflight.part": "{name}: {length}, {time}, {photos} pictures, {sorties} {sorties|flight|flights}",
+  "gapflight.failed": "Not planned: {why}", "gapflight.uploading": "Uploading…", "gapflight.refused": "Not uploaded: {list}", "gapflight.part": "{name}: {length}, {time}, {photos} {photos|picture|pictures}, {sorties} {sorties|flight|flights}",
 };

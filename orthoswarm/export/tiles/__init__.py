@@ -1,0 +1,1 @@
+"""The orthoimage as web map tiles, drawn once for all files that hold them: MBTiles, PMTiles, KMZ."""

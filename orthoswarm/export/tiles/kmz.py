@@ -1,0 +1,163 @@
+"""KMZ: the orthoimage for globes and tactical maps; one ground overlay if it is small, else a pyramid of them.
+
+The pyramid is KML's "super-overlay": each node is shown while it is small on the screen and names its children. Nodes
+are quads of web map tiles. KML stretches an overlay evenly over latitude, web mercator does not: over a node of 512
+pixels of a map of 10 km that is less than a tenth of a pixel.
+"""
+
+import contextlib
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.tiles.mbtiles import encode_tile
+from orthoswarm.export.tiles.tile_pyramid import SIDE, Pyramid, Quad, degrees_of, draw_tiles
+
+Bytes = NDArray[np.uint8]
+Box = tuple[float, float, float, float]
+"""West, south, east, north in degrees."""
+_SINGLE_PX = 2048
+_TOP_NODES = 4
+"""A map that lies across a tile's border has no node of its own size; so up to four are at the top."""
+
+
+def write_kmz(
+    source: Path, path: Path, *, name: str = "orthoimage", progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write a georeferenced RGBA raster as KMZ.
+
+    Args:
+        source: the raster, an orthoimage.
+        path: the file; appears when it is complete.
+        name: shown by viewers.
+        progress: called with parts done and parts in all.
+
+    Raises:
+        InputError: if the raster cannot be read.
+        OrthoSwarmError: if the disk is full.
+    """
+    with kmz_file(path, name) as file:
+        draw_tiles(source, [file], progress)
+
+
+@contextlib.contextmanager
+def kmz_file(path: Path, name: str = "orthoimage") -> "Iterator[KmzFile]":
+    """A KMZ file to fill by `draw_tiles`; see `write_kmz`. It appears when the block ends without an error."""
+    with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+        yield KmzFile(archive, name)
+
+
+class KmzFile:
+    """An open KMZ file. See `tile_pyramid.TileFile`."""
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        self._archive, self._name = archive, name
+        self._images: dict[tuple[int, int, int], str] = {}
+        self._single: Bytes | None = None
+
+    def begin(self, pyramid: Pyramid) -> None:
+        """Write the root of a pyramid first, as readers expect it; a small picture is gathered in memory."""
+        self._pyramid = pyramid
+        self._finest = pyramid.finest.zoom - 1
+        self._top = next((k for k in pyramid.levels[1:] if k.count <= _TOP_NODES), pyramid.finest)
+        left, top, right, bottom = pyramid.pixels()
+        if max(right - left, bottom - top) <= _SINGLE_PX:
+            tiles = pyramid.finest
+            sides = (tiles.bottom // 2 - tiles.top // 2 + 1, tiles.right // 2 - tiles.left // 2 + 1)
+            self._single = np.zeros((sides[0] * 2 * SIDE, sides[1] * 2 * SIDE, 4), np.uint8)
+        else:
+            nodes = [(self._top.zoom, x, y) for x, y in self._top.tiles()]
+            links = [_network_link("{}/{}/{}.kml".format(*self._node(*node)), _box(*node)) for node in nodes]
+            self._archive.writestr("doc.kml", _document(self._name, "".join(links)))
+
+    def encode(self, quad: Quad) -> bytes | None:
+        """The picture of a node; None if the quad is none."""
+        if self._single is not None or quad.zoom < self._top.zoom:
+            return None
+        return encode_tile(quad.rgba, "jpg" if bool((quad.rgba[..., 3] == 255).all()) else "png")
+
+    def store(self, quad: Quad, encoded: bytes | None) -> None:
+        """Write a node's picture."""
+        if self._single is not None and quad.zoom == self._finest:
+            row, col = quad.y - self._pyramid.finest.top // 2, quad.x - self._pyramid.finest.left // 2
+            side = 2 * SIDE
+            self._single[row * side : (row + 1) * side, col * side : (col + 1) * side] = quad.rgba
+        elif encoded is not None:
+            level, row, col = self._node(quad.zoom, quad.x, quad.y)
+            image = f"{col}.png" if encoded[:4] == b"\x89PNG" else f"{col}.jpg"
+            self._archive.writestr(f"{level}/{row}/{image}", encoded)
+            self._images[quad.zoom, quad.x, quad.y] = image
+
+    def end(self) -> None:
+        """Write the single picture, or the nodes, which link to those of their children that show something."""
+        if self._single is not None:
+            self._write_single(self._single)
+            return
+        empty = dict.fromkeys((self._top.zoom, x, y) for x, y in self._top.tiles())  # doc.kml links to all of these
+        for (zoom, x, y), image in (empty | self._images).items():
+            level, row, col = self._node(zoom, x, y)
+            box = _box(zoom, x, y)
+            parts = [_region(box, 128, -1 if zoom == self._finest else 1024)]
+            parts += [_overlay("", image, box, level)] if image else []
+            for child in ((zoom + 1, 2 * x + j, 2 * y + i) for i in (0, 1) for j in (0, 1)):
+                if child in self._images:
+                    below = self._node(*child)
+                    parts.append(_network_link(f"../../{below[0]}/{below[1]}/{below[2]}.kml", _box(*child)))
+            self._archive.writestr(f"{level}/{row}/{col}.kml", _document("", "".join(parts)))
+
+    def _node(self, zoom: int, x: int, y: int) -> tuple[int, int, int]:
+        """Level (0 is the coarsest), row and column of a node, counted from the first of its level."""
+        level = zoom - self._top.zoom
+        return level, y - (self._top.top << level), x - (self._top.left << level)
+
+    def _write_single(self, rgba: Bytes) -> None:
+        left, top, right, bottom = self._pyramid.pixels()
+        aside, above = self._pyramid.finest.left % 2 * SIDE, self._pyramid.finest.top % 2 * SIDE
+        shown = np.ascontiguousarray(rgba[above + top : above + bottom, aside + left : aside + right])
+        overlay = _overlay(self._name, "overlay.png", self._pyramid.whole_pixel_bounds(), 0)
+        self._archive.writestr("doc.kml", _document(self._name, overlay))
+        self._archive.writestr("overlay.png", encode_tile(shown, "png"))
+
+
+def _box(zoom: int, x: int, y: int) -> Box:
+    (west, north), (east, south) = degrees_of(x, y, zoom), degrees_of(x + 1, y + 1, zoom)
+    return west, south, east, north
+
+
+def _document(name: str, content: str) -> str:
+    title = f"<name>{escape(name)}</name>" if name else ""
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+        f"{title}{content}</Document></kml>\n"
+    )
+
+
+def _overlay(name: str, image: str, box: Box, order: int) -> str:
+    west, south, east, north = box
+    title = f"<name>{escape(name)}</name>" if name else ""
+    return (
+        f"<GroundOverlay>{title}<drawOrder>{order}</drawOrder><Icon><href>{image}</href></Icon><LatLonBox>"
+        f"<north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east><west>{west:.9f}</west>"
+        "</LatLonBox></GroundOverlay>"
+    )
+
+
+def _region(box: Box, least: int, most: int) -> str:
+    west, south, east, north = box
+    return (
+        f"<Region><LatLonAltBox><north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east>"
+        f"<west>{west:.9f}</west></LatLonAltBox><Lod><minLodPixels>{least}</minLodPixels>"
+        f"<maxLodPixels>{most}</maxLodPixels></Lod></Region>"
+    )
+
+
+def _network_link(href: str, box: Box) -> str:
+    return (
+        f"<NetworkLink>{_region(box, 128, -1)}<Link><href>{href}</href>"
+        "<viewRefreshMode>onRegion</viewRefreshMode></Link></NetworkLink>"
+    )

@@ -1,0 +1,118 @@
+"""MBTiles: the orthoimage as web map tiles in one SQLite file, for tablets and offline maps."""
+
+import contextlib
+import errno
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.tiles.tile_pyramid import Pyramid, Quad, draw_tiles
+
+Bytes = NDArray[np.uint8]
+Format = Literal["png", "webp", "jpg"]
+Tile = tuple[int, int, bytes]
+_TABLES: Final = (
+    "PRAGMA journal_mode=OFF; PRAGMA synchronous=OFF; PRAGMA application_id=1297105496;"
+    "CREATE TABLE metadata (name text, value text);"
+    "CREATE TABLE tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob);"
+    "CREATE UNIQUE INDEX tile_index ON tiles (zoom_level, tile_column, tile_row);"
+)
+
+
+def write_mbtiles(
+    source: Path,
+    path: Path,
+    *,
+    name: str = "orthoimage",
+    tile_format: Format = "png",
+    quality: int = 85,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a georeferenced RGBA raster as MBTiles 1.3.
+
+    Args:
+        source: the raster, an orthoimage.
+        path: the file; appears when it is complete.
+        name: shown by viewers.
+        tile_format: "png" is read by all programs, "webp" is a third of its size, "jpg" has no transparency.
+        quality: of webp and jpg.
+        progress: called with parts done and parts in all.
+
+    Raises:
+        InputError: if the raster cannot be read.
+        OrthoSwarmError: if the disk is full.
+    """
+    with mbtiles_file(path, name=name, tile_format=tile_format, quality=quality) as file:
+        draw_tiles(source, [file], progress)
+
+
+@contextlib.contextmanager
+def mbtiles_file(
+    path: Path, *, name: str = "orthoimage", tile_format: Format = "png", quality: int = 85
+) -> "Iterator[MbtilesFile]":
+    """An MBTiles file to fill by `draw_tiles`; see `write_mbtiles`. It appears when the block ends without an error."""
+    with written_whole(path) as part, closing(sqlite3.connect(part)) as database:
+        try:
+            yield MbtilesFile(database, name, tile_format, quality)
+        except sqlite3.Error as error:
+            full = error.sqlite_errorcode == sqlite3.SQLITE_FULL
+            raise OSError(errno.ENOSPC if full else errno.EIO, str(error)) from None
+
+
+class MbtilesFile:
+    """An open MBTiles file. See `tile_pyramid.TileFile`."""
+
+    def __init__(self, database: sqlite3.Connection, name: str, tile_format: Format, quality: int) -> None:
+        self._database, self._name, self._format, self._quality = database, name, tile_format, quality
+
+    def begin(self, pyramid: Pyramid) -> None:
+        """Write the metadata."""
+        self._database.executescript(_TABLES)
+        west, south, east, north = pyramid.bounds
+        finest = pyramid.finest.zoom
+        rows = {
+            "name": self._name,
+            "format": self._format,
+            "type": "overlay",
+            "version": "1.0",
+            "description": "orthoimage made by OrthoSwarm",
+            "bounds": ",".join(f"{v:.10f}" for v in pyramid.whole_pixel_bounds()),
+            "center": f"{(west + east) / 2:.6f},{(south + north) / 2:.6f},{finest - 1}",
+            "minzoom": str(pyramid.levels[-1].zoom),
+            "maxzoom": str(finest),
+        }
+        self._database.executemany("INSERT INTO metadata VALUES (?, ?)", rows.items())
+
+    def encode(self, quad: Quad) -> list[Tile]:
+        """Column, row from the north and bytes of the quad's tiles."""
+        return [(x, y, encode_tile(rgba, self._format, self._quality)) for x, y, rgba in quad.tiles()]
+
+    def store(self, quad: Quad, encoded: list[Tile]) -> None:
+        """Insert tiles; MBTiles counts rows from the south."""
+        zoom = quad.zoom + 1
+        rows = [(zoom, x, 2**zoom - 1 - y, data) for x, y, data in encoded]
+        self._database.executemany("INSERT INTO tiles VALUES (?, ?, ?, ?)", rows)
+
+    def end(self) -> None:
+        """Commit."""
+        self._database.commit()
+
+
+def encode_tile(rgba: Bytes, tile_format: Format, quality: int = 85) -> bytes:
+    """A tile uint8 (rows, columns, 4) as PNG, WebP or JPEG (white where transparent)."""
+    import cv2
+
+    if tile_format == "jpg":
+        rgb = np.where(rgba[..., 3:] > 0, rgba[..., :3], 255).astype(np.uint8)
+        image, options = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    else:
+        opaque = bool((rgba[..., 3] == 255).all())
+        image = cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA if not opaque else cv2.COLOR_RGBA2BGR)
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 4] if tile_format == "png" else [cv2.IMWRITE_WEBP_QUALITY, quality]
+    return bytes(cv2.imencode("." + tile_format, image, options)[1])

@@ -1,0 +1,282 @@
+"""Web map tiles (XYZ, web mercator, 256 pixels) of an orthoimage, drawn once and handed to all files that want them.
+
+The finest zoom is warped from the orthoimage in blocks of 8 x 8 tiles; each coarser tile is the mean of its four finer
+ones. Tiles come four at a time, as the quad that their parent is made of, children before parents, so that no more than
+one block and one quad a zoom are in memory.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.canvas.overviews import reduce_rgba
+from orthoswarm.export.reduced_raster import ReducedRaster
+from orthoswarm.export.tiles.triangle_warp import warp
+from orthoswarm.model.earth import WEB_MERCATOR_M
+from orthoswarm.model.errors import InputError
+
+Bytes = NDArray[np.uint8]
+Tell = Callable[[int, int], None]
+SIDE: Final = 256
+_STEP: Final = 32
+"""Pixels between exactly transformed points: a tile bends by less than 1e-4 of a pixel between them."""
+_BLOCK_ZOOMS: Final = 3
+_DEEPEST: Final = 23
+_ENCODERS: Final = 2
+_AHEAD: Final = 32
+"""Quads of 1 MB that wait to be encoded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Tiles of one zoom: first and last column and row (from the north), inclusive."""
+
+    zoom: int
+    left: int
+    right: int
+    top: int
+    bottom: int
+
+    @property
+    def count(self) -> int:
+        """How many tiles."""
+        return (self.right - self.left + 1) * (self.bottom - self.top + 1)
+
+    def parent(self) -> "Range":
+        """The range one zoom coarser."""
+        return Range(self.zoom - 1, self.left // 2, self.right // 2, self.top // 2, self.bottom // 2)
+
+    def tiles(self) -> list[tuple[int, int]]:
+        """Column and row of each tile, row by row."""
+        return [(x, y) for y in range(self.top, self.bottom + 1) for x in range(self.left, self.right + 1)]
+
+    def has(self, x: int, y: int) -> bool:
+        """True if the tile of this column and row is in it."""
+        return self.left <= x <= self.right and self.top <= y <= self.bottom
+
+
+@dataclass(frozen=True, slots=True)
+class Pyramid:
+    """The tiles of an orthoimage.
+
+    Attributes:
+        bounds: west, south, east, north of the orthoimage in degrees.
+        levels: from the finest zoom to the one where a single tile holds all.
+    """
+
+    bounds: tuple[float, float, float, float]
+    levels: tuple[Range, ...]
+
+    @property
+    def finest(self) -> Range:
+        """The tiles of the finest zoom."""
+        return self.levels[0]
+
+    def pixels(self) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom of the orthoimage in whole pixels of the finest zoom, counted from its first tile.
+
+        Outwards to the next pixel's edge: GDAL (and so QGIS) shows complete pixels from the bounds on; bounds within a
+        pixel would shift the map by up to half a pixel.
+        """
+        west, south, east, north = self.bounds
+        zoom = self.finest.zoom
+        left, top = _tiles_from_north_west(west, north, zoom)
+        right, bottom = _tiles_from_north_west(east, south, zoom)
+        x, y = self.finest.left, self.finest.top
+        return (
+            math.floor((left - x) * SIDE),
+            math.floor((top - y) * SIDE),
+            math.ceil((right - x) * SIDE),
+            math.ceil((bottom - y) * SIDE),
+        )
+
+    def whole_pixel_bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north in degrees of `pixels`."""
+        left, top, right, bottom = self.pixels()
+        x, y, zoom = self.finest.left, self.finest.top, self.finest.zoom
+        west, north = degrees_of(x + left / SIDE, y + top / SIDE, zoom)
+        east, south = degrees_of(x + right / SIDE, y + bottom / SIDE, zoom)
+        return west, south, east, north
+
+
+@dataclass(frozen=True, slots=True)
+class Quad:
+    """Four tiles, those that the tile `zoom`, `x`, `y` is made of.
+
+    Attributes:
+        zoom: of the parent; -1 for the one tile of zoom 0. x, y: column, and row from the north, of the parent.
+        rgba: uint8 (512, 512, 4), something drawn.
+    """
+
+    zoom: int
+    x: int
+    y: int
+    rgba: Bytes
+
+    def tiles(self) -> Iterator[tuple[int, int, Bytes]]:
+        """Column, row from the north and pixels, uint8 (256, 256, 4), of its tiles where something is drawn."""
+        for i in (0, 1):
+            for j in (0, 1):
+                tile = np.ascontiguousarray(self.rgba[i * SIDE : (i + 1) * SIDE, j * SIDE : (j + 1) * SIDE])
+                if tile[..., 3].any():
+                    yield 2 * self.x + j, 2 * self.y + i, tile
+
+
+class TileFile(Protocol):
+    """A file that is being filled with tiles."""
+
+    def begin(self, pyramid: Pyramid) -> None:
+        """Called once, before the first quad."""
+
+    def encode(self, quad: Quad) -> Any:
+        """What is stored of a quad; called in other threads."""
+
+    def store(self, quad: Quad, encoded: Any) -> None:
+        """Store what `encode` returned, in the caller's thread, children before parents."""
+
+    def end(self) -> None:
+        """Called once, after the last quad."""
+
+
+def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = None) -> None:
+    """Draw the tiles of a georeferenced RGBA raster and store them in files.
+
+    Args:
+        source: the raster, an orthoimage. files: what is filled. progress: called with blocks done and blocks in all.
+
+    Raises:
+        InputError: if the raster cannot be read.
+        OrthoSwarmError: if the disk is full.
+    """
+    from rasterio.errors import RasterioError
+
+    try:
+        with ReducedRaster(source) as raster, ThreadPoolExecutor(_ENCODERS) as encoders:
+            pyramid = _pyramid(raster.full)
+            for file in files:
+                file.begin(pyramid)
+            waiting: deque[tuple[TileFile, Quad, Future[Any]]] = deque()
+            for quad in _Drawing(raster, pyramid, progress).quads():
+                waiting.extend((file, quad, encoders.submit(file.encode, quad)) for file in files)
+                while len(waiting) > _AHEAD:
+                    _store(*waiting.popleft())
+            while waiting:
+                _store(*waiting.popleft())
+            for file in files:
+                file.end()
+    except RasterioError as error:
+        raise InputError(f"{source} cannot be read ({error}); make the map again") from None
+
+
+def _store(file: TileFile, quad: Quad, encoded: Future[Any]) -> None:
+    file.store(quad, encoded.result())
+
+
+def degrees_of(x: float, y: float, zoom: int) -> tuple[float, float]:
+    """Longitude and latitude of a tile's north-western corner; x and y may be fractions."""
+    n = 2**zoom
+    return x / n * 360.0 - 180.0, math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y / n))))
+
+
+def _pyramid(raster: Any) -> Pyramid:
+    from rasterio.warp import transform_bounds
+
+    west, south, east, north = transform_bounds(raster.crs, "EPSG:4326", *raster.bounds, densify_pts=21)
+    latitude = math.radians(0.5 * (south + north))
+    zoom = math.ceil(math.log2(WEB_MERCATOR_M * math.cos(latitude) / SIDE / raster.res[0]) - 0.3)
+    zoom = min(max(zoom, 0), _DEEPEST)
+    left, top = _tile_of(west, north, zoom)
+    right, bottom = _tile_of(east, south, zoom)
+    levels = [Range(zoom, left, right, top, bottom)]
+    while levels[-1].count > 1 and levels[-1].zoom > 0:
+        levels.append(levels[-1].parent())
+    return Pyramid((west, south, east, north), tuple(levels))
+
+
+def _tile_of(lon: float, lat: float, zoom: int) -> tuple[int, int]:
+    n = 2**zoom
+    x, y = _tiles_from_north_west(lon, lat, zoom)
+    return min(max(int(x), 0), n - 1), min(max(int(y), 0), n - 1)
+
+
+def _tiles_from_north_west(lon: float, lat: float, zoom: int) -> tuple[float, float]:
+    n = 2**zoom
+    return (lon + 180.0) / 360.0 * n, (1.0 - math.asinh(math.tan(math.radians(lat))) / math.pi) / 2.0 * n
+
+
+class _Drawing:
+    """Draws the tiles of one raster."""
+
+    def __init__(self, raster: ReducedRaster, pyramid: Pyramid, progress: Tell | None) -> None:
+        from pyproj import Transformer
+
+        self._levels = {level.zoom: level for level in pyramid.levels}
+        self._finest, self._root = pyramid.levels[0], pyramid.levels[-1]
+        self._block_zoom = max(self._finest.zoom - _BLOCK_ZOOMS, self._root.zoom)
+        self._from_mercator = Transformer.from_crs("EPSG:3857", raster.full.crs, always_xy=True)
+        latitude = math.radians(0.5 * (pyramid.bounds[1] + pyramid.bounds[3]))
+        pixel_m = WEB_MERCATOR_M * math.cos(latitude) / SIDE / 2**self._finest.zoom
+        self._source = raster.at(pixel_m / raster.full.res[0])[0]
+        self._progress, self._done, self._blocks = progress, 0, self._levels[self._block_zoom].count
+
+    def quads(self) -> Iterator[Quad]:
+        """All quads with something drawn; the last one has the coarsest tile alone."""
+        root = self._root
+        tile = yield from self._below(root.zoom, root.left, root.top)
+        if tile is not None:
+            rgba = np.zeros((2 * SIDE, 2 * SIDE, 4), np.uint8)
+            top, left = root.top % 2 * SIDE, root.left % 2 * SIDE
+            rgba[top : top + SIDE, left : left + SIDE] = tile
+            yield Quad(root.zoom - 1, root.left // 2, root.top // 2, rgba)
+
+    def _below(self, zoom: int, x: int, y: int) -> Generator[Quad, None, Bytes | None]:
+        """The quads of a tile and of all below it; returns the tile itself."""
+        if zoom == self._block_zoom:
+            return (yield from self._of_block(x, y))
+        rgba: Bytes | None = None
+        for i in (0, 1):
+            for j in (0, 1):
+                if self._levels[zoom + 1].has(2 * x + j, 2 * y + i):
+                    tile = yield from self._below(zoom + 1, 2 * x + j, 2 * y + i)
+                    if tile is not None:
+                        rgba = np.zeros((2 * SIDE, 2 * SIDE, 4), np.uint8) if rgba is None else rgba
+                        rgba[i * SIDE : (i + 1) * SIDE, j * SIDE : (j + 1) * SIDE] = tile
+        if rgba is None:
+            return None
+        yield Quad(zoom, x, y, rgba)
+        return reduce_rgba(rgba, 2)
+
+    def _of_block(self, x: int, y: int) -> Generator[Quad, None, Bytes | None]:
+        """The same, of a tile of the zoom that is warped."""
+        rgba = self._warped(x, y)
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._blocks)
+        if rgba is None:
+            return None
+        side = 2 * SIDE
+        for zoom in range(self._finest.zoom - 1, self._block_zoom - 1, -1):
+            across = 1 << (zoom - self._block_zoom)
+            for i in range(across):
+                for j in range(across):
+                    part = rgba[i * side : (i + 1) * side, j * side : (j + 1) * side]
+                    if part[..., 3].any():
+                        yield Quad(zoom, x * across + j, y * across + i, np.ascontiguousarray(part))
+            rgba = reduce_rgba(rgba, 2)
+        return rgba
+
+    def _warped(self, x: int, y: int) -> Bytes | None:
+        """The pixels of the finest zoom below a tile of the zoom that is warped; None if nothing is there."""
+        tiles = 1 << (self._finest.zoom - self._block_zoom)
+        side_m = WEB_MERCATOR_M / 2**self._block_zoom
+        share = np.linspace(0.0, 1.0, tiles * SIDE // _STEP + 1)
+        east, north = np.meshgrid((x + share) * side_m - WEB_MERCATOR_M / 2, WEB_MERCATOR_M / 2 - (y + share) * side_m)
+        nodes = np.stack(self._from_mercator.transform(east, north), -1)
+        return warp(self._source, nodes, _STEP)
