@@ -1,1 +1,1 @@
-"""Benchmarks behind `orthoswarm bench`: accuracy, growth of the cost, other programs on the same photos."""
+"""Benchmarks of `orthoswarm bench`: accuracy, cost by number of pictures, comparison with other programs."""

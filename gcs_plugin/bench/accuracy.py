@@ -1,4 +1,4 @@
-"""Accuracy and cost of the methods on sets with truth: do nothing, the paper, swarm, true poses."""
+"""Accuracy and cost on data sets with truth: recorded poses, the paper's refiner, the default refiner, true poses."""
 
 import shutil
 import sys
@@ -6,7 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.bench.benchmark_runs import check_set, cost, described, keep, kept, label, machine, mosaic, share, text
+from gcs_plugin.bench.benchmark_runs import (
+    check_set,
+    cost,
+    described,
+    label,
+    machine,
+    mosaic,
+    read_result,
+    share,
+    text,
+    write_result,
+)
 from gcs_plugin.bench.pasting import paste
 
 METHODS = ("nothing", "paper", "swarm", "truth")
@@ -16,7 +27,7 @@ NAMES = {"nothing": "do nothing", "paper": "paper", "swarm": "swarm", "truth": "
 def run_accuracy(
     sets: Sequence[Path], methods: Sequence[str], out: Path, workers: int | None, keep_maps: bool
 ) -> dict[str, Any]:
-    """Measure every method on every set; what is in `out` already is not measured again.
+    """Measure every method on every set; results that exist in `out` are not measured again.
 
     Raises:
         InputError: if a folder is not a data set with truth.
@@ -27,17 +38,17 @@ def run_accuracy(
     for folder in sets:
         for method in methods:
             path = out / f"{folder.absolute().name}-{method}.json"
-            row = kept(path)
+            row = read_result(path)
             if row is None:
                 print(f"{folder.name}: {method}", file=sys.stderr, flush=True)
                 row = measure(folder, method, out / "map", workers, keep_maps)
-                keep(path, row)
+                write_result(path, row)
             rows.append(described(folder) | row)
     return {"machine": machine(), "rows": rows}
 
 
 def measure(folder: Path, method: str, out: Path, workers: int | None, keep_map: bool) -> dict[str, Any]:
-    """One set mapped by one method and compared with the truth; a failure is a row with its message."""
+    """Map one set by one method and compare it with the truth; a failure gives a row with its message."""
     from orthoswarm.evaluation.true_cameras import evaluate_poses
     from orthoswarm.model.errors import OrthoSwarmError
 
@@ -71,7 +82,7 @@ def judged(product: Path, folder: Path) -> dict[str, Any]:
 
 
 def true_orthoimage(folder: Path, out: Path, photos: Path | None = None) -> dict[str, Any]:
-    """Render a set from its true cameras over its true ground: the ceiling of the measure. Gives the time.
+    """Render a set from its true cameras and true terrain: the best result that can be measured. Returns the times.
 
     Args:
         folder: the set. out: where orthoimage.tif goes.
@@ -88,7 +99,7 @@ def true_orthoimage(folder: Path, out: Path, photos: Path | None = None) -> dict
     true = read_truth(folder / "truth" / "frames.csv")
     frames = [f for f in telemetry.load([photos or folder / "photos"]).frames if f.image in true]
     if not frames:
-        raise InputError(f"no photo of {folder} stands in its truth/frames.csv; make the set again")
+        raise InputError(f"truth/frames.csv lists no photo of {folder}; make the set again")
     placed = [PlacedFrame(f, true[f.image][2], "fine", 0.0) for f in frames]
     paste(placed, _true_ground(folder), true[frames[0].image][1], out)
     return {"wall_s": perf_counter() - wall, "cpu_s": process_time() - cpu, "frames": len(placed)}
@@ -109,7 +120,7 @@ def _true_ground(folder: Path) -> Any:
 
 
 def accuracy_table(result: dict[str, Any]) -> str:
-    """The result as a Markdown table; what is within a metre stands as a share of what true poses reach."""
+    """The result as a Markdown table; the share within 1 m is also given relative to that of the true poses."""
     lines = [
         f"Machine: {result['machine']}.",
         "",
@@ -127,7 +138,7 @@ def accuracy_table(result: dict[str, Any]) -> str:
         best, poses = within.get(row["set"]), row.get("poses") or {}
         fov = [abs(v) for v in (poses.get("fov_error_deg") or {}).values() if v is not None]
         centres = " / ".join(text(poses.get(f"center_ground_{k}_m"), 2) for k in ("median", "p95")) if poses else "-"
-        honest = " / ".join(share(poses.get(f"sigma_within_{k}"), 0) for k in (1, 2)) if poses else "-"
+        within_sigma = " / ".join(share(poses.get(f"sigma_within_{k}"), 0) for k in (1, 2)) if poses else "-"
         cells = [
             text(row["median_m"], 3),
             text(row["p95_m"], 3),
@@ -135,7 +146,7 @@ def accuracy_table(result: dict[str, Any]) -> str:
             share(row["share_within_1m"]),
             share(row["share_within_1m"] / best if best else None),
             centres,
-            honest,
+            within_sigma,
             text(max(fov, default=None), 2),
             *(text(row.get(k), 0) for k in ("cpu_s", "wall_s", "peak_rss_mb")),
         ]

@@ -1,4 +1,4 @@
-"""Bring what other programs made to the ground: camera models by recorded positions, pictures by a homography."""
+"""Georeferencing of other programs' results: camera models by recorded positions, mosaics by a homography."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,19 +27,19 @@ class Similarity(NamedTuple):
     shift: Array
 
     def apply(self, points: Array) -> Array:
-        """Points (..., 3) moved."""
+        """Transformed points (..., 3)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
 
 def fit_similarity(source: Array, target: Array, rounds: int = 30) -> Similarity:
-    """The similarity that brings points to others, robustly: least squares (Umeyama), reweighted by the residuals.
+    """Robust similarity from source to target points: iteratively reweighted least squares (Umeyama).
 
     Args:
         source: (N, 3), any frame and scale. target: (N, 3), metres.
-        rounds: of reweighting; weights are Geman-McClure's with the residuals' own median as their scale.
+        rounds: of reweighting, with Geman-McClure weights scaled by the median residual.
 
     Raises:
-        OrthoSwarmError: if there are fewer than four points, or all lie on one line: then they leave a turn open.
+        OrthoSwarmError: for fewer than four points, or collinear ones, which leave a rotation undetermined.
     """
     if len(source) < _LEAST_CAMERAS:
         raise OrthoSwarmError(f"{len(source)} cameras are too few to place a model")
@@ -58,7 +58,7 @@ def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
     s, t = source - mean_s, target - mean_t
     u, d, vt = np.linalg.svd((t * weight[:, None]).T @ s)
     if d[1] < 1e-6 * max(d[0], 1e-300):
-        raise OrthoSwarmError("its cameras lie on one line, which leaves a turn open")
+        raise OrthoSwarmError("its cameras are collinear, which leaves a rotation undetermined")
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / (weight @ (s * s).sum(1)))
@@ -66,10 +66,10 @@ def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
 
 
 def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array]) -> "tuple[dict[str, Camera], float]":
-    """Cameras of all models in the recorded grid, and the level of the ground below them.
+    """Cameras of all models in the grid of the recorded positions, and the median ground height.
 
-    Each model is placed by itself, the largest first; a picture in two models takes the larger one's camera. Models of
-    fewer than four cameras, or along one line, are left out.
+    Each model is georeferenced independently, the largest first; a picture in two models gets the larger one's camera.
+    Models with fewer than four cameras, or collinear ones, are left out.
 
     Args:
         models: as inside/colmap.py writes them.
@@ -92,32 +92,32 @@ def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array
             to_grid = fit_similarity(centers, np.array([recorded[k] for k in own]).reshape(-1, 3))
         except OrthoSwarmError:
             continue
-        for (name, said), center in zip(own.items(), to_grid.apply(centers), strict=True):
-            lens = Lens(said["width"], said["height"], said["focal_px"], k1=said["k1"])
-            cameras.setdefault(name, Camera(center, to_grid.rotation @ np.array(said["rotation"]), lens))
+        for (name, camera), center in zip(own.items(), to_grid.apply(centers), strict=True):
+            lens = Lens(camera["width"], camera["height"], camera["focal_px"], k1=camera["k1"])
+            cameras.setdefault(name, Camera(center, to_grid.rotation @ np.array(camera["rotation"]), lens))
         points = np.array(model["points"]).reshape(-1, 3)
         heights.append(to_grid.apply(points)[:, 2])
     known = np.concatenate(heights) if heights else np.zeros(0)
     if not len(known):
-        raise OrthoSwarmError("no model has the cameras and points to be placed by recorded positions")
+        raise OrthoSwarmError("no model has enough cameras and points to be georeferenced by recorded positions")
     return cameras, float(np.median(known))
 
 
 def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
-    """Lay a picture on the reference by one homography, whatever georeference it has, and write it as a GeoTIFF (RGBA).
+    """Warp a mosaic onto the reference by one homography, ignoring its own georeference; writes a GeoTIFF (RGBA).
 
-    The homography comes from SIFT matches between both (MAGSAC): no hand takes part. It is fitted to the truth, so that
-    only the picture's inner shape is judged afterwards, in the picture's favour.
+    The homography is estimated automatically from SIFT matches between both (MAGSAC). Since it is fitted to the truth,
+    the comparison afterwards measures only the mosaic's internal geometry, in its favour.
 
     Args:
-        picture: RGB or RGBA in a file; what is black or transparent is empty.
+        picture: RGB or RGBA file; black or transparent pixels are empty.
         reference: the true map. out: the file to write.
 
     Returns:
         Number of matches that agree.
 
     Raises:
-        OrthoSwarmError: if the picture fits nowhere.
+        OrthoSwarmError: if the mosaic cannot be registered.
     """
     import cv2
     import rasterio
@@ -142,9 +142,9 @@ def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
 
 
 def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
-    """Red, green, blue (rows, columns, 3) of a file, black where it is empty, with at most so many pixels.
+    """RGB (rows, columns, 3) of a file, black where it is empty, reduced to at most `most` pixels.
 
-    Gives how many of the file's pixels one of these is wide and high, too.
+    Also returns the width and height of a reduced pixel in pixels of the file.
     """
     import warnings
 
@@ -168,20 +168,20 @@ def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
 
 
 def _enlarged(per: Array) -> Array:
-    """From pixels of a reduced picture to those of the whole; pixel centres at integers."""
+    """Transformation (3, 3) from pixels of a reduced picture to those of the full one; pixel centres at integers."""
     x, y = per
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:
-    """The homography from a grey picture to a grey map, from SIFT matches; with the number that agree.
+    """The homography from a grey picture to a grey map by SIFT matches, and the number of inliers.
 
     Raises:
-        OrthoSwarmError: if fewer than forty agree.
+        OrthoSwarmError: for fewer than forty inliers.
     """
     import cv2
 
-    lost = OrthoSwarmError("its picture fits nowhere on the true map")
+    lost = OrthoSwarmError("its mosaic could not be registered on the true map")
     sift = cv2.SIFT_create(nfeatures=20000)  # type: ignore[attr-defined,unused-ignore]
     (here, own), (there, other) = sift.detectAndCompute(picture, None), sift.detectAndCompute(ground, None)
     if own is None or other is None or len(own) < 2 or len(other) < 2:
@@ -194,7 +194,7 @@ def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tu
     b = np.array([there[p[0].trainIdx].pt for p in pairs])
     try:
         h, mask = cv2.findHomography(a, b, cv2.USAC_MAGSAC, 8.0, maxIters=20000, confidence=0.9999)
-    except cv2.error:  # OpenCV 5 throws where it finds no model
+    except cv2.error:  # OpenCV 5 raises an error where it finds no homography
         raise lost from None
     if h is None or int(mask.sum()) < _LEAST_INLIERS:
         raise lost

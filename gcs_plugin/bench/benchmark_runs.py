@@ -1,4 +1,4 @@
-"""What all benchmarks share: sets, kept results, a run of `mosaic` in a process of its own, the machine in words."""
+"""Shared parts of all benchmarks: data sets, cached results, a `mosaic` run as a process, the machine."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 
 def check_set(folder: Path, *, truth: bool = False) -> None:
-    """See that a folder is a set of `twin make`.
+    """Check that a folder is a data set of `twin make`.
 
     Raises:
         InputError: if its photos, its map or (where asked for) its truth is missing.
@@ -27,7 +27,7 @@ def check_set(folder: Path, *, truth: bool = False) -> None:
 
 
 def described(folder: Path) -> dict[str, Any]:
-    """What a set is, from its manifest: its name, and disaster, noise, seed and what else is special (None unknown)."""
+    """Name, disaster, noise, seed and special parameters of a set, from its manifest; None where unknown."""
     manifest = folder / "truth" / "manifest.json"
     known = json.loads(manifest.read_text(encoding="utf-8")) if manifest.exists() else {}
     special = []
@@ -44,23 +44,23 @@ def described(folder: Path) -> dict[str, Any]:
 
 
 def label(row: dict[str, Any]) -> str:
-    """A set in the words of a table: disaster, noise, what is special, seed; else its folder's name."""
+    """A set's label in tables: disaster, noise, special parameters, seed; else its folder's name."""
     if row.get("disaster") is None or row.get("seed") is None:
         return str(row["set"])
     disaster = {"none": "clear", "all": "all disasters"}.get(row["disaster"], row["disaster"])
     return ", ".join([disaster, row["noise"], *row.get("special", ()), f"seed {row['seed']}"])
 
 
-def keep(path: Path, value: Any) -> None:
-    """Write a result as JSON; its name never stands on half of it."""
+def write_result(path: Path, value: Any) -> None:
+    """Write a result as JSON; the file is complete or absent."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     part.write_text(json.dumps(value, indent=1), encoding="utf-8")
     os.replace(part, path)
 
 
-def kept(path: Path) -> Any:
-    """A result that was kept, None if there is none that can be read."""
+def read_result(path: Path) -> Any:
+    """A result of an earlier run, None if there is none that can be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -72,8 +72,8 @@ def pictures(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg") and p.is_file())
 
 
-def linked(photos: Sequence[Path], root: Path, target: Path, *, flat: bool = False) -> None:
-    """Lay out photos afresh in a folder, as hard links where the file system allows.
+def link_photos(photos: Sequence[Path], root: Path, target: Path, *, flat: bool = False) -> None:
+    """Put photos into an emptied folder, as hard links where the file system allows it, else as copies.
 
     Args:
         photos: files below root. root: their common folder.
@@ -99,7 +99,7 @@ def mosaic_command(photos: Path, basemap: Path, out: Path, how: Sequence[str], w
 
 
 def mosaic(photos: Path, basemap: Path, out: Path, how: Sequence[str], workers: int | None) -> dict[str, Any]:
-    """The report of a `mosaic` run in a process of its own.
+    """Run `mosaic` as a separate process and return its report.
 
     Raises:
         OrthoSwarmError: if it failed, with its message.
@@ -108,20 +108,20 @@ def mosaic(photos: Path, basemap: Path, out: Path, how: Sequence[str], workers: 
     command = mosaic_command(photos, basemap, out, how, workers)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise OrthoSwarmError(last_words(done.stderr))
+        raise OrthoSwarmError(error_line(done.stderr))
     report: dict[str, Any] = json.loads(done.stdout)
     return report
 
 
-def last_words(stderr: str) -> str:
-    """The line that says why a program ended: this program's message, else the last line of all."""
+def error_line(stderr: str) -> str:
+    """The line of stderr that says why a program failed: this program's own message, else the last line."""
     lines = [line.strip() for line in stderr.splitlines() if line.strip()]
     own = [line for line in lines if line.startswith("orthoswarm:")]
     return ((own or lines) or ["it ended without a message"])[-1].removeprefix("orthoswarm: ")
 
 
 def cost(report: dict[str, Any]) -> dict[str, Any]:
-    """What a run cost, from its report; stages of one name before the colon are added."""
+    """CPU time, wall time and memory of a run from its report; stages with the same name before the colon are added."""
     stages: dict[str, float] = {}
     for stage in report["stages"]:
         name = stage["name"].split(":")[0]
@@ -141,10 +141,10 @@ def share(value: float | None, digits: int = 1) -> str:
 
 
 def numbers(value: str, flag: str) -> list[int]:
-    """A list of numbers with commas between.
+    """A comma-separated list of positive whole numbers.
 
     Raises:
-        InputError: if it is none.
+        InputError: if it is not such a list.
     """
     try:
         found = [int(part) for part in value.split(",") if part.strip()]
@@ -156,7 +156,7 @@ def numbers(value: str, flag: str) -> list[int]:
 
 
 def machine() -> str:
-    """The machine in words: cores that may be used, processor, GPU."""
+    """Description of the machine: usable cores, processor, GPU."""
     import platform
 
     from orthoswarm.compute.workers import cores

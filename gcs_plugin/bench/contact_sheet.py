@@ -1,4 +1,4 @@
-"""The maps of all programs side by side in one picture, each with its verdict."""
+"""A picture with the maps of all programs side by side, each with its accuracy."""
 
 import os
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 Cell = tuple[str, Path | None]
-"""What stands above a map, and its small picture; None where there is no map."""
+"""Title above a map, and its thumbnail; None where there is no map."""
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[Cell]]], out: Path) -> None:
@@ -43,7 +43,7 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[Cell]]], out: Path) -> None
 
 
 def verdict(title: str, row: dict[str, Any]) -> str:
-    """What stands above a map: the program and its share of right ground."""
+    """Title above a map: the program and the share of the ground within 1 m of its true position."""
     if "error" in row:
         return f"{title}\nfailed"
     if row["right_share"] is None:

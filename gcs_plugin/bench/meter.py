@@ -1,6 +1,6 @@
-"""Run a command with a limit and measure all its processes together: CPU time, memory, time on the clock.
+"""Run a command with a limit and measure all its processes together: CPU time, memory, wall time.
 
-Linux only: the processes are found in /proc by the session that they were started in.
+Linux only: the processes are found in /proc by their session id.
 """
 
 import contextlib
@@ -21,11 +21,11 @@ _WALL_FACTOR = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What a command used.
+    """Resources that a command used.
 
     Attributes:
         code: exit code, None if it was stopped at the limit.
-        wall_s: seconds on the clock. cpu_s: CPU seconds of all its processes.
+        wall_s: wall time, seconds. cpu_s: CPU seconds of all its processes.
         peak_rss_mb: largest sum of their resident sizes, megabytes; pages that they share count for each.
     """
 
@@ -47,9 +47,9 @@ def run_measured(
     Args:
         command: program and arguments.
         log: where its stderr goes (and its stdout, without `out`).
-        limit_s: CPU seconds that all its processes may use; it is stopped, too, when twenty times as much has
-            passed on the clock. CPU time is what other work on the machine does not change.
-        env: variables beside those of this process.
+        limit_s: CPU seconds that all its processes may use; it is also stopped after twenty times as much wall time.
+            CPU time, since other work on the machine does not change it.
+        env: variables in addition to those of this process.
         out: where its stdout goes.
 
     Raises:
@@ -77,21 +77,21 @@ def run_measured(
                     time.sleep(_EVERY_S)
             process.returncode = os.waitstatus_to_exitcode(status)
         finally:
-            with contextlib.suppress(ProcessLookupError, PermissionError):  # what it left behind, or Ctrl-C
+            with contextlib.suppress(ProcessLookupError, PermissionError):  # remaining child processes, or Ctrl-C
                 os.killpg(process.pid, signal.SIGKILL)
     used = max(used, usage.ru_utime + usage.ru_stime)
     return Measured(None if stopped else process.returncode, time.monotonic() - start, used, memory)
 
 
 def session_usage(session: int) -> tuple[float, float]:
-    """CPU seconds and resident megabytes of the processes of a session that live; their dead children's time counts."""
+    """CPU seconds and resident megabytes of a session's living processes, with the CPU time of their ended children."""
     ticks, page = os.sysconf("SC_CLK_TCK"), os.sysconf("SC_PAGE_SIZE")
     cpu, pages = 0, 0
     for entry in _PROC.iterdir():
         if not entry.name.isdigit():
             continue
         try:
-            # the name may hold spaces and brackets: what counts follows its last closing bracket
+            # the process name may contain spaces and brackets; the fields follow its last closing bracket
             fields = (entry / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
         except OSError:
             continue

@@ -1,4 +1,4 @@
-"""Orthoimages from cameras that somebody else says: pasted on given ground with this program's renderer."""
+"""Orthoimages from cameras and terrain of another source, rendered by this program."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,13 +7,13 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 
 
 def paste(placed: Sequence[PlacedFrame], terrain: Terrain, epsg: int, out: Path) -> Path:
-    """Render frames over given ground into OUT/orthoimage.tif (COG, RGBA) and give its path.
+    """Render frames over a terrain into OUT/orthoimage.tif (COG, RGBA) and return its path.
 
     Args:
         placed: frames with cameras in the grid `epsg`; heights share the datum of the terrain.
         terrain: ground heights.
         epsg: the UTM zone.
-        out: a folder, made where it is not there.
+        out: a folder, created if missing.
     """
     from orthoswarm.canvas.canvas import Canvas
     from orthoswarm.export.cog import write_cog

@@ -1,7 +1,7 @@
-"""Other programs on the same photos, side by side with this one (the paper's Table I): accuracy, time, memory.
+"""Comparison with other programs on the same photos (the paper's Table I): accuracy, time, memory.
 
-Each runs in a virtual environment of its own, made on first use; none of them is a dependency. Each gets the same
-photos, the same number of threads, the same limit, and is measured in the same way, as is this program.
+Each program runs in its own virtual environment, made on first use; none of them is a dependency. All, this one
+included, get the same photos, number of threads and limit, and are measured in the same way.
 """
 
 import os
@@ -17,22 +17,22 @@ from gcs_plugin.bench.accuracy import judged, true_orthoimage
 from gcs_plugin.bench.benchmark_runs import (
     check_set,
     described,
-    keep,
-    kept,
+    error_line,
     label,
-    last_words,
-    linked,
+    link_photos,
     machine,
     mosaic_command,
     pictures,
+    read_result,
     share,
     text,
+    write_result,
 )
 from gcs_plugin.bench.meter import run_measured
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 SUCCESS = 0.9
-"""A map succeeded when this share of the ground that the photos show lies within a metre of its true place."""
+"""A map succeeds if at least this share of the photographed ground is within a metre of its true position."""
 
 _INSIDE = Path(__file__).parent / "inside"
 
@@ -43,7 +43,7 @@ class Job:
 
     Attributes:
         folder: the set. photos: those to use, in their sub-folders. flat: the same, all in one folder.
-        out: an empty folder for what it makes. threads: how many it may use.
+        out: an empty folder for its results. threads: how many it may use.
     """
 
     folder: Path
@@ -59,12 +59,12 @@ class Program:
 
     Attributes:
         title: its name in the table.
-        packages: what its environment needs, for pip; empty for this program itself.
-        command: the command line of a job, given the environment's folder of programs.
-        product: makes the GeoTIFF that is judged from what the program made; gives its path and how many pictures are
-            in it (None where it does not say).
-        georeferenced: how it knows where it is, for the table.
-        placed: False for a program whose map has no place, and is judged by its shape alone.
+        packages: pip requirements of its environment; empty for this program itself.
+        command: the command line of a job, from the job and the environment's folder of executables.
+        product: makes the GeoTIFF that is evaluated from the program's results; returns its path and the number of
+            pictures in it (None where unknown).
+        georeferenced: the source of its georeference, for the table.
+        placed: False for a program without georeference; only the internal geometry of its map is evaluated.
     """
 
     title: str
@@ -85,7 +85,7 @@ def _own(refine: str) -> Program:
         )
 
     def product(job: Job) -> tuple[Path, int | None]:
-        report = kept(job.out / "map" / "report.json") or {}
+        report = read_result(job.out / "map" / "report.json") or {}
         return job.out / "map" / "orthoimage.tif", report.get("frames", {}).get("used")
 
     return Program(
@@ -99,7 +99,7 @@ def _orthomosaic_command(job: Job, programs: Path) -> list[str]:
 
 
 def _orthomosaic_product(job: Job) -> tuple[Path, int | None]:
-    report = kept(job.out / "ortho_report.json") or {}
+    report = read_result(job.out / "ortho_report.json") or {}
     if not report.get("georeferenced", True):
         raise OrthoSwarmError("it made a picture without georeference")
     return job.out / "ortho.tif", report.get("images_used")
@@ -115,9 +115,9 @@ def _script(name: str) -> Callable[[Job, Path], list[str]]:
 def _stitched(job: Job) -> tuple[Path, int | None]:
     from gcs_plugin.bench.alignment import lay_on_reference
 
-    out = job.out / "laid.tif"  # the best that anyone could do with it afterwards
+    out = job.out / "laid.tif"  # the most favourable georeference that it could get
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
-    return out, (kept(job.out / "said.json") or {}).get("used")
+    return out, (read_result(job.out / "said.json") or {}).get("used")
 
 
 def _pasted(job: Job) -> tuple[Path, int | None]:
@@ -136,7 +136,7 @@ def _pasted(job: Job) -> tuple[Path, int | None]:
     recorded = {
         name: np.array([*np.ravel(grid.to_grid(f.lat_deg, f.lon_deg)), f.height_m], float) for name, f in fixes.items()
     }
-    cameras, level = placed_models(kept(job.out / "poses.json") or [], recorded)
+    cameras, level = placed_models(read_result(job.out / "poses.json") or [], recorded)
     placed = [PlacedFrame(frames[name], camera, "fine", 0.0) for name, camera in sorted(cameras.items())]
     return paste(placed, Terrain.flat(level), epsg, job.out), len(placed)
 
@@ -191,39 +191,39 @@ class Settings:
     keep_maps: bool
 
     def path(self, folder: Path, name: str, suffix: str) -> Path:
-        """Where something about one program on one set is kept."""
+        """Path of a result of one program on one set."""
         thin = f"-every{self.every}" if self.every > 1 else ""
         return self.out / f"{folder.absolute().name}-{name}{thin}{suffix}"
 
 
 def run_peers(sets: Sequence[Path], settings: Settings) -> dict[str, Any]:
-    """Run every program on every set; what is in the folder of results already is not run again.
+    """Run every program on every set; results that exist in the output folder are not computed again.
 
     Raises:
         InputError: if a folder is not a data set with truth, or a program is not known.
     """
     unknown = set(settings.programs) - set(PROGRAMS)
     if unknown or not settings.programs:
-        raise InputError(f"--programs takes some of {', '.join(PROGRAMS)}; give them with commas between")
+        raise InputError(f"--programs accepts {', '.join(PROGRAMS)}; give one or more, separated by commas")
     for folder in sets:
         check_set(folder, truth=True)
     rows = []
     for folder in sets:
-        ceiling = _kept(folder, "truth", settings)
+        ceiling = _result(folder, "truth", settings)
         for name in settings.programs:
-            rows.append(described(folder) | with_verdict(_kept(folder, name, settings), ceiling))
+            rows.append(described(folder) | with_verdict(_result(folder, name, settings), ceiling))
         rows.append(described(folder) | with_verdict(ceiling, ceiling))
     return {"machine": machine(), "limit_s": settings.limit_s, "threads": settings.threads, "rows": rows}
 
 
-def _kept(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
+def _result(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
     path = settings.path(folder, name, ".json")
-    row = kept(path)
+    row = read_result(path)
     if row is None:
         print(f"{folder.name}: {name}", file=sys.stderr, flush=True)
         row = _ceiling(folder, settings) if name == "truth" else _row(folder, name, settings)
         row |= {"program": name, "every": settings.every}
-        keep(path, row)
+        write_result(path, row)
     found: dict[str, Any] = row
     return found
 
@@ -237,10 +237,10 @@ def thinned(folder: Path, every: int) -> list[Path]:
 
 
 def _ceiling(folder: Path, settings: Settings) -> dict[str, Any]:
-    """The map from true poses of the same photos: how much ground there is to win."""
+    """The map from the true poses of the same photos: the best result that can be measured."""
     photos, out = settings.out / "photos", settings.out / "run"
     chosen = thinned(folder, settings.every)
-    linked(chosen, folder / "photos", photos)
+    link_photos(chosen, folder / "photos", photos)
     shutil.rmtree(out, ignore_errors=True)
     row = true_orthoimage(folder, out, photos) | {"photos": len(chosen)}
     row |= judged(out / "orthoimage.tif", folder) | {"used": row["frames"]}
@@ -254,8 +254,8 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
     program, base = PROGRAMS[name], settings.out
     chosen = thinned(folder, settings.every)
     job = Job(folder.absolute(), base / "photos", base / "flat", base / "run" / name, settings.threads)
-    linked(chosen, folder / "photos", job.photos)
-    linked(chosen, folder / "photos", job.flat, flat=True)
+    link_photos(chosen, folder / "photos", job.photos)
+    link_photos(chosen, folder / "photos", job.flat, flat=True)
     shutil.rmtree(job.out, ignore_errors=True)
     job.out.mkdir(parents=True)
     row: dict[str, Any] = {"photos": len(chosen)}
@@ -270,7 +270,7 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
         if used.code is None:
             raise OrthoSwarmError(f"stopped at the limit of {settings.limit_s:.0f} CPU s")
         if used.code:
-            raise OrthoSwarmError(last_words(log.read_text(encoding="utf-8", errors="replace")))
+            raise OrthoSwarmError(error_line(log.read_text(encoding="utf-8", errors="replace")))
         product, row["used"] = program.product(job)
         _picture(product, settings.path(folder, name, ".jpg"))
         if not program.placed:
@@ -285,7 +285,7 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
 
 
 def _shape(product: Path, job: Job) -> dict[str, Any] | None:
-    """The figures of a map without its place: laid on the truth by one homography. None where it fits nowhere."""
+    """The figures of a map after registration on the truth by one homography; None where that fails."""
     from gcs_plugin.bench.alignment import lay_on_reference
 
     laid = job.out / "shape.tif"
@@ -308,7 +308,7 @@ def _threads(count: int) -> dict[str, str]:
 
 
 def environment(name: str, root: Path) -> Path:
-    """The folder of programs of a program's own virtual environment, made where it is not there yet.
+    """The folder of executables of a program's own virtual environment, made if missing.
 
     Raises:
         OrthoSwarmError: if it cannot be installed, with pip's message.
@@ -325,13 +325,13 @@ def environment(name: str, root: Path) -> Path:
     ):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise OrthoSwarmError(f"it could not be installed: {last_words(done.stderr)}")
+            raise OrthoSwarmError(f"it could not be installed: {error_line(done.stderr)}")
     (folder / "made").touch()
     return programs
 
 
 def _versions(programs: Path, program: Program) -> str:
-    """The installed version of a program, as its environment says it."""
+    """The version of a program that is installed in its environment."""
     if not program.packages:
         from orthoswarm import __version__
 
@@ -343,7 +343,7 @@ def _versions(programs: Path, program: Program) -> str:
 
 
 def _picture(product: Path, out: Path) -> None:
-    """A small picture of a map on white, to be looked at."""
+    """Write a thumbnail of a map on white."""
     import numpy as np
     import rasterio
     from PIL import Image
@@ -352,9 +352,9 @@ def _picture(product: Path, out: Path) -> None:
         scale = max(1.0, max(file.width, file.height) / 900.0)
         shape = (max(1, round(file.height / scale)), max(1, round(file.width / scale)))
         data = file.read([1, 2, 3], out_shape=(3, *shape), resampling=rasterio.enums.Resampling.average)
-        seen = file.dataset_mask(out_shape=shape) > 0
+        drawn = file.dataset_mask(out_shape=shape) > 0
     part = out.with_suffix(".part")
-    Image.fromarray(np.moveaxis(np.where(seen, data, 255), 0, -1).astype(np.uint8)).save(part, "JPEG", quality=85)
+    Image.fromarray(np.moveaxis(np.where(drawn, data, 255), 0, -1).astype(np.uint8)).save(part, "JPEG", quality=85)
     os.replace(part, out)
 
 
@@ -364,9 +364,9 @@ def _picture(product: Path, out: Path) -> None:
 def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]:
     """A row with `right_share`, `shape_share` and `succeeded`.
 
-    `right_share` is the ground within a metre of its true place, as a share of the ground that a map from the true
-    poses of the same photos covers: what is missing from a map counts against it like what is wrong. `shape_share` is
-    the same for the map laid on the truth by one homography, where that was done.
+    `right_share` is the ground within a metre of its true position, as a share of the ground covered by a map from the
+    true poses of the same photos, so that missing ground counts like wrong ground. `shape_share` is the same after
+    registration on the truth by one homography, where that was done.
     """
     if "error" in row or not ceiling.get("blocks"):
         return row | {"succeeded": False}
@@ -382,7 +382,7 @@ def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]
 
 
 def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
-    """Draw the maps of all programs side by side, one row for each set."""
+    """Draw the maps of all programs side by side, one row per set."""
     from gcs_plugin.bench.contact_sheet import contact_sheet, verdict
 
     by_set: dict[str, list[tuple[str, Path | None]]] = {}

@@ -1,4 +1,4 @@
-"""How cost grows with vehicles (the paper's Fig. 7) and with pictures a vehicle (Fig. 8), from runs of their own."""
+"""Cost by number of vehicles (the paper's Fig. 7) and by pictures per vehicle (Fig. 8), each from separate runs."""
 
 import os
 import shutil
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.bench.benchmark_runs import cost, keep, kept, linked, machine, mosaic, pictures
+from gcs_plugin.bench.benchmark_runs import cost, link_photos, machine, mosaic, pictures, read_result, write_result
 from orthoswarm.model.errors import InputError
 
 FLAT = 0.2
-"""Cost per picture counts as flat while it stays within this share of that of the smallest block."""
+"""Cost per picture counts as constant if it differs by at most this share from that of the smallest block."""
 _SMALLEST_BLOCK = 1000
 
 
@@ -25,36 +25,36 @@ def run_scaling(
     workers: int | None,
     maps: bool,
 ) -> dict[str, Any]:
-    """Map the first vehicles of a set, then the first pictures of all of them; each run's report.json is kept.
+    """Map the first vehicles of a set, then the first pictures of all of them; each run's report.json is stored.
 
-    Vehicles with fewer pictures than the fullest are left out (a set that is still being made).
+    Vehicles with fewer pictures than the largest number of the set are left out (a set that is still being made).
 
     Args:
-        folder: the set. counts: numbers of vehicles; those that the set does not have are left out.
-        images: pictures a vehicle, with the largest number of vehicles. refine: the refiner.
-        out: folder of results; what is there already is not run again. workers: processes at once.
-        maps: keep the maps.
+        folder: the set. counts: numbers of vehicles; numbers above that of the set are left out.
+        images: pictures per vehicle, for the runs with the largest number of vehicles. refine: the refiner.
+        out: folder of results; existing ones are not computed again. workers: processes at once.
+        maps: whether to keep the maps.
 
     Raises:
         InputError: if the set has no vehicles, or none of the numbers fits.
     """
     vehicles = {p: pictures(p) for p in sorted((folder / "photos").iterdir()) if p.is_dir()}
     most = max((len(v) for v in vehicles.values()), default=0)
-    whole = [photos for photos in vehicles.values() if photos and len(photos) == most]
-    if len(whole) < len(vehicles):
-        print(f"{len(vehicles) - len(whole)} vehicles with fewer than {most} photos are left out", file=sys.stderr)
-    there = [n for n in sorted(set(counts)) if n <= len(whole)]
+    complete = [photos for photos in vehicles.values() if photos and len(photos) == most]
+    if len(complete) < len(vehicles):
+        print(f"{len(vehicles) - len(complete)} vehicles with fewer than {most} photos are left out", file=sys.stderr)
+    there = [n for n in sorted(set(counts)) if n <= len(complete)]
     if not there:
-        raise InputError(f"{folder} has {len(whole)} vehicles; give smaller numbers to --vehicles")
+        raise InputError(f"{folder} has {len(complete)} vehicles; give smaller numbers to --vehicles")
     each = [n for n in sorted(set(images)) if n <= most]
     runs = [("vehicles", n, most) for n in there] + [("images", there[-1], n) for n in each]
     rows = []
     for kind, count, number in runs:
         name = f"{folder.absolute().name}-{refine}-{count}x{number}"
-        report = kept(out / f"{name}.json")
+        report = read_result(out / f"{name}.json")
         if report is None:
             print(f"{count} vehicles, {number} pictures each", file=sys.stderr, flush=True)
-            photos = [photo for vehicle in whole[:count] for photo in vehicle[:number]]
+            photos = [photo for vehicle in complete[:count] for photo in vehicle[:number]]
             report = _run(folder, photos, name, refine=refine, out=out, workers=workers, maps=maps)
         rows.append({"kind": kind, "vehicles": count, "images": number} | cost(report))
     return {"machine": machine(), "set": folder.absolute().name, "refine": refine, "rows": rows}
@@ -64,9 +64,9 @@ def _run(
     folder: Path, photos: list[Path], name: str, *, refine: str, out: Path, workers: int | None, maps: bool
 ) -> dict[str, Any]:
     subset, product = out / "photos", out / f"map-{name}"
-    linked(photos, folder / "photos", subset)
+    link_photos(photos, folder / "photos", subset)
     report = mosaic(subset, folder / "basemap.tif", product, ["--refine", refine], workers)
-    keep(out / f"{name}.json", report)
+    write_result(out / f"{name}.json", report)
     shutil.rmtree(subset, ignore_errors=True)
     if not maps:
         shutil.rmtree(product, ignore_errors=True)
@@ -74,12 +74,12 @@ def _run(
 
 
 def growth(result: dict[str, Any]) -> dict[str, Any]:
-    """How the cost per picture and the memory change from the smallest block of at least 1,000 pictures upwards.
+    """Change of CPU time and memory per picture, relative to the smallest block of at least 1,000 pictures.
 
     Returns:
-        `base` (pictures of that block) and, for each run over vehicles from there on, `frames`, `cpu` and `memory` per
-        picture as a share of the block's; `cpu_spread`, the largest departure of `cpu` from 1; `flat`, whether it stays
-        within 20 % and memory per picture never grows by more. Empty where there are not two such runs.
+        `base`: number of pictures of that block. `points`: for it and each larger run over vehicles `frames`, and `cpu`
+        and `memory` per picture relative to the block's. `cpu_spread`: the largest deviation of `cpu` from 1. `flat`:
+        whether that is at most 20 % and memory per picture grows by at most 20 %. Empty with fewer than two such runs.
     """
     rows = [r for r in result["rows"] if r["kind"] == "vehicles" and r["frames"] >= _SMALLEST_BLOCK]
     rows.sort(key=lambda r: int(r["frames"]))
@@ -97,7 +97,7 @@ def growth(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def scaling_table(result: dict[str, Any]) -> str:
-    """The result as a Markdown table, with what it says about growth."""
+    """The result as a Markdown table, with a sentence about growth."""
     lines = [
         f"Machine: {result['machine']}. Set: {result['set']}. Refiner: {result['refine']}.",
         "",
@@ -126,7 +126,7 @@ def scaling_table(result: dict[str, Any]) -> str:
 
 
 def plot_scaling(result: dict[str, Any], out: Path) -> list[Path]:
-    """Draw fig7.png (time against vehicles), fig8.png (against pictures a vehicle), growth.png; gives those drawn."""
+    """Draw fig7.png (time by vehicles), fig8.png (by pictures per vehicle), growth.png; returns the files drawn."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -149,7 +149,7 @@ def _fixed(result: dict[str, Any], kind: str, key: str) -> int:
 
 
 def _plot_times(rows: list[dict[str, Any]], kind: str, axis: str, result: dict[str, Any], path: Path) -> Path:
-    """CPU seconds stacked by stage, and the time on the clock with the stages side by side on all cores."""
+    """CPU seconds stacked by stage, and the wall time with all cores in use."""
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(7.5, 4.5), layout="constrained")
@@ -161,12 +161,12 @@ def _plot_times(rows: list[dict[str, Any]], kind: str, axis: str, result: dict[s
     axes.set_title(f"{result['refine']}, {result['machine']}", fontsize=9)
     axes.grid(alpha=0.3)
     handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles[::-1], labels[::-1], loc="upper left", fontsize=8)  # as they lie on each other
+    axes.legend(handles[::-1], labels[::-1], loc="upper left", fontsize=8)  # in the order of the stack
     return _saved(figure, path)
 
 
 def _plot_growth(result: dict[str, Any], path: Path) -> Path:
-    """CPU milliseconds a picture, and memory, against pictures; the band is 20 % about the smallest block."""
+    """CPU milliseconds per picture and memory by number of pictures; the band is +-20 % around the smallest block."""
     from matplotlib import pyplot
 
     rows = sorted((r for r in result["rows"] if r["kind"] == "vehicles"), key=lambda r: int(r["frames"]))

@@ -1,1 +1,1 @@
-"""The demonstration: a swarm, its cameras and a city, all simulated, around the real daemon."""
+"""`orthoswarm demo`: a simulated swarm with simulated cameras over a simulated city, mapped by the real daemon."""

@@ -1,4 +1,4 @@
-"""The digital twin's city where a real vehicle stands, so that a simulated camera has something to see there."""
+"""The digital twin's city around the position of a real vehicle, as the scene for its simulated camera."""
 
 import json
 import math
@@ -26,7 +26,7 @@ def set_there(folder: Path) -> bool:
 
 
 def read_spec(folder: Path) -> TwinSpec:
-    """What a set that `orthoswarm twin make` (or this module) has made was made of.
+    """The parameters of a data set made by `orthoswarm twin make` or by this module.
 
     Raises:
         InputError: the folder holds no set, or one of another version.
@@ -40,9 +40,7 @@ def read_spec(folder: Path) -> TwinSpec:
             values[name] = kind(**{key: _tuples(value) for key, value in values[name].items()})
         return TwinSpec(**{key: _tuples(value) for key, value in values.items()})
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{folder} holds no set that can be read ({error}); make one anew in an empty folder"
-        ) from None
+        raise InputError(f"{folder} contains no readable data set ({error}); make one in an empty folder") from None
 
 
 def _tuples(value: Any) -> Any:
@@ -54,8 +52,8 @@ def place_spec(preset: str, seed: int, lat_deg: float, lon_deg: float) -> TwinSp
     return with_heading(spec(preset, seed=seed, lat_deg=lat_deg, lon_deg=lon_deg))
 
 
-def write_set(world: TwinSpec, folder: Path, tell: Callable[[str, int, int], None]) -> Path:
-    """Write the map before the disaster, the truth after it and the area to map; pictures are the camera's business.
+def write_set(world: TwinSpec, folder: Path, report: Callable[[str, int, int], None]) -> Path:
+    """Write the map before the disaster, the truth after it and the area to map, but no photos.
 
     Returns:
         The area, a GeoJSON file with one polygon.
@@ -63,17 +61,17 @@ def write_set(world: TwinSpec, folder: Path, tell: Callable[[str, int, int], Non
     Raises:
         InputError: the folder holds another set.
     """
-    from orthoswarm.twin.dataset_files import write_whole
+    from orthoswarm.twin.dataset_files import write_atomic
     from orthoswarm.twin.make import make_twin
 
-    make_twin(world, folder, only=0, progress=tell)
+    make_twin(world, folder, only=0, progress=report)
     path = folder / "area.geojson"
-    write_whole(path, json.dumps(area_of(world)).encode())
+    write_atomic(path, json.dumps(area_of(world)).encode())
     return path
 
 
 def area_of(world: TwinSpec) -> dict[str, Any]:
-    """The area that the set's own flight maps, a GeoJSON polygon; a camera over it sees nothing but city."""
+    """The area that the set's own flight maps, a GeoJSON polygon; all footprints over it are inside the city."""
     site = Site.of(world)
     across, along = (0.5 * side for side in world.plan.extent_m)
     corners = np.array([[-across, -along], [across, -along], [across, along], [-across, along], [-across, -along]])
@@ -82,7 +80,7 @@ def area_of(world: TwinSpec) -> dict[str, Any]:
 
 
 def build_world(world: TwinSpec) -> tuple["Stage", Site]:
-    """The city after the disaster, ready to be photographed."""
+    """The city after the disaster, prepared for rendering, and its site."""
     from orthoswarm.twin.dataset_files import after_disaster
 
     site = Site.of(world)
@@ -91,7 +89,7 @@ def build_world(world: TwinSpec) -> tuple["Stage", Site]:
 
 
 def away_m(world: TwinSpec, lat_deg: float, lon_deg: float) -> float:
-    """How far a place is from the city's nearest ground that a camera may fly over, metres; 0 within."""
+    """Distance of a position from the part of the city that a camera may fly over, metres; 0 inside."""
     site = Site.of(world)
     east, north = np.asarray(site.grid.to_grid(lat_deg, lon_deg)) - site.center
     if not (math.isfinite(east) and math.isfinite(north)):

@@ -1,4 +1,4 @@
-"""The demonstration's course: city, plan, flight, map, refinement at each completion, and the accuracy at the end."""
+"""The steps of `orthoswarm demo`: city, plan, flight, map, refinement at each completion, accuracy at the end."""
 
 import json
 import multiprocessing.process
@@ -20,31 +20,31 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 if TYPE_CHECKING:
     from gcs_plugin.daemon.daemon import Daemon
 
-_MARK: Final = "demo.json"
-_MADE: Final = (
+_MARKER_FILE: Final = "demo.json"
+_DEMO_FILES: Final = (
     "journal.db", "journal.db-wal", "journal.db-shm", "pictures", "layers", "solutions", "plans", "videos", "twin",
     "token", "telemetry.tlog", "export", "report.json", "report.html", "frames.jsonl", "footprints.gpkg",
-    "realtime.tif", "coarse.tif", "orthoimage.tif", _MARK,
+    "realtime.tif", "coarse.tif", "orthoimage.tif", _MARKER_FILE,
 )  # fmt: skip
 _MOST_S: Final = 900.0
 ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: Setting, out: Path, tell: ReportProgress, *, port: int = 0, opened: Callable[[str], None]
+    setting: Setting, out: Path, report: ReportProgress, *, port: int = 0, opened: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Run it; gives the content of report.json.
+    """Run the demonstration and return the content of report.json.
 
     Args:
-        setting: what to fly.
-        out: workspace of the daemon; a demonstration that is there already is replaced.
-        tell: progress.
+        setting: number of vehicles, seed, speed.
+        out: workspace of the daemon; an earlier demonstration in it is replaced.
+        report: called with a stage's name, the number of finished items and their total.
         port: of the web page.
         opened: called with the page's address.
 
     Raises:
-        InputError: the folder holds something else.
-        OrthoSwarmError: the demonstration did not come to its end.
+        InputError: the folder contains other files.
+        OrthoSwarmError: the demonstration failed or did not finish in time.
     """
     _clear(out)
     began = time.monotonic()
@@ -54,18 +54,18 @@ def run_demo(
     _start(process)
     theirs.close()
     try:
-        tell("city", 0, 1)
+        report("city", 0, 1)
         write_world(setting, out / "twin")
-        tell("city", 1, 1)
-        places = _first_words(ours, process)
-        with _daemon(setting, out, places) as daemon, Served(daemon, port) as served:
+        report("city", 1, 1)
+        addresses = _receive_addresses(ours, process)
+        with _daemon(setting, out, addresses) as daemon, Served(daemon, port) as served:
             opened(served.url)
-            _fly(daemon, setting, tell)
+            _fly(daemon, setting, report)
             ours.send("stop")
             end = ours.recv() if ours.poll(90.0) else {}
-            _finish(daemon, tell)
+            _finish(daemon, report)
     except BaseException:
-        process.terminate()  # while it makes its city it does not listen
+        process.terminate()  # while it builds its city it does not read the pipe
         raise
     finally:
         ours.close()
@@ -75,21 +75,21 @@ def run_demo(
             process.join(10.0)
     if end.get("problem"):
         raise OrthoSwarmError(f"a simulated camera failed: {end['problem']}")
-    tell("measuring", 0, 1)
-    report = _measure(setting, out, end, time.monotonic() - began)
-    tell("measuring", 1, 1)
-    return report
+    report("measuring", 0, 1)
+    result = _measure(setting, out, end, time.monotonic() - began)
+    report("measuring", 1, 1)
+    return result
 
 
 def _start(process: multiprocessing.process.BaseProcess) -> None:
-    """Start a process that a Ctrl-C at the terminal does not reach: this one ends it.
+    """Start a process that ignores Ctrl-C in the terminal; this process terminates it.
 
-    The signal is held back meanwhile, not ignored: one that comes just now is heard afterwards.
+    SIGINT is blocked meanwhile, not ignored: one that arrives now is delivered afterwards.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # there the simulator itself ignores it, as soon as it runs
+    if not hasattr(signal, "pthread_sigmask"):  # Windows: the simulator ignores the signal itself once it runs
         process.start()
         return
-    multiprocessing.resource_tracker.ensure_running()  # it would let the signal through while it starts
+    multiprocessing.resource_tracker.ensure_running()  # starting it later would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process.start()
@@ -98,40 +98,41 @@ def _start(process: multiprocessing.process.BaseProcess) -> None:
 
 
 def _clear(out: Path) -> None:
-    """Make room: an earlier demonstration goes, anything else stays and is refused."""
+    """Remove an earlier demonstration from a folder; a folder with other files is refused."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file; choose a folder for --out")
-    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
-        raise InputError(f"{out} holds something else; choose an empty folder for --out")
+    if out.exists() and any(out.iterdir()) and not (out / _MARKER_FILE).exists():
+        raise InputError(f"{out} contains other files; choose an empty folder for --out")
     out.mkdir(parents=True, exist_ok=True)
-    for name in _MADE:
+    for name in _DEMO_FILES:
         path = out / name
         if path.is_dir():
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-    (out / _MARK).write_text("{}\n")
+    (out / _MARKER_FILE).write_text("{}\n")
 
 
-def _first_words(pipe: Any, process: Any) -> dict[str, list[str]]:
+def _receive_addresses(pipe: Any, process: Any) -> dict[str, list[str]]:
+    """Addresses of the simulator's links and video streams, which it sends once it is ready."""
     end = time.monotonic() + 180.0
     while time.monotonic() < end:
         if pipe.poll(0.2):
-            places: dict[str, list[str]] = pipe.recv()
-            return places
+            addresses: dict[str, list[str]] = pipe.recv()
+            return addresses
         if not process.is_alive():
             break
     raise OrthoSwarmError("the simulated swarm did not start; run the demonstration again")
 
 
-def _daemon(setting: Setting, out: Path, places: dict[str, list[str]]) -> "Daemon":
+def _daemon(setting: Setting, out: Path, addresses: dict[str, list[str]]) -> "Daemon":
     from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.settings import Settings, VehicleSettings
     from orthoswarm.compute.workers import cores
 
-    vehicles = tuple(VehicleSettings(f"v{n}", n, "", url) for n, url in enumerate(places["streams"], start=1))
+    vehicles = tuple(VehicleSettings(f"v{n}", n, "", url) for n, url in enumerate(addresses["streams"], start=1))
     settings = Settings(
-        workspace=out, links=tuple(places["links"]), basemap=out / "twin" / "basemap.tif", fov_min_deg=FOV_MIN_DEG,
+        workspace=out, links=tuple(addresses["links"]), basemap=out / "twin" / "basemap.tif", fov_min_deg=FOV_MIN_DEG,
         workers=max(1, cores() - 1), vehicles=vehicles,
     )  # fmt: skip
     return Daemon(settings)
@@ -155,7 +156,7 @@ class Served:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind(("127.0.0.1", port))
-            self._socket.listen()  # a browser may come at once
+            self._socket.listen()  # a browser may connect before the server's loop runs
         except OSError as error:
             self._socket.close()
             raise InputError(f"port {port} cannot be served ({error.strerror}); choose another --port") from None
@@ -177,12 +178,12 @@ class Served:
         self._socket.close()
 
 
-def _fly(daemon: "Daemon", setting: Setting, tell: ReportProgress) -> None:
+def _fly(daemon: "Daemon", setting: Setting, report: ReportProgress) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
     links = daemon.links
     assert links is not None
     _wait(lambda: sum(row["lat_deg"] is not None for row in links.rows()) == setting.vehicles, 60.0, "the vehicles")
-    tell("planning", 0, 1)
+    report("planning", 0, 1)
     starts = [[row["lat_deg"], row["lon_deg"]] for row in links.rows()]
     body = {
         "area": setting.area(), "vehicles": setting.vehicles, "altitude_m": HEIGHT_M, "fov_min_deg": FOV_MIN_DEG,
@@ -190,58 +191,58 @@ def _fly(daemon: "Daemon", setting: Setting, tell: ReportProgress) -> None:
         "end": "rtl", "separation_m": 4.0,
     }  # fmt: skip
     plan = daemon.plans.make(body)
-    tell("planning", 1, 1)
+    report("planning", 1, 1)
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
     began = time.monotonic()
     for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
         system = links.system_of(vehicle)
         mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, links.fleet.vehicles[system].autopilot)
         links.command(lambda fleet, s=system, m=mission: fleet.upload(s, m))  # type: ignore[misc]
-        # apart as planned, and never at the same moment, so that one completes while others fly
+        # with the planned delays, at least 6 s, so that one vehicle completes while others still fly
         due = began + max(delays[vehicle], 6.0 * (number - 1)) / setting.speed
         time.sleep(max(0.0, due - time.monotonic()))
         links.command(lambda fleet, s=system: fleet.start(s))  # type: ignore[misc]
-        tell("starting", number, setting.vehicles)
+        report("starting", number, setting.vehicles)
     photos = sum(vehicle["photos"] for vehicle in plan["vehicles"])
 
     def done() -> bool:
-        tell("flying: pictures on the map", min(daemon.drawer.drawn, photos), photos)
+        report("flying: pictures on the map", min(daemon.drawer.drawn, photos), photos)
         return len(daemon.completions()) >= setting.vehicles
 
     _wait(done, _MOST_S, "the missions' completion")
-    tell("flying: pictures on the map", photos, photos)
+    report("flying: pictures on the map", photos, photos)
 
 
-def _finish(daemon: "Daemon", tell: ReportProgress) -> None:
+def _finish(daemon: "Daemon", report: ReportProgress) -> None:
     """Wait until every completion's refinement is on the map, and the products are written."""
 
     def refined() -> bool:
         rows = daemon.completions()
-        tell("refining", sum("version" in row for row in rows), len(rows))
+        report("refining", sum("version" in row for row in rows), len(rows))
         failed = [job for job in daemon.jobs.all() if job.state == "failed" and job.kind != "coarse"]
         if failed:
             raise OrthoSwarmError(f"the {failed[0].kind} of {failed[0].vehicle} failed: {failed[0].message}")
         return all("version" in row for row in rows) and not daemon.jobs.open()
 
     _wait(refined, 300.0, "the refinement")
-    tell("products", 0, 1)
+    report("products", 0, 1)
     job = daemon.export(["cog", "gpkg", "mbtiles", "kmz"])
     _wait(
         lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
     )
-    tell("products", 1, 1)
+    report("products", 1, 1)
 
 
 def _wait(done: Callable[[], bool], limit_s: float, what: str) -> None:
     end = time.monotonic() + limit_s
     while not done():
         if time.monotonic() > end:
-            raise OrthoSwarmError(f"{what} did not come within {limit_s:.0f} s; run the demonstration again")
+            raise OrthoSwarmError(f"{what}: not finished within {limit_s:.0f} s; run the demonstration again")
         time.sleep(0.2)
 
 
 def _measure(setting: Setting, out: Path, end: dict[str, Any], wall_s: float) -> dict[str, Any]:
-    """Compare the orthoimages with the truth, and put the figures into the report."""
+    """Compare the orthoimages with the truth and add the figures to the report."""
     from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask
     from orthoswarm.export.product_files import write_json
 

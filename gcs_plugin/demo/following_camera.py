@@ -1,8 +1,9 @@
-"""Simulated cameras under REAL vehicles: what the twin looks like from where an autopilot says that it is.
+"""Simulated cameras on REAL vehicles: the twin is rendered from the pose that an autopilot reports.
 
-The autopilot (ArduCopter or PX4 in simulation, or a real one on the bench) tells position, attitude and, where it has
-one, its gimbal; the camera renders the twin from there and sends video, or posts photos. Pictures are taken at even
-moments of the VEHICLE's clock, a little late, so that telemetry from before and after is there to interpolate.
+The autopilot (ArduCopter or PX4 in simulation, or a real one on the bench) reports position, attitude and, if it has
+one, its gimbal's attitude; the camera renders the twin from that pose and sends video, or posts photos. Pictures are
+due at even intervals of the VEHICLE's clock. They are rendered LATE_S later, when telemetry from before and after the
+exposure has arrived and the pose can be interpolated.
 """
 
 import contextlib
@@ -34,12 +35,12 @@ if TYPE_CHECKING:
     from orthoswarm.twin.site import Site
 
 LATE_S: Final = 0.25
-"""How long a moment is past before its picture is taken: two messages at 10 Hz."""
+"""Delay between an exposure and its rendering, seconds: two messages at 10 Hz."""
 _BEHIND_S: Final = 10.0
-"""A camera that is later than this gives up what it has missed."""
+"""A camera that is later than this skips the exposures it has missed."""
 _THINNED_S: Final = 2.0
-"""For each so many seconds that it is late it leaves out one more between two pictures: on a machine that is too slow
-the pictures lie farther apart, without holes."""
+"""For every two seconds of delay one more exposure is skipped between two pictures: on a slow machine the pictures are
+farther apart, but still evenly spaced."""
 _IDLE_S: Final = 0.02
 _POST_TIMEOUT_S: Final = 30.0
 
@@ -47,10 +48,10 @@ Pixels = NDArray[np.uint8]
 
 
 class Outlet(Protocol):
-    """Where a vehicle's pictures go.
+    """Destination of a vehicle's pictures.
 
     Attributes:
-        url: where that is.
+        url: its address.
     """
 
     url: str
@@ -59,7 +60,7 @@ class Outlet(Protocol):
         """Send a picture, uint8 (rows, columns, 3), with its recorded pose."""
 
     def close(self) -> None:
-        """End."""
+        """Close the connection."""
 
 
 class Poster:
@@ -75,7 +76,7 @@ class Poster:
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
     def send(self, image: Pixels, sample: Sample) -> None:
-        """Post a picture; one that the daemon cannot take is counted, and the flight goes on."""
+        """Post a picture; one that the daemon does not accept is counted in `failed`."""
         import simplejpeg
 
         data = bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), 92, "RGB", "420"))
@@ -93,28 +94,28 @@ class Poster:
             self.failed += 1
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close: each picture has its own connection."""
 
 
 def _multipart(picture: bytes, pose: str) -> tuple[str, bytes]:
     """Content type and body of a form with `image` and `pose` (RFC 7578)."""
-    mark = "orthoswarm-picture-and-pose"
+    boundary = "orthoswarm-picture-and-pose"
     body = io.BytesIO()
-    body.write(f'--{mark}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode())
+    body.write(f'--{boundary}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode())
     head = 'Content-Disposition: form-data; name="image"; filename="picture.jpg"\r\nContent-Type: image/jpeg'
-    body.write(f"--{mark}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{mark}--\r\n".encode())
-    return f"multipart/form-data; boundary={mark}", body.getvalue()
+    body.write(f"--{boundary}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{boundary}--\r\n".encode())
+    return f"multipart/form-data; boundary={boundary}", body.getvalue()
 
 
 def open_outlet(url: str, system: int) -> Outlet:
-    """Where the pictures of a vehicle go: vehicle 1 to the address as it is, vehicle 2 to the next port, and so on.
+    """Open the destination of a vehicle's pictures; vehicle N uses the given port + N - 1.
 
     Args:
         url: tcp://HOST:PORT serves video there, udp://HOST:PORT sends it there, http://HOST:PORT posts photos.
         system: the vehicle's MAVLink system id.
 
     Raises:
-        InputError: it is none of these, or the port is taken.
+        InputError: it is none of these, or the port is in use.
     """
     from urllib.parse import urlsplit
 
@@ -125,7 +126,7 @@ def open_outlet(url: str, system: int) -> Outlet:
         host = port = None
     if parts.scheme not in ("tcp", "udp", "http") or not host or not port:
         raise InputError(
-            f"'{url}' is not a place for pictures; give tcp://HOST:PORT, udp://HOST:PORT or http://HOST:PORT"
+            f"'{url}' is not an address for pictures; give tcp://HOST:PORT, udp://HOST:PORT or http://HOST:PORT"
         )
     if parts.scheme == "http":
         return Poster(url, f"v{system}")
@@ -141,13 +142,13 @@ def open_outlet(url: str, system: int) -> Outlet:
 
 @dataclass(slots=True, kw_only=True)
 class Shutter:
-    """Says when a vehicle's next picture is due.
+    """Decides when a vehicle's next picture is due.
 
     Attributes:
         every_s: seconds of the vehicle's clock between pictures.
         above_m: least height over takeoff.
         on_trigger: True to take pictures only when the autopilot reports an exposure.
-        skipped: moments that passed while the camera was busy.
+        skipped: exposures left out because the camera was busy.
     """
 
     every_s: float
@@ -158,12 +159,12 @@ class Shutter:
     _events: deque[float] = field(default_factory=deque)
 
     def exposed(self, time_s: float) -> None:
-        """The autopilot has reported an exposure (UTC)."""
+        """Note an exposure that the autopilot has reported (UTC epoch seconds)."""
         if self.on_trigger:
             self._events.append(time_s)
 
     def due(self, now_s: float, armed: bool, height_m: float | None) -> float | None:
-        """The moment of a picture that is due, None if there is none.
+        """Time of the exposure that is due, UTC epoch seconds; None if there is none.
 
         Args:
             now_s: the vehicle's UTC of its latest telemetry.
@@ -176,7 +177,7 @@ class Shutter:
         if not armed or height_m is None or height_m < self.above_m:
             self._next_s = None
             return None
-        if self._next_s is None or self._next_s > now_s + _BEHIND_S:  # it takes off, or its clock was set back
+        if self._next_s is None or self._next_s > now_s + _BEHIND_S:  # takeoff, or the vehicle's clock was set back
             self._next_s = ready_s
         late = ready_s - self._next_s
         if late < 0.0:
@@ -195,13 +196,13 @@ class Shutter:
 
 @dataclass(slots=True, kw_only=True)
 class Follower:
-    """The camera under one vehicle.
+    """The simulated camera of one vehicle.
 
     Attributes:
-        vehicle: as the fleet knows it. poses: where it was.
-        shutter: when to take pictures. camera: takes them. outlet: takes them away.
-        level: True for a gimbal that holds the camera level, of which the autopilot says nothing.
-        taken: pictures so far.
+        vehicle: its state in the fleet. poses: its recent poses.
+        shutter: when to take pictures. camera: renders them. outlet: sends them.
+        level: True for a gimbal that keeps the camera at nadir and that the autopilot does not report.
+        taken: number of pictures so far. problem: the last error, empty without one.
     """
 
     vehicle: "Vehicle"
@@ -214,13 +215,13 @@ class Follower:
     problem: str = ""
 
     def feed(self, message: Any, utc: float) -> None:
-        """Take a message of the vehicle (in the fleet's thread)."""
+        """Process a message of the vehicle (in the fleet's thread)."""
         event = self.poses.feed(message, utc)
         if event is not None and event.time_s is not None:
             self.shutter.exposed(event.time_s)
 
     def work(self) -> bool:
-        """Take the picture that is due, if one is; False if none was."""
+        """Take the picture that is due; False if none is."""
         latest = self.poses.latest
         if latest.time_s is None:
             return False
@@ -235,26 +236,26 @@ class Follower:
         return True
 
     def pose(self, moment: float) -> Sample | None:
-        """Where the camera is at a moment; None where telemetry has a gap."""
+        """The camera's pose at a time (UTC epoch seconds); None where telemetry has a gap."""
         pose = self.poses.at(moment)
         if self.level and pose.flight_yaw_deg is not None:
             pose = replace(pose, yaw_deg=pose.flight_yaw_deg, pitch_deg=-90.0, roll_deg=0.0)
         known = pose.has_position and pose.height_m is not None and pose.yaw_deg is not None
-        # the body's own angles are the mount's business, not the camera's
+        # the recorded pose is the camera's; attitude of the airframe and absolute altitude stay out of it
         return replace(pose, flight_pitch_deg=None, flight_roll_deg=None, altitude_m=None) if known else None
 
 
-class Crew:
-    """The cameras of all vehicles of a fleet, each opened when its vehicle is heard.
+class FollowingCameras:
+    """The cameras of all vehicles of a fleet, each opened when its vehicle is first heard.
 
     Args:
-        fleet: whose vehicles; it is polled by a thread of this object.
-        stage: the city. site: where it lies.
-        stream: where pictures go (`open_outlet`).
+        fleet: the vehicles; another thread polls it.
+        stage: the city. site: its position.
+        stream: address for the pictures (`open_outlet`).
         seed: of the cameras' errors.
         shutter: makes a vehicle's shutter.
         level: see Follower. rays: see TwinCamera.
-        opened: told of each new camera.
+        opened: called with each new camera.
     """
 
     def __init__(
@@ -268,9 +269,9 @@ class Crew:
         fleet.subscribe(self._message)
 
     def run(self, stop: threading.Event) -> None:
-        """Take pictures until told to stop; the fleet must be polled by another thread."""
+        """Take pictures until `stop` is set; the fleet must be polled by another thread."""
         while not stop.is_set():
-            self._welcome()
+            self._open_cameras()
             taken = sum(_guarded(follower) for follower in list(self.followers.values()))
             if not taken:
                 time.sleep(_IDLE_S)
@@ -281,8 +282,8 @@ class Crew:
             with contextlib.suppress(OSError):
                 follower.outlet.close()
 
-    def _welcome(self) -> None:
-        """Open a camera for each vehicle that has come."""
+    def _open_cameras(self) -> None:
+        """Open a camera for each new vehicle."""
         for system, vehicle in sorted(self._fleet.vehicles.items()):
             if system not in self.followers:
                 follower = Follower(
@@ -300,7 +301,7 @@ class Crew:
 
 
 def _guarded(follower: Follower) -> bool:
-    """Take a picture; what goes wrong with one does not end the others."""
+    """Take a picture; an error is stored in `problem`, so that the other cameras go on."""
     try:
         return follower.work()
     except (OSError, ValueError, ArithmeticError) as error:
@@ -311,18 +312,18 @@ def _guarded(follower: Follower) -> bool:
 def wait_for_place(
     fleet: "Fleet", vehicles: int, seconds: float, stop: threading.Event, say: Callable[[str], None]
 ) -> tuple[float, float] | None:
-    """Poll a fleet until so many vehicles know where they are; gives where the one with the lowest id stands.
+    """Poll a fleet until enough vehicles have a position; returns latitude, longitude of the one with the lowest id.
 
-    Stock ArduCopter says latitude 0, longitude 0 until its receiver and filter have a position, which takes up to half
-    a minute after its start; PX4 says nothing.
+    Stock ArduCopter reports latitude 0, longitude 0 until its receiver and EKF have a position, up to half a minute
+    after its start; PX4 reports none.
 
     Args:
         fleet: the vehicles. vehicles: how many. seconds: longest wait.
-        stop: set by whoever wants to end it; then None is returned.
-        say: called with what is waited for, when that changes.
+        stop: event that ends the wait; then None is returned.
+        say: called with a description of what is missing, whenever it changes.
 
     Raises:
-        InputError: they do not come in time.
+        InputError: they have no position in time.
     """
     said = ""
 
@@ -353,7 +354,7 @@ def wait_for_place(
 
 
 def _missing(fleet: "Fleet", vehicles: int, placed: int) -> str:
-    """What the vehicles still lack, in words."""
+    """What the vehicles still lack, as a text."""
     heard = sorted(fleet.vehicles.items())
     if len(heard) < vehicles:
         return f"{len(heard)} of {vehicles} vehicles heard"

@@ -1,7 +1,7 @@
-"""A way through for a ground station: the autopilot's one link serves the camera and, behind it, the daemon.
+"""A MAVLink router: shares the autopilot's single link between the simulated camera and a ground station.
 
-As a companion computer's router does: packets of the vehicles go on to the ground untouched, signatures included;
-packets of the ground go to the vehicle that they name, or to all.
+It works like mavlink-router on a companion computer: packets of the vehicles are forwarded to the ground unchanged,
+signatures included; packets of the ground go to the vehicle that is their target, or to all.
 """
 
 import threading
@@ -19,15 +19,15 @@ _WAIT_S: Final = 0.5
 
 
 class Relay:
-    """Passes packets between a fleet's vehicles and a ground station.
+    """Forwards packets between a fleet's vehicles and a ground station.
 
     Args:
-        fleet: whose vehicles; it must be polled elsewhere.
+        fleet: the vehicles; another thread polls it.
         ground: the ground station's link, for example tcpin:127.0.0.1:5790.
         own: the address that greets the ground station.
 
     Attributes:
-        down: packets passed to the ground; up: packets passed to vehicles.
+        down: number of packets forwarded to the ground; up: to vehicles.
     """
 
     def __init__(self, fleet: "Fleet", ground: Link | str, own: Address) -> None:
@@ -39,11 +39,11 @@ class Relay:
         self._thread = threading.Thread(target=self._run, name="relay", daemon=True)
 
     def start(self) -> None:
-        """Begin to pass on."""
+        """Start forwarding."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop; the fleet is closed by whoever opened it."""
+        """Stop; the fleet stays open."""
         self._stop.set()
         if self._thread.ident is not None:
             self._hub.post(lambda: None)
@@ -59,7 +59,7 @@ class Relay:
     def _from_vehicle(self, packet: "Packet", utc: float) -> None:
         del utc
         if packet.system not in self._fleet.vehicles or self._stop.is_set():
-            return  # another ground station's words on the vehicle's link
+            return  # sent by another ground station on the vehicle's link
         raw = packet.raw
 
         def send() -> None:

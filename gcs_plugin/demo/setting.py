@@ -1,4 +1,4 @@
-"""Where the demonstration takes place: the twin's city, the area to map, and how well its vehicles know themselves."""
+"""The setting of the demonstration: the twin's city, the area to map, and the vehicles' pose errors."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ class Setting:
     """The demonstration's parameters.
 
     Attributes:
-        vehicles: how many. seed: of city, disaster and errors. speed: simulated seconds in a second.
+        vehicles: how many. seed: of city, disaster and errors. speed: simulated seconds per real second.
     """
 
     vehicles: int = 3
@@ -37,7 +37,7 @@ class Setting:
 
     @property
     def twin(self) -> TwinSpec:
-        """The twin whose city it is; the disaster strikes the middle of the area, a tenth of it."""
+        """Parameters of the twin; the disaster covers about a tenth of the area, in its middle."""
         across, along = (0.4 * side for side in self.extent_m)
         plan = FlightPlan(
             columns=1, legs=2, photos=round((2.0 * along + 0.5 * across) / _STEP_M) + 1, spacing_m=_STEP_M,
@@ -59,7 +59,7 @@ class Setting:
         return {"type": "Polygon", "coordinates": [ring]}
 
     def home(self) -> tuple[float, float, float]:
-        """Latitude, longitude and altitude where the first vehicle stands: at the area's edge."""
+        """Latitude, longitude (degrees) and altitude (metres) of the first vehicle, at the area's south-west corner."""
         site = Site.of(self.twin)
         east, north = (c - 0.5 * side for c, side in zip(site.center, self.extent_m, strict=True))
         lat, lon = (float(v) for v in site.grid.to_geographic([east, north]))
@@ -68,7 +68,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """How one vehicle's record differs from the truth; angles in radians, lengths in metres."""
+    """Constant errors of one vehicle's recorded poses, and its true field of view; radians."""
 
     fov_rad: float
     yaw_rad: float
@@ -77,14 +77,14 @@ class Errors:
 
     @classmethod
     def of(cls, setting: Setting, system: int) -> "Errors":
-        """The errors of a vehicle, fixed for its flight."""
+        """The errors of a vehicle, constant during its flight."""
         rng = np.random.default_rng([setting.seed, 211, system])
         yaw, pitch, roll = np.radians(rng.normal(0.0, [2.0, 0.8, 0.8]))
         return cls(float(np.radians(rng.choice(_FOVS_DEG))), float(yaw), float(pitch), float(roll))
 
 
 def build_stage(setting: Setting) -> tuple["Stage", Site]:
-    """The city after the disaster, ready to be photographed."""
+    """The city after the disaster, prepared for rendering, and its site."""
     from orthoswarm.twin.dataset_files import after_disaster
 
     twin = setting.twin
@@ -94,7 +94,7 @@ def build_stage(setting: Setting) -> tuple["Stage", Site]:
 
 
 def write_world(setting: Setting, folder: Path) -> None:
-    """The map before the disaster and the truth after it, without pictures."""
+    """Write the map before the disaster and the truth after it, but no photos."""
     from orthoswarm.twin.make import make_twin
 
     make_twin(setting.twin, folder, only=0)

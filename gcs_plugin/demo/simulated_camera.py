@@ -1,4 +1,4 @@
-"""Simulated cameras: the twin's view at a vehicle's true pose, streamed as H.264 in MPEG-TS over TCP, poses as SEI."""
+"""Simulated cameras: the twin rendered at a vehicle's true pose, streamed as H.264 in MPEG-TS, poses as SEI."""
 
 import contextlib
 import queue
@@ -26,17 +26,17 @@ _JITTER_RAD: Final = float(np.radians(0.2))
 _CLOCK: Final = 90_000
 _MOST_WAITING: Final = 512
 _NEXT: Final = b"\0\0\0\1\x09\xf0"
-"""The next picture's delimiter, sent behind each picture, so that a reader knows at once that the picture is whole."""
+"""Access unit delimiter of the next picture, sent after each picture: the reader knows at once that it is complete."""
 
 
 class TwinCamera:
     """The camera of one vehicle in the twin.
 
     Args:
-        stage: the city. site: where it lies.
-        setting: the demonstration's.
+        stage: the city. site: its position.
+        setting: of the demonstration.
         system: the vehicle's MAVLink system id.
-        rays: along the side of a pixel; 2 smooth edges, 1 is four times faster.
+        rays: along the side of a pixel; 2 gives smooth edges, 1 is four times faster.
     """
 
     def __init__(self, stage: "Stage", site: "Site", setting: Setting, system: int, rays: int = 2) -> None:
@@ -48,23 +48,23 @@ class TwinCamera:
         self._seed = setting.seed
 
     def take(self, exposure: "Exposure", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
-        """The picture, uint8 (480, 640, 3), and what is recorded about it; a gimbal holds the camera level."""
+        """The picture, uint8 (480, 640, 3), and its recorded pose; a gimbal keeps the camera at nadir."""
         pose = exposure.pose
         true = Sample(
             time_s=time_s, lat_deg=pose.lat_deg, lon_deg=pose.lon_deg, height_m=pose.height_m,
             yaw_deg=float(np.degrees(pose.yaw_rad)), pitch_deg=-90.0, roll_deg=0.0,
         )  # fmt: skip
-        return self.shoot(true, exposure.index, seen=(exposure.lat_deg, exposure.lon_deg))
+        return self.shoot(true, exposure.index, received=(exposure.lat_deg, exposure.lon_deg))
 
     def shoot(
-        self, true: Sample, index: int, *, seen: tuple[float, float] | None = None
+        self, true: Sample, index: int, *, received: tuple[float, float] | None = None
     ) -> tuple[NDArray[np.uint8], Sample]:
-        """The picture at a pose, uint8 (480, 640, 3), and what is recorded about it.
+        """The picture at a pose, uint8 (480, 640, 3), and its recorded pose.
 
         Args:
-            true: where the camera is (with position, height and angles), and when.
+            true: true position, height, angles and time of the camera.
             index: number of the picture; equal arguments give equal pictures.
-            seen: latitude and longitude as the receiver has them, before its own noise; the true ones unless said.
+            received: latitude and longitude of the GNSS receiver without its noise, degrees; None: the true ones.
         """
         errors, grid = self._errors, self._site.grid
         lat, lon, height, time_s = (float(v or 0.0) for v in (true.lat_deg, true.lon_deg, true.height_m, true.time_s))
@@ -73,28 +73,28 @@ class TwinCamera:
         east, north = grid.to_grid(lat, lon)
         turn = float(grid.convergence_rad(lat, lon))
         wobble = rng.normal(0.0, _JITTER_RAD, 3)
-        # the mount has fixed errors of its own, of which the record knows nothing
+        # constant misalignment of the mount, which is not in the recorded pose
         angles = np.array([yaw + errors.yaw_rad - turn, pitch + errors.pitch_rad, roll + errors.roll_rad]) + wobble
         camera = Camera(np.array([east, north, height]), rotation_from_angles(*angles), self._lens)
         motion = rng.uniform(0.0, 1024.0, 8)
         image = self._sensor.expose(render(self._stage, camera, self._rays, motion), rng)
         off = rng.uniform(-_POSITION_M, _POSITION_M, 2)
-        lat, lon = (float(v) for v in grid.to_geographic(grid.to_grid(*(seen or (lat, lon))) + off))
+        lat, lon = (float(v) for v in grid.to_geographic(grid.to_grid(*(received or (lat, lon))) + off))
         return image, replace(true, lat_deg=lat, lon_deg=lon, vehicle=f"v{self._system}")
 
 
 class Sink(Protocol):
-    """Takes bytes, as a file does."""
+    """A writable byte stream, like a file."""
 
     def write(self, data: bytes) -> int:
-        """Take bytes; gives how many."""
+        """Write bytes; returns their number."""
 
 
 class VideoStream:
     """Encodes pictures to H.264 in MPEG-TS, every picture a key picture with its pose as SEI.
 
     Args:
-        sink: takes the stream's bytes, whole transport packets of 188 bytes each time.
+        sink: receives the stream's bytes; each write is a multiple of 188 bytes, the size of a transport packet.
     """
 
     def __init__(self, sink: "Sink") -> None:
@@ -136,7 +136,7 @@ class VideoStream:
         import av
 
         self._first_s = time_s
-        # A PES packet that states its length is whole for the reader at once, not when the next one begins.
+        # a PES packet with a stated length is complete for the reader at once, not only when the next one begins
         options = {"omit_video_pes_length": "0", "flush_packets": "1"}
         self._container = av.open(self._sink, "w", format="mpegts", options=options)
         stream = self._container.add_stream("libx264", rate=10)
@@ -152,15 +152,15 @@ class VideoServer(VideoStream):
     """Serves one live stream over TCP.
 
     Args:
-        host: address to serve on; port: 0 takes any free one.
-        live: True keeps the newest hundred pictures or so for a reader who comes late, however late; False keeps all
-            for half a minute.
+        host: address to serve on; port: 0 for any free one.
+        live: True buffers about the newest hundred pictures for a reader who connects at any later time; False buffers
+            all pictures, and gives up without a reader for half a minute.
 
     Attributes:
-        url: where it is.
+        url: address of the stream.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, *, live: bool = False) -> None:
@@ -173,7 +173,7 @@ class VideoServer(VideoStream):
         self._thread.start()
 
     def write(self, data: bytes) -> int:
-        """Take bytes of the muxer (it writes to this object as to a file)."""
+        """Queue bytes of the muxer, which writes to this object as to a file."""
         if self._live and self._bytes.qsize() >= _MOST_WAITING:
             with contextlib.suppress(queue.Empty):
                 self._bytes.get_nowait()
@@ -207,7 +207,7 @@ class VideoServer(VideoStream):
             connection.close()
 
     def _newest(self) -> socket.socket:
-        """The connection that was made last; a reader that was tired of waiting has come again."""
+        """The most recent connection: a reader that timed out has connected again."""
         connection, _ = self._listener.accept()
         self._listener.settimeout(0.2)
         with contextlib.suppress(TimeoutError):
@@ -219,7 +219,7 @@ class VideoServer(VideoStream):
 
 
 def _sent(connection: socket.socket, data: bytes) -> bool:
-    """Send, unless the reader has hung up: what is sent to nobody would be lost without an error."""
+    """Send; False if the reader has closed the connection, since sending would then succeed without an error."""
     try:
         connection.settimeout(0.0)
         try:
@@ -235,13 +235,13 @@ def _sent(connection: socket.socket, data: bytes) -> bool:
 
 
 class VideoSender(VideoStream):
-    """Sends one live stream by UDP, whether anybody listens or not.
+    """Sends one live stream by UDP; without a receiver the datagrams are lost.
 
     Args:
-        host: to whom; port: where.
+        host: destination address; port: destination port.
     """
 
-    _DATAGRAM: Final = 7 * 188  # what fits an Ethernet frame
+    _DATAGRAM: Final = 7 * 188  # transport packets that fit into an Ethernet frame
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__(self)
@@ -250,7 +250,7 @@ class VideoSender(VideoStream):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, data: bytes) -> int:
-        """Take bytes of the muxer."""
+        """Send bytes of the muxer."""
         for at in range(0, len(data), self._DATAGRAM):
             with contextlib.suppress(OSError):
                 self._socket.sendto(data[at : at + self._DATAGRAM], self._to)
@@ -263,11 +263,11 @@ class VideoSender(VideoStream):
 
 
 @dataclass(slots=True, kw_only=True)
-class Studio:
-    """Takes the pictures of all vehicles, one after the other, as they are asked for.
+class RenderQueue:
+    """Renders and streams the pictures of all vehicles in one thread, in the order of their exposures.
 
     Attributes:
-        cameras, servers: by system id. taken: pictures so far.
+        cameras, servers: by system id. taken: number of pictures so far. problem: the last error, empty without one.
     """
 
     cameras: dict[int, TwinCamera]
@@ -278,22 +278,22 @@ class Studio:
     problem: str = ""
 
     def __post_init__(self) -> None:
-        """Begin to work."""
+        """Start the thread."""
         self._waiting = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="render-queue", daemon=True)
         self._thread.start()
 
     @property
     def backlog(self) -> int:
-        """Pictures that are not taken yet."""
+        """Number of pictures waiting to be rendered."""
         return self._waiting.qsize()
 
     def expose(self, vehicle: Any, exposure: "Exposure") -> None:
-        """Ask for a picture (SimVehicle.on_exposure)."""
+        """Queue a picture (SimVehicle.on_exposure)."""
         self._waiting.put((vehicle.system, exposure, vehicle.utc_s(exposure.time_s)))
 
     def close(self) -> None:
-        """Take what is still waiting, and end the streams."""
+        """Render the waiting pictures and end the streams."""
         self._waiting.put(None)
         self._thread.join(60.0)
         for server in self.servers.values():
@@ -301,12 +301,12 @@ class Studio:
 
     def _run(self) -> None:
         while True:
-            asked = self._waiting.get()
-            if asked is None:
+            request = self._waiting.get()
+            if request is None:
                 return
-            system, exposure, time_s = asked
+            system, exposure, time_s = request
             try:
                 self.servers[system].send(*self.cameras[system].take(exposure, time_s))
                 self.taken += 1
-            except Exception as error:  # told at the end; the flight goes on
+            except Exception as error:  # reported at the end; the flight goes on
                 self.problem = f"{type(error).__name__}: {error}"

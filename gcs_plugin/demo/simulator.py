@@ -1,4 +1,4 @@
-"""The simulated part of the demonstration, in a process of its own: vehicles on TCP links, cameras on TCP streams."""
+"""The simulator process of the demonstration: vehicles on TCP links, cameras on TCP streams."""
 
 import signal
 import threading
@@ -14,14 +14,14 @@ _BEHIND_S: Final = 0.05
 
 
 class PacedClock:
-    """A clock that runs slower while the cameras are behind, so that a slow machine flies slower and loses nothing."""
+    """A clock that slows down while rendering is behind: a slow machine flies slower and loses no picture."""
 
     def __init__(self) -> None:
         self._real, self._now, self.slow = time.monotonic(), 0.0, False
         self._lock = threading.Lock()
 
     def __call__(self) -> float:
-        """Seconds."""
+        """Simulated seconds since the start."""
         with self._lock:
             real = time.monotonic()
             self._now += (real - self._real) * (_SLOW if self.slow else 1.0)
@@ -30,48 +30,48 @@ class PacedClock:
 
 
 def simulate(setting: Setting, pipe: Connection) -> None:
-    """Run until the other end says stop or is gone.
+    """Run until "stop" is received or the pipe is closed.
 
     Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # not inherited everywhere
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # not all systems inherit this from the parent process
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
     from gcs_plugin.demo.setting import build_stage
-    from gcs_plugin.demo.simulated_camera import Studio, TwinCamera, VideoServer
+    from gcs_plugin.demo.simulated_camera import RenderQueue, TwinCamera, VideoServer
     from gcs_plugin.sim.multirotor import Airframe
     from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 
     stage, site = build_stage(setting)
     systems = range(1, setting.vehicles + 1)
-    studio = Studio(
+    renderer = RenderQueue(
         cameras={s: TwinCamera(stage, site, setting, s) for s in systems},
         servers={s: VideoServer() for s in systems},
     )
     airframe = Airframe(climb_m_s=8.0, sink_m_s=6.0, gps_sigma_m=0.8)
     vehicles = make_swarm(
-        setting.vehicles, home=setting.home(), airframe=airframe, seed=setting.seed, on_exposure=studio.expose
+        setting.vehicles, home=setting.home(), airframe=airframe, seed=setting.seed, on_exposure=renderer.expose
     )
     clock = PacedClock()
     with SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=setting.speed, clock=clock) as swarm:
-        streams = [studio.servers[s].url for s in systems]
+        streams = [renderer.servers[s].url for s in systems]
         pipe.send({"links": swarm.addresses, "streams": streams})
-        while not _told_to_stop(pipe):
-            clock.slow = studio.backlog > _MOST_WAITING
-    studio.close()
-    _tell(pipe, {"taken": studio.taken, "problem": studio.problem})
+        while not _stop_received(pipe):
+            clock.slow = renderer.backlog > _MOST_WAITING
+    renderer.close()
+    _send(pipe, {"taken": renderer.taken, "problem": renderer.problem})
 
 
-def _told_to_stop(pipe: Connection) -> bool:
+def _stop_received(pipe: Connection) -> bool:
     try:
         return pipe.poll(_BEHIND_S) and pipe.recv() == "stop"
     except (EOFError, OSError):
         return True
 
 
-def _tell(pipe: Connection, what: dict[str, Any]) -> None:
+def _send(pipe: Connection, message: dict[str, Any]) -> None:
     try:
-        pipe.send(what)
-    except OSError:  # nobody listens any more
+        pipe.send(message)
+    except OSError:  # the demonstration has ended already
         return

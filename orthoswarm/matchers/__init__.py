@@ -1,8 +1,8 @@
-"""Matchers behind one registry: what finds the same ground in two pictures, and in a picture and the map.
+"""Image matchers behind one registry, for two pictures of a flight, and for a rectified patch and the map.
 
-Two kinds. A PictureMatcher takes two pictures of one flight and knows nothing of where they lie. A MapMatcher takes a
-rectified patch and a larger window of the map around the place where the patch should lie (the prior window).
-Learned ones need weights from packages (`orthoswarm weights`); SIFT and CFOG need none.
+A PictureMatcher takes two pictures of one flight, without their poses. A MapMatcher takes a rectified patch and a
+larger window of the map around its expected position (the prior window). Learned matchers need weights from packages
+(`orthoswarm weights`); SIFT and CFOG need none.
 """
 
 from orthoswarm.matchers.matcher import MapMatcher, Matches, PictureMatcher

@@ -1,7 +1,7 @@
-"""CFOG: channel features of orientated gradients, matched by FFT (Ye et al., TGRS 2019). No weights, any season.
+"""CFOG: channel features of orientated gradients, matched by FFT (Ye et al., TGRS 2019). Needs no weights.
 
-Each pixel gets the strength of its gradient in a few directions, blurred and normalised, so that light and colour do
-not matter and contrast may be inverted; tiles of these features are correlated at all shifts by FFT.
+Each pixel gets the magnitude of its gradient in a few directions, blurred and normalised. These features do not depend
+on light, colour and the sign of contrast, so they match across seasons; tiles are correlated at all shifts by FFT.
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ def features(gray: Floats, valid: Mask) -> Floats:
         strength = np.abs(np.float32(np.cos(a)) * gx + np.float32(np.sin(a)) * gy)
         channels[k] = cv2.GaussianBlur(strength, (0, 0), blur)
     own = config.cfog_direction_blur
-    beside = 0.5 * (1.0 - own)
-    channels = beside * np.roll(channels, 1, 0) + own * channels + beside * np.roll(channels, -1, 0)
+    adjacent = 0.5 * (1.0 - own)
+    channels = adjacent * np.roll(channels, 1, 0) + own * channels + adjacent * np.roll(channels, -1, 0)
     norm = np.sqrt((channels * channels).sum(0)) + 1e-3
     weight = np.where(inner, length / (length + max(middle, 1e-3)) / norm, 0.0).astype(np.float32)
     channels -= channels.mean(0)
@@ -42,7 +42,7 @@ def features(gray: Floats, valid: Mask) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """Where a tile lies: shift (column, row) from the middle, height of the peak, second peak / peak."""
+    """Peak of a correlation: shift (column, row) from the middle, its value, second highest peak / peak."""
 
     column: float
     row: float
@@ -51,7 +51,7 @@ class Peak:
 
 
 def correlate(tile: Floats, window: Floats) -> Peak:
-    """Best place of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
+    """Best position of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
     from scipy import fft
 
     config = active().matchers
@@ -118,7 +118,7 @@ def match_tiles(
 
 
 def tile_centres(valid: Mask) -> NDArray[np.int64]:
-    """Centres (column, row), int64 (N, 2), of tiles that lie in a patch and hold some of its valid part."""
+    """Centres (column, row), int64 (N, 2), of the tiles of a patch with a sufficient share of valid pixels."""
     config = active().matchers
     step = config.cfog_tile_px
     half = step // 2
@@ -131,7 +131,7 @@ def tile_centres(valid: Mask) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Cfog:
-    """Patch to map without weights: one shift of the complete patch first, then tiles about it."""
+    """Patch to map without weights: first one shift of the complete patch at half resolution, then single tiles."""
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
@@ -141,14 +141,14 @@ class Cfog:
         if min(size) < active().matchers.cfog_least_side_px or not valid.any():
             return Matches.none()
         half_reach = reach // 2
-        wide = (size[0] + 2 * half_reach, size[1] + 2 * half_reach)
+        window_size = (size[0] + 2 * half_reach, size[1] + 2 * half_reach)
         small = cv2.resize(patch, size, interpolation=cv2.INTER_AREA)
         small_valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         # crop so that both halves keep the same grid
         odd = reach - 2 * half_reach
-        inner = (slice(odd, odd + 2 * wide[1]), slice(odd, odd + 2 * wide[0]))
-        coarse = cv2.resize(window[inner], wide, interpolation=cv2.INTER_AREA)
-        coarse_known = cv2.resize(known[inner].astype(np.uint8), wide, interpolation=cv2.INTER_NEAREST) > 0
+        inner = (slice(odd, odd + 2 * window_size[1]), slice(odd, odd + 2 * window_size[0]))
+        coarse = cv2.resize(window[inner], window_size, interpolation=cv2.INTER_AREA)
+        coarse_known = cv2.resize(known[inner].astype(np.uint8), window_size, interpolation=cv2.INTER_NEAREST) > 0
         common = correlate(features(small, small_valid), features(coarse, coarse_known))
         shift = np.array([reach + 2 * common.column, reach + 2 * common.row])
         centres = tile_centres(valid)

@@ -1,7 +1,7 @@
-"""Dense XFeat descriptors matched in the prior window: what found real before/after pairs that keypoints did not.
+"""Dense XFeat descriptors matched in the prior window; finds real before/after pairs where keypoints fail.
 
 Every cell of 8 x 8 pixels of the patch is compared with the map's cells at all shifts that the poses allow. Scores
-are averaged over neighbouring cells, since neighbours shift alike, before the best shift of a cell is taken.
+are averaged over neighbouring cells, which have nearly the same shift, before the best shift of a cell is chosen.
 """
 
 from dataclasses import dataclass
@@ -115,7 +115,7 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
 
 
 def _part(image: Gray, row: int, column: int) -> Any:
-    """Unit descriptors (64, <= n, <= n) of n x n cells: the network's memory grows with what it sees at once."""
+    """Unit descriptors (64, <= n, <= n) of n x n cells; in parts, since the network's memory grows with the image."""
     import torch
 
     side, margin = active().matchers.window_part_cells, active().matchers.window_margin_cells

@@ -1,4 +1,4 @@
-"""What matchers take and give."""
+"""The interfaces of matchers, and their result."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -18,7 +18,7 @@ class Matches:
 
     Attributes:
         a: float64 (N, 2), column and row in the first picture, pixel centres at integers; b: in the second.
-        score: float64 (N,), 0 to 1, how sure each is (matchers measure differently: compare within one).
+        score: float64 (N,), confidence 0 to 1; comparable only within one matcher.
     """
 
     a: Array
@@ -39,7 +39,7 @@ class Matches:
 
 
 class PictureMatcher(Protocol):
-    """Matches two pictures of about the same heading and scale (learned matchers do not stand turns)."""
+    """Matches two pictures of about the same heading and scale (learned matchers are not invariant to rotation)."""
 
     def match(self, a: Gray, b: Gray) -> Matches:
         """Matches of two grey pictures, uint8 (rows, columns)."""
@@ -62,4 +62,4 @@ class MapMatcher(Protocol):
 
 
 class UnavailableError(Exception):
-    """A matcher cannot be had here (weights or a package are missing); the message says what would help."""
+    """A matcher cannot be used on this machine (weights or a package are missing); the message says what to do."""

@@ -1,7 +1,7 @@
-"""A patch brought onto the map: matches in the prior window, MAGSAC, then rounds of CFOG tiles (paper III.D).
+"""Registration of a patch on the map: matches in the prior window, MAGSAC, then rounds of CFOG tiles (paper III.D).
 
-The share of tiles that agree with the final homography says how far to trust it: on real pairs of different dates a
-share of a half or more was never wrong.
+The share of tiles that agree with the final homography measures its reliability: on real pairs of different dates no
+result with a share of a half or more was wrong.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from orthoswarm.matchers.matcher import Array, Floats, MapMatcher, Mask, Matches
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where a patch lies in a window of the map.
+    """Registration of a patch in a window of the map.
 
     Attributes:
         homography: float64 (3, 3), patch pixel to window pixel, last element 1.
@@ -32,7 +32,7 @@ class Registration:
 
 
 Keep = Callable[[Matches, Array], Mask]
-"""Which matches to keep, given them and the homography so far (outliers in height, for instance)."""
+"""Inlier mask of matches under the current homography (rejects inconsistent heights, for instance)."""
 
 
 def register(
@@ -48,7 +48,7 @@ def register(
     """Find a patch in a window of the map (see MapMatcher for the frames).
 
     Returns:
-        None where no homography is found at all; else what was found, however little it is to be trusted.
+        None where no homography is found; else the result, whose `share` may still be too low to trust it.
     """
     config = active().matchers
     first = matcher.match(patch, valid, window, known, reach)
@@ -82,7 +82,7 @@ def register(
 
 
 def magsac(matches: Matches, threshold_px: float) -> Array | None:
-    """Homography from a to b by MAGSAC++; None where there is none (also where OpenCV 5 throws because of it)."""
+    """Homography from a to b by MAGSAC++; None where there is none (OpenCV 5 raises an error in that case)."""
     import cv2
 
     config = active().matchers
@@ -108,7 +108,7 @@ def apply(homography: Array, points: Array) -> Array:
 
 
 def plausible(homography: Array, shape: tuple[int, ...], reach: int) -> bool:
-    """Whether a homography could be a correction of poses: mild scale and perspective, no corner beyond the reach."""
+    """Whether a homography can be a correction of poses: moderate scale and perspective, corners within the reach."""
     config = active().matchers
     rows, cols = shape
     corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], float)

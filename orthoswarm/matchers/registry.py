@@ -16,9 +16,9 @@ from orthoswarm.model.errors import InputError
 
 GROUP = "orthoswarm.matchers"
 PICTURE_ORDER = ("xfeat", "sift")
-"""What matches pictures of a flight where nothing is asked for: the first that is available."""
+"""Default matcher of pictures: the first of these that is available."""
 MAP_ORDER = ("xfeat-window", "cfog")
-"""The same for patches on the map."""
+"""Default matcher of patches on the map: the first of these that is available."""
 
 
 def _learned(kind: Any) -> PictureMatcher:
@@ -61,7 +61,7 @@ MAP: dict[str, Callable[[], MapMatcher]] = {"xfeat-window": _window, "cfog": _cf
 
 
 def picture_matcher(name: str | None = None) -> PictureMatcher:
-    """A matcher of pictures by name; without one the best that is available.
+    """A matcher of pictures by name; without a name the first available of PICTURE_ORDER.
 
     Raises:
         InputError: if the name is unknown, or its weights or packages are missing.
@@ -71,7 +71,7 @@ def picture_matcher(name: str | None = None) -> PictureMatcher:
 
 
 def map_matcher(name: str | None = None) -> MapMatcher:
-    """A matcher of patches to the map by name; without one the best that is available.
+    """A matcher of patches on the map by name; without a name the first available of MAP_ORDER.
 
     Raises:
         InputError: if the name is unknown, or its weights or packages are missing.
@@ -81,7 +81,7 @@ def map_matcher(name: str | None = None) -> MapMatcher:
 
 
 def available() -> dict[str, str]:
-    """Every matcher by name, built in or added, and what keeps it from being used (an empty text: nothing)."""
+    """Every matcher, built in or added, with the reason why it cannot be used (empty: it can)."""
     out = {}
     for name, make in {**PICTURE, **MAP, **_added()}.items():
         try:
@@ -89,7 +89,7 @@ def available() -> dict[str, str]:
             out[name] = ""
         except UnavailableError as error:
             out[name] = str(error)
-        except Exception as error:  # other people's code
+        except Exception as error:  # code of other packages may raise anything
             out[name] = f"it cannot be loaded ({type(error).__name__}: {error})"
     return out
 

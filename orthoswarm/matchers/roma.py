@@ -1,4 +1,4 @@
-"""RoMa (Edstedt et al., CVPR 2024), the paper's dense matcher: an optional extra with weights that a user brings.
+"""RoMa (Edstedt et al., CVPR 2024), the paper's dense matcher: an optional extra; the user supplies its weights.
 
 `pip install orthoswarm[roma]`, then `orthoswarm weights import` of roma_outdoor.pth and dinov2_vitl14_pretrain.pth.
 On a CPU one match at 560 pixels takes about a minute; on a GPU half a second.

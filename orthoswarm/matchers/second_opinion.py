@@ -1,4 +1,4 @@
-"""The second opinion: learned matching in the prior window, asked before a leg is carried by others."""
+"""Second attempt at a leg that correlation did not find on the map: learned matching in the prior window."""
 
 from functools import lru_cache
 
@@ -14,18 +14,18 @@ from orthoswarm.model.errors import InputError
 def second_opinion(
     patch: Floats, valid: Mask, window: Floats, *, known: Mask, reach: int, matcher: MapMatcher | None = None
 ) -> tuple[float, float] | None:
-    """Where a rectified strip of pictures lies on the map, as far as learned matching can tell.
+    """Position of a rectified strip of pictures on the map by learned matching.
 
     Args:
         patch: float32 (h, w), grey values of the strip.
         valid: bool (h, w), where it has ground.
         window: float32 (h + 2 reach, w + 2 reach), the map at the same pixel size.
-        known: bool, where it has ground.
-        reach: largest shift from the prior, pixels; pixels of 0.3 to 1 m suit the networks best.
-        matcher: None takes the best that is available (without weights CFOG).
+        known: bool, where the map has ground.
+        reach: largest shift from the prior, pixels; the networks work best at 0.3 to 1 m per pixel.
+        matcher: None for the first available (CFOG without weights).
 
     Returns:
-        Shift (column, row) in pixels, by which the strip's middle lies off the prior; None where it is not trusted.
+        Shift (column, row) of the strip's middle from the prior, pixels; None where too few tiles agree.
     """
     if matcher is None:
         try:

@@ -1,6 +1,6 @@
 """Sparse learned matchers through kornia: XFeat + LighterGlue, DISK + LightGlue, ALIKED + LightGlue.
 
-Weights are read from files of this machine (weights.py). Pictures are padded to the networks' strides instead of
+Weights are read from local files (weight_files.py). Pictures are padded to the networks' strides instead of
 being resized or cropped, which would shift keypoints by fractions of a pixel.
 """
 
@@ -28,7 +28,11 @@ def device() -> Any:
 
 
 def read_state(name: str) -> dict[str, Any]:
-    """The tensors of a weight file, read without running anything that the file may hold."""
+    """The tensors of a weight file, read without executing code that the file may contain.
+
+    Raises:
+        UnavailableError: if the file is missing or damaged.
+    """
     import torch
 
     path = weight_files.require(name)
@@ -83,7 +87,7 @@ def glue(kind: Kind) -> Any:
 
 
 def padded_tensor(gray: Gray, stride: int, channels: int = 1) -> Any:
-    """A picture as a float tensor (1, channels, H, W) in 0 to 1, its edge repeated up to multiples of a stride."""
+    """A picture as a float tensor (1, channels, H, W), 0 to 1, padded with its edge to multiples of a stride."""
     import torch
 
     rows, cols = gray.shape

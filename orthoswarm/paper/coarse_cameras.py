@@ -1,4 +1,4 @@
-"""Coarse cameras of one vehicle (paper III.C): legs, lines, positions on them, one field of view."""
+"""Coarse cameras of one vehicle (paper III.C): legs, their lines, positions on the lines, one field of view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,10 +21,10 @@ from orthoswarm.refine.features.grey_pictures import Pictures
 
 @dataclass(frozen=True, slots=True)
 class CoarseOptions:
-    """How coarse cameras are found.
+    """Options of the coarse stage.
 
     Attributes:
-        fov_start_rad: guess that places the orthogonal centre, and what is taken where nothing can be matched.
+        fov_start_rad: first guess, which places the orthogonal centre; also the result where nothing can be matched.
         matcher: name of the picture matcher; None for the best available.
     """
 
@@ -34,7 +34,7 @@ class CoarseOptions:
 
 @dataclass(slots=True, kw_only=True)
 class CoarseVehicle:
-    """One vehicle after III.C.
+    """One vehicle after the coarse stage (III.C).
 
     Attributes:
         vehicle: id. frames: in order. leg: int32 (N,), -1 in turns. lines: of each leg.
@@ -89,9 +89,11 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
         matcher = picture_matcher(options.matcher)
         found = estimate_fov(tasks, pictures.gray, rotation, size=pictures.size, start_rad=start, matcher=matcher)
     if found is None:
-        warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are taken")
+        warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are used")
     fov = start if found is None else found.mean
-    fov_sigma = np.radians(config.unknown_fov_sigma_deg) if found is None else found.sigma / np.sqrt(max(found.kept, 1))
+    fov_sigma = (
+        np.radians(config.unknown_fov_sigma_deg) if found is None else found.sigma / np.sqrt(max(found.inliers, 1))
+    )
     width, height = frames[0].width, frames[0].height
     lens = np.zeros((1, 8))
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height

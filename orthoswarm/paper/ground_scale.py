@@ -15,45 +15,45 @@ from orthoswarm.refine.bundle.flight_records import Array
 
 @dataclass(frozen=True, slots=True)
 class Gaussian:
-    """A mean with outliers suppressed.
+    """Mean and standard deviation of the inliers.
 
     Attributes:
-        mean, sigma: of those kept. kept: how many.
+        mean, sigma: of the inliers. inliers: how many.
     """
 
     mean: float
     sigma: float
-    kept: int
+    inliers: int
 
 
 def gaussian(samples: Array) -> Gaussian:
-    """Gaussian outlier suppression: mean and deviation of what lies near the mean, repeated.
+    """Gaussian outlier suppression: mean and standard deviation of the samples near the mean, iterated.
 
-    It starts at the median and the median deviation, since a mean of everything may be far from all of it.
+    It starts at the median and the median absolute deviation, since outliers may pull the mean far off.
     """
     config = active().paper
     mean = float(np.median(samples))
     sigma = mad_sigma(samples - mean)
-    kept = samples
+    inliers = samples
     for _ in range(config.outlier_rounds):
         inside = np.abs(samples - mean) <= config.outlier_sigmas * max(sigma, 1e-12)
         if not inside.any():
             break
-        kept = samples[inside]
+        inliers = samples[inside]
         before = mean
-        mean, sigma = float(kept.mean()), float(kept.std())
+        mean, sigma = float(inliers.mean()), float(inliers.std())
         if abs(mean - before) <= 1e-9 * abs(mean):
             break
-    return Gaussian(mean, sigma, len(kept))
+    return Gaussian(mean, sigma, len(inliers))
 
 
 def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: float, flown_m: float) -> float | None:
-    """Scale at the orthogonal centre from two frames of a leg: distance flown over the shift of the picture.
+    """Ground sampling distance at the orthogonal centre from two frames of a leg: distance flown / image shift.
 
     Args:
         matches: between the two pictures.
         centre: column and row of the orthogonal centre (straight below).
-        reach_px: matches whose middle lies farther from the centre are not used: there height and tilt distort.
+        reach_px: matches farther from the centre are not used, since relief and tilt distort them.
         flown_m: distance between the two frames along the leg's line.
 
     Returns:
@@ -69,7 +69,7 @@ def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: fl
     if len(shift) < config.scale_matches:
         return None
     found = gaussian(shift)
-    if found.kept < config.scale_matches or found.sigma > config.scale_scatter * found.mean:
+    if found.inliers < config.scale_matches or found.sigma > config.scale_scatter * found.mean:
         return None
     return flown_m / found.mean
 
@@ -79,15 +79,15 @@ def field_of_view(scale_m: float, width: int, height_m: float, tilt_rad: float =
 
     theta = 2 arctan(L / d) with L = scale W / 2, HALF the ground width that the picture's width would cover at the
     scale of the orthogonal centre, and d = h cos(tilt), the depth of the orthogonal centre along the optical axis.
-    As printed the equation takes the whole width, inverts the fraction of L, and divides by a slant height of the
-    picture's middle while the scale is measured at the orthogonal centre; see docs/method.md.
+    The printed equation uses the full width, inverts the fraction of L, and divides by the slant height of the
+    image centre although the scale is measured at the orthogonal centre; see docs/method.md.
     """
     return 2.0 * float(np.arctan2(0.5 * scale_m * width, height_m * np.cos(tilt_rad)))
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleTask:
-    """Two frames of a leg to be matched.
+    """A pair of frames of one leg that gives one measurement of the scale.
 
     Attributes:
         first, second: indices. flown_m: along the line. height_m: mean height. tilt_rad: mean tilt of the camera.
@@ -101,7 +101,7 @@ class ScaleTask:
 
 
 def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:
-    """Up to `count` pairs of a leg, evenly spread, whose distance is nearest to the wanted share of the height.
+    """Up to `count` pairs, evenly spread over a leg, with a distance near `scale_pair_heights` flying heights.
 
     Args:
         along: float64 (n,), distance along the line of the leg's frames, in flying order.
@@ -148,7 +148,7 @@ def estimate_fov(
         gray: picture i.
         rotation: float64 (N, 3, 3).
         size: width and height of the pictures.
-        start_rad: a first guess, which only places the orthogonal centre.
+        start_rad: first guess, used only to place the orthogonal centre.
         matcher: for the pairs.
     """
     config = active().paper

@@ -1,8 +1,8 @@
-"""From the homography of a leg to cameras: the best-fitting pose of each frame, and legs carried by others.
+"""From the homography of a leg to cameras: the best-fitting pose of each frame, and corrections for unmatched legs.
 
-The paper warps a leg's frames by its homography. Here every product takes cameras, so each frame gets the pose whose
-picture lies closest to where the homography puts it (field of view and lens as they are). What a pinhole cannot
-follow, shear above all, is told as `rms_m`: a few centimetres on real legs.
+The paper warps a leg's frames by its homography. All products here need cameras, so each frame gets the pose whose
+footprint is closest to the warped one, with interior orientation fixed. What a perspective camera cannot represent,
+mainly shear, remains as `rms_m`: a few centimetres on real legs.
 """
 
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ from orthoswarm.refine.bundle.flight_records import Array
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A corrected camera and what it could not follow: rms distance of its ground points, metres."""
+    """A corrected camera and the rms of the residuals of its ground points, metres."""
 
     camera: Camera
     rms_m: float
 
 
 def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> Pose:
-    """The pose that sees ground points (N, 2) on the plane 0 at pixels (N, 2), by Gauss-Newton from a first camera."""
+    """Space resection by Gauss-Newton: the pose that images ground points (N, 2) at height 0 at pixels (N, 2)."""
     points = np.c_[corrected, np.zeros(len(corrected))]
     position = camera.position + np.array([*(corrected - camera.to_ground(pixels)).mean(axis=0), 0.0])
     current = Camera(position, camera.rotation, camera.lens)
     for _ in range(active().paper.pose_rounds):
-        seen = current.project(points)
+        projected = current.project(points)
         jacobian = np.empty((2 * len(points), 6))
         for k in range(6):
-            jacobian[:, k] = ((_moved(current, k, 1e-5).project(points) - seen) / 1e-5).ravel()
-        step, *_ = np.linalg.lstsq(jacobian, (pixels - seen).ravel(), rcond=None)
+            jacobian[:, k] = ((_moved(current, k, 1e-5).project(points) - projected) / 1e-5).ravel()
+        step, *_ = np.linalg.lstsq(jacobian, (pixels - projected).ravel(), rcond=None)
         if not np.isfinite(step).all():
             break
         current = _apply_step(current, np.asarray(step, np.float64))
@@ -51,7 +51,7 @@ def pixel_grid(camera: Camera, columns: int = 6, rows: int = 5) -> Array:
 
 
 def carried_shift(index: Array, matched: Sequence[tuple[float, Array]]) -> Array:
-    """Corrections (N, 2) of frames from matched legs of the same vehicle, linear in the frame number between them.
+    """Corrections (N, 2) of frames between matched legs of the same vehicle, interpolated by frame number.
 
     Args:
         index: float64 (N,), frame numbers.

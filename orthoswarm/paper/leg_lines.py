@@ -37,9 +37,8 @@ class Line:
 def fit_line(position: Array) -> Line:
     """Eq. 2: the line through positions (N, 2) of a leg, by TOTAL least squares.
 
-    The paper minimises the error of y = kx + b in y, which has no solution for a leg due north (x = const) and leans
-    towards the x axis for steep ones. The line that minimises distances at right angles has neither fault and is the
-    same for legs due east.
+    The paper minimises the error of y = kx + b in y. This has no solution for a leg due north (x = const) and is
+    biased for steep legs. Minimising perpendicular distances has neither fault and agrees with it for legs due east.
     """
     middle = position.mean(axis=0)
     _, spread, axes = np.linalg.svd(position - middle, full_matrices=False)
@@ -49,7 +48,7 @@ def fit_line(position: Array) -> Line:
 
 
 def find_legs(records: FlightRecords) -> Ints:
-    """Leg of each frame, int32 (N,), -1 in turns: straight by the path flown and of one heading of the camera."""
+    """Leg of each frame, int32 (N,), -1 in turns; a leg is straight and has one camera heading."""
     path = split_legs(records.position, records.time_s if records.timed else None)
     out = np.full(len(path), -1, np.int32)
     number = 0
@@ -62,9 +61,9 @@ def find_legs(records: FlightRecords) -> Ints:
 
 
 def _grown(leg: Ints, records: FlightRecords) -> Ints:
-    """Legs extended over the frames before and after that lie on their line and look the same way.
+    """Legs extended over the frames before and after them that are on their line and have the same heading.
 
-    The path alone tells a turn only a few frames away from it.
+    The path alone detects a turn a few frames too early or too late.
     """
     config = active().paper
     most_turned = np.radians(config.leg_heading_deg)

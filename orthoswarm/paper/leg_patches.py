@@ -1,4 +1,4 @@
-"""Leg patches on the map (paper III.D): compositing, dense matches, consistent heights, MAGSAC homography."""
+"""Registration of leg patches on the map (paper III.D): compositing, dense matching, height filter, MAGSAC."""
 
 from dataclasses import dataclass
 from time import perf_counter, process_time
@@ -22,7 +22,7 @@ from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
 @dataclass(frozen=True, slots=True)
 class PatchTask:
-    """A leg to be found on the map; small enough to be sent to another machine.
+    """A leg to be registered on the map; small, since it may be sent to another machine.
 
     Attributes:
         vehicle: id. leg: its number. frames: the leg's frames. cameras: their coarse cameras.
@@ -36,11 +36,11 @@ class PatchTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PatchFit:
-    """Where a leg's patch lies on the map.
+    """Result of registering a leg's patch on the map.
 
     Attributes:
-        vehicle, leg: which leg. homography: float64 (3, 3), ground as placed coarsely -> ground on the map, in
-            metres about `centre`; None if the leg was not found. centre: (2,), local frame.
+        vehicle, leg: which leg. homography: float64 (3, 3), ground by the coarse cameras -> ground on the map, in
+            metres relative to `centre`; None if the leg was not found. centre: (2,), local frame.
         share: of tiles that agree. rms_m: of their residuals per axis. gsd_m: of the patch.
         damaged: image -> why it could not be used. cpu_s, wall_s: what the task took.
     """
@@ -69,7 +69,7 @@ class PatchFit:
 
 @dataclass(frozen=True, slots=True)
 class PatchOptions:
-    """How patches are matched.
+    """Options of the matching of patches.
 
     Attributes:
         matcher: name of the map matcher; None for the best available.
@@ -79,7 +79,7 @@ class PatchOptions:
 
 
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
-    """Find one leg on the map."""
+    """Register one leg on the map."""
     began, clock = process_time(), perf_counter()
     config, trust = active().paper, active().matchers
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
@@ -119,7 +119,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
 
 
 def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
-    """Pixel of a leg's patch: that of the coarser of pictures and map, coarser still if the leg is long."""
+    """GSD of a leg's patch, metres: the coarser of pictures and map; coarser still for long legs, to limit its size."""
     config = active().paper
     own = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, F])
     gsd = float(np.clip(max(own, map_gsd_m), *config.patch_gsd_m))
@@ -128,10 +128,10 @@ def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
 
 
 def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -> tuple[Floats, Mask, GroundGrid]:
-    """The map about a patch (see MapMatcher), and the grid on which it lies, in the local frame.
+    """The map around a patch (see MapMatcher), and its grid in the local frame.
 
-    The map's windows lie on multiples of the pixel in the area's grid, the patch on those of the local frame: the two
-    may differ by part of a pixel, which the returned grid tells exactly.
+    Map windows are aligned to multiples of the pixel in the area's grid, patches to those of the local frame. The two
+    differ by a fraction of a pixel, which the returned grid contains.
     """
     gsd = own.gsd_m
     bounds = own.bounds.grown(reach * gsd).moved(float(origin[0]), float(origin[1]))
@@ -159,9 +159,10 @@ def in_metres(pixels: Array, own: GroundGrid, there: GroundGrid, centre: Array) 
 class HeightFilter:
     """Rejects matches of inconsistent height (III.D): roofs and towers.
 
-    A point at height h over the plane is drawn farther from the nadir point of its picture by h rho / H, rho being its
-    distance from that point and H the height of the camera. What a match lacks along that direction is an apparent
-    height; those far from the usual one are dropped. Near the nadir points nothing leans, and all are kept.
+    A point at height h above the plane is displaced away from the nadir point of its picture by h rho / H, rho being
+    its distance from the nadir point and H the flying height (relief displacement). The residual of a match along that
+    direction gives an apparent height; matches far from the median height are rejected. Near the nadir points the
+    displacement vanishes and no match is rejected.
 
     Attributes:
         cameras: the leg's cameras. own: grid of the patch. there: grid of the window.
@@ -177,14 +178,14 @@ class HeightFilter:
             return np.zeros(0, bool)
         config = active().paper
         ground = self.own.to_ground(matches.a)
-        lack = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
+        residual = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
         away = ground[:, None] - self.cameras.position[None, :, :2]
         nearest = np.argmin((away**2).sum(-1), axis=1)
         lever = away[np.arange(len(ground)), nearest]
         rho = np.hypot(*lever.T)
         height = np.maximum(self.cameras.position[nearest, 2], 1.0)
         leaning = rho > config.roof_distance_share * height
-        apparent = (lack * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
+        apparent = (residual * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
         if leaning.sum() < active().matchers.least_tiles:
             return np.ones(len(matches), bool)
         usual = float(np.median(apparent[leaning]))

@@ -1,4 +1,4 @@
-"""The paper's refiner as a whole: III.C for each vehicle, III.D for each leg, then cameras for all frames.
+"""The paper's refiner: III.C for each vehicle, III.D for each leg, then cameras for all frames.
 
 Legs are independent tasks (III.E). By Eq. 5 a run takes as long as its slowest task plus the sequential rest, given
 enough workers; `Refinement.equation_5` compares this with the time measured.
@@ -36,10 +36,10 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class PaperState:
-    """What a unit of a vehicle leaves.
+    """What a solved unit passes on to later calls.
 
     Attributes:
-        found: centre and shift of each leg that was found on the map, for neighbours. frames: those that were solved.
+        found: centre and shift of each leg that was found on the map, for neighbours. frames: those that were placed.
     """
 
     found: list[tuple[Array, Array]]
@@ -48,7 +48,7 @@ class PaperState:
 
 @dataclass(frozen=True, slots=True)
 class PaperRefiner:
-    """One vehicle as soon as it completes (placement.Refiner).
+    """The paper's refiner behind the interface `placement.Refiner`.
 
     Attributes:
         epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
@@ -60,23 +60,30 @@ class PaperRefiner:
     options: Options = field(default_factory=Options)
 
     def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Place one vehicle's frames; where none of its legs is found, neighbours carry it.
+        """Place one vehicle's frames; if none of its legs is found on the map, it gets its neighbours' correction.
 
         Raises:
             OrthoSwarmError: if there are no frames.
         """
-        held = [pair for n in neighbours for pair in _found(n)]
+        from_neighbours = [pair for n in neighbours for pair in _found(n)]
 
         def solve(units: list[list[Frame]]) -> Solution:
             grid = LocalGrid(self.epsg)
             return _refine(
-                units, held, basemap, grid=grid, origin=self.origin, options=self.options, run=serial, progress=None
+                units,
+                from_neighbours,
+                basemap,
+                grid=grid,
+                origin=self.origin,
+                options=self.options,
+                run=serial,
+                progress=None,
             ).fine[0]
 
         return refine_vehicle(frames, self.epsg, solve)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Place a vehicle again beside neighbours; only one that found no leg itself can gain by them."""
+        """Place a vehicle again with later neighbours; changes only a vehicle with no leg of its own on the map."""
         if _found(solution) or not any(_found(n) for n in neighbours):
             return solution
         now = self.refine([p.frame for p in solution.placed], neighbours, basemap)
@@ -106,7 +113,7 @@ def _found(solution: Solution) -> list[tuple[Array, Array]]:
 
 def _refine(
     units: Sequence[Sequence[Frame]],
-    held: Sequence[tuple[Array, Array]],
+    from_neighbours: Sequence[tuple[Array, Array]],
     basemap: MapWindow | None,
     *,
     grid: LocalGrid,
@@ -136,7 +143,10 @@ def _refine(
             if progress:
                 progress("legs on the map", n + 1, len(tasks))
         parallel_s += perf_counter()
-    everyone = [*held, *((f.centre, f.shift) for own in fits for f in own.values() if f.homography is not None)]
+    everyone = [
+        *from_neighbours,
+        *((f.centre, f.shift) for own in fits for f in own.values() if f.homography is not None),
+    ]
     before = [_solution(v, {}, [], origin=origin, stage="coarse", had_map=False) for v in coarse]
     after = [
         _solution(
@@ -155,13 +165,13 @@ def _refine(
 
 
 def _equation_5(tasks_s: Mapping[str, Sequence[float]], sequential_s: float, wall_s: float) -> dict[str, float]:
-    """Eq. 5 against the clock: slowest task of each step plus the sequential rest, and the time it really took.
+    """Eq. 5 and the measured time: slowest task of each parallel step plus the sequential rest, and the wall time.
 
-    They meet when there are as many free cores as tasks; the difference is what more workers could save.
+    The two agree when there are as many free cores as tasks; the difference is what more workers could save.
 
     Args:
         tasks_s: wall seconds of each parallel task, by step.
-        sequential_s: wall seconds of what lies between and after these steps. wall_s: of all of it.
+        sequential_s: wall seconds between and after these steps. wall_s: of the complete run.
     """
     slowest = sum(max(t, default=0.0) for t in tasks_s.values())
     return {
@@ -193,7 +203,7 @@ def _solution(
     stage: Stage,
     had_map: bool,
 ) -> Solution:
-    """Cameras of all frames: legs found on the map by their homography, the others carried."""
+    """Cameras of all frames: by the homography of their leg, or by interpolated corrections where it was not found."""
     began = process_time()
     dropped = {vehicle.frames[i].image: why for i, why in vehicle.damaged.items()}
     for fit in fits.values():
@@ -249,9 +259,9 @@ def _solution(
 def _carried(
     vehicle: CoarseVehicle, matched: Mapping[int, PatchFit], everyone: Sequence[tuple[Array, Array]]
 ) -> tuple[Array | None, float]:
-    """Corrections (N, 2) for frames of legs that were not found, from the vehicle's own others, else from neighbours.
+    """Corrections (N, 2) for frames of legs that were not found, from the vehicle's other legs, else from neighbours.
 
-    The second number is how far such a correction may be off, metres.
+    The second value is one sigma of such a correction, metres.
     """
     config = active().paper
     number = np.arange(len(vehicle.frames), dtype=float)

@@ -1,4 +1,4 @@
-"""The files of a set but for its photos: basemap, reference, height models, masks, plan, table of true cameras."""
+"""The files of a data set except its photos: basemap, reference, height models, masks, plan, true cameras."""
 
 import csv
 import json
@@ -23,8 +23,8 @@ from orthoswarm.twin.site import Site, light_of, map_lean
 from orthoswarm.twin.true_flight import Flight
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write whole or not at all."""
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a file by way of a temporary one, so that it is complete or absent."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
     part.write_bytes(data)
@@ -32,7 +32,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid, nodata: float | None = None) -> None:
-    """A tiled GeoTIFF of (rows, columns, bands) or (rows, columns), written whole or not at all."""
+    """Write a tiled GeoTIFF of (rows, columns, bands) or (rows, columns); it is complete or absent."""
     import rasterio
 
     bands = image[..., None] if image.ndim == 2 else image
@@ -53,7 +53,7 @@ def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid, nodata: flo
 
 
 def write_basemap(spec: TwinSpec, scene: Scene, slots: list[Slot], path: Path, truth: Path) -> None:
-    """The map before the disaster: other light, season and cars, leaning buildings; truth/basemap.json has its lean."""
+    """Write the map before the disaster: other light, season and cars, leaning buildings; truth/basemap.json: lean."""
     import cv2
 
     before = scene.copy()
@@ -73,11 +73,11 @@ def write_basemap(spec: TwinSpec, scene: Scene, slots: list[Slot], path: Path, t
         part *= gain
         part += (haze + rng.normal(0.0, 2.2, part.shape[:2])[..., None]).astype(np.float32)
     write_geotiff(path, np.clip(image, 1, 255).astype(np.uint8), grid)
-    write_whole(truth / "basemap.json", json.dumps({"lean_east": lean[0], "lean_north": lean[1]}).encode())
+    write_atomic(truth / "basemap.json", json.dumps({"lean_east": lean[0], "lean_north": lean[1]}).encode())
 
 
 def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zones: dict[str, Zone]) -> Stage:
-    """The scene at the time of the flight; changes the scene in place."""
+    """The scene at the time of the flight, ready for rendering; the scene is changed in place."""
     place_cars(scene, slots, spec.seed * 2 + 2, spec.cars)
     haze = np.zeros((0, 0), np.float32)
     if "debris" in zones:
@@ -92,7 +92,7 @@ def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zones: dict[
 
 
 def write_truth(spec: TwinSpec, stage: Stage, zones: dict[str, Zone], truth: Path) -> None:
-    """True orthoimage after the disaster, surface, bare ground, and masks: moving, disaster, level ground."""
+    """Write the true orthoimage after the disaster, surface, bare ground, and masks: moving, disaster, open ground."""
     import cv2
 
     if (truth / "ground_mask.tif").exists():
@@ -130,7 +130,7 @@ def write_plan(spec: TwinSpec, site: Site, path: Path) -> None:
         line = _lonlat(spec, site, spec.plan.corners(v))
         properties = {"role": "path", "vehicle": vehicle_name(spec, v), "height_m": spec.plan.height_m}
         features.append(_feature("LineString", line, properties))
-    write_whole(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
+    write_atomic(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
 
 
 def vehicle_name(spec: TwinSpec, v: int) -> str:

@@ -1,4 +1,4 @@
-"""What happens to a city after the map was made: debris flow, waterlogging, haze (the paper's IV.A)."""
+"""Disasters between the date of the map and the flight: debris flow, waterlogging, haze (paper IV.A)."""
 
 from dataclasses import dataclass
 
@@ -35,12 +35,12 @@ class Zone:
 
 
 def zone_depth(scene: Scene, zone: Zone, step: int, seed: int) -> Floats:
-    """How deep inside a zone each place lies, in metres (negative outside), edges ragged.
+    """Signed distance of each cell from a zone's ragged edge, metres, positive inside; float32 (rows, columns).
 
     Args:
         scene: gives the grid.
-        zone: where.
-        step: texels along the side of a cell of the result.
+        zone: the patch of ground.
+        step: side of a cell of the result, in texels.
         seed: of the ragged edge.
     """
     rows, cols = scene.grid.height // step, scene.grid.width // step
@@ -58,7 +58,7 @@ def zone_depth(scene: Scene, zone: Zone, step: int, seed: int) -> Floats:
 
 @kernel
 def _wreckage(x, y, seed, piece):  # type: ignore[no-untyped-def]
-    """What lies on the mud at x, y: piece[0] its height, piece[1:4] its colour; False where there is only mud.
+    """Wreckage on the mud at x, y: piece[0] its height, piece[1:4] its colour; False where there is only mud.
 
     Boards, fragments of roofs and boulders, one candidate in each cell of 4 m, any direction.
     """
@@ -114,7 +114,7 @@ def _bury(albedo, kind, dsm, dtm, wall, facade, depth, flow_x, flow_y, seed):  #
             for k in range(4):
                 rr, cc = 2 * r + (k >> 1), 2 * c + (k & 1)
                 x, y = cc * TEXEL_M, rr * TEXEL_M
-                # bend the ground's coordinates, so that nothing lines up with the grid
+                # distort the coordinates, so that the pattern does not line up with the grid
                 x += 4.0 * lattice(x / 21.0, y / 21.0, seed + 11)
                 y += 4.0 * lattice(x / 21.0 + 7.3, y / 21.0, seed + 12)
                 u, v = x * flow_x + y * flow_y, y * flow_x - x * flow_y
@@ -144,7 +144,7 @@ def _bury(albedo, kind, dsm, dtm, wall, facade, depth, flow_x, flow_y, seed):  #
 
 
 def debris_flow(scene: Scene, zone: Zone, seed: int) -> None:
-    """Bury a zone under 0 to 3 m of rubble, in place; houses within it are gone."""
+    """Bury a zone under 0 to 3 m of rubble, in place; buildings inside it disappear."""
     depth = zone_depth(scene, zone, 2, seed * 13 + 1)
     _bury(
         scene.albedo, scene.kind, scene.dsm, scene.dtm, scene.wall, scene.facade, depth,
@@ -153,7 +153,7 @@ def debris_flow(scene: Scene, zone: Zone, seed: int) -> None:
 
 
 def flood(scene: Scene, zone: Zone, seed: int) -> None:
-    """Put a zone under muddy water that has no texture but moving glints, in place; the ground level is kept."""
+    """Flood a zone with muddy water, whose only texture is moving glints, in place; the water is at ground level."""
     depth = zone_depth(scene, zone, 2, seed * 13 + 2)
     wet = depth > 0.0
     scene.dsm[wet] = scene.dtm[wet]
@@ -165,12 +165,12 @@ def flood(scene: Scene, zone: Zone, seed: int) -> None:
 
 
 def haze_opacity(scene: Scene, zone: Zone, seed: int) -> Floats:
-    """Opacity of a white veil over a zone, float32 on HAZE_CELL_M cells, 0 outside, about 0.65 within."""
+    """Opacity of white haze over a zone, float32 on HAZE_CELL_M cells, 0 outside, about 0.65 inside."""
     depth = zone_depth(scene, zone, int(HAZE_CELL_M / TEXEL_M), seed * 13 + 3)
     return np.asarray(0.66 * np.clip((depth + 6.0) / 26.0, 0.0, 1.0), np.float32)
 
 
 def zone_mask(scene: Scene, zone: Zone, disaster: str, seed: int) -> NDArray[np.bool_]:
-    """The zone on the height fields' cells, as the disaster of that name uses it."""
+    """Cells of the height fields inside the zone of a disaster ("debris", "water" or "haze"), bool."""
     salt = {"debris": 1, "water": 2, "haze": 3}[disaster]
     return np.asarray(zone_depth(scene, zone, 2, seed * 13 + salt) > 0.0)

@@ -1,4 +1,4 @@
-"""Make a set of data: the map before the disaster, the photos after it, and the truth in a folder of its own."""
+"""Make a data set: the map before the disaster, the photos after it, and the truth in its own folder."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -18,11 +18,11 @@ from orthoswarm.twin.camera.sensor import Sensor
 from orthoswarm.twin.dataset_files import (
     after_disaster,
     photo_name,
+    write_atomic,
     write_basemap,
     write_frames,
     write_plan,
     write_truth,
-    write_whole,
 )
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.recorded_noise import Record, record
@@ -31,21 +31,21 @@ from orthoswarm.twin.true_flight import Flight, fly, raised
 
 Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0
-"""Absolute altitude of the takeoff point, so that nobody takes absolute altitudes for heights."""
+"""Absolute altitude of the takeoff point; far from 0, so that mixing up altitude and height shows at once."""
 GENERATOR = 3
-"""Raised when the same parameters give other data, so that a set is never continued by another generator.
+"""Version of the generator; raised when the same parameters give other photos or another truth.
 
-Not raised for the map's edges, which were black where rays began outside the scene: no photo and no truth changed.
+A half-made set is continued only by the version that began it.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class TwinSet:
-    """What was made.
+    """Summary of a data set after `make_twin`.
 
     Attributes:
         folder: of the set.
-        photos: pictures of the set; made: those rendered now (the others were there).
+        photos: pictures of the set; made: those rendered in this run (the others existed).
         vehicles: number of vehicles.
     """
 
@@ -58,7 +58,7 @@ class TwinSet:
 def make_twin(
     spec: TwinSpec, folder: Path, *, workers: int = 1, progress: Progress | None = None, only: int | None = None
 ) -> TwinSet:
-    """Make a set of data; pictures that are already there are kept, so that an interrupted run goes on.
+    """Make a data set; existing pictures are not rendered again, so an interrupted run can be continued.
 
     Layout: photos/<vehicle>/<name>.JPG, basemap.tif, plan.geojson; truth/ holds frames.csv, reference.tif, dsm.tif,
     dtm.tif, masks and manifest.json. The same spec gives the same bytes.
@@ -67,17 +67,17 @@ def make_twin(
         spec: what to make.
         folder: where to put it.
         workers: threads that render.
-        progress: called with a stage's name, what is done and what there is to do.
+        progress: called with a stage's name, the number of finished items and their total.
         only: stop after this many new pictures (None: all).
 
     Raises:
         InputError: if the folder holds another set.
     """
-    tell = progress or (lambda *_: None)
+    report = progress or (lambda *_: None)
     truth = folder / "truth"
     truth.mkdir(parents=True, exist_ok=True)
     _claim(truth / "manifest.json", spec)
-    tell("city", 0, 1)
+    report("city", 0, 1)
     site = Site.of(spec)
     flights = [
         fly(spec.plan, spec.motion, site.center, vehicle=v, seed=spec.seed, lens_k=spec.lens_k)
@@ -89,16 +89,16 @@ def make_twin(
     records = [record(flight, spec.noise, v, spec.seed) for v, flight in enumerate(flights)]
     zones = disaster_zones(spec, site)
     if not (folder / "basemap.tif").exists():
-        tell("basemap", 0, 1)
+        report("basemap", 0, 1)
         write_basemap(spec, scene, slots, folder / "basemap.tif", truth)
-    tell("disaster", 0, 1)
+    report("disaster", 0, 1)
     stage = after_disaster(spec, scene, slots, zones)
     write_truth(spec, stage, zones, truth)
     write_plan(spec, site, folder / "plan.geojson")
     write_frames(spec, site, flights, truth / "frames.csv")
     total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))
     shots = list(_missing(spec, flights, records, folder))[:only]
-    _render_all(spec, stage, site.grid, shots=shots, workers=workers, tell=tell)
+    _render_all(spec, stage, site.grid, shots=shots, workers=workers, report=report)
     return TwinSet(folder, total, len(shots), spec.plan.vehicles)
 
 
@@ -108,7 +108,7 @@ def _claim(manifest: Path, spec: TwinSpec) -> None:
         if json.loads(manifest.read_text()) != json.loads(text):
             raise InputError(f"{manifest.parent.parent} holds a set with other parameters; choose another folder")
         return
-    write_whole(manifest, text.encode())
+    write_atomic(manifest, text.encode())
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class _Shot:
 
 
 def _missing(spec: TwinSpec, flights: list[Flight], records: list[Record], folder: Path) -> Iterator[_Shot]:
-    """The pictures that are not there yet."""
+    """The pictures that do not exist yet."""
     for v, (flight, recorded) in enumerate(zip(flights, records, strict=True)):
         (folder / "photos" / flight.vehicle).mkdir(parents=True, exist_ok=True)
         for i in range(0, len(flight.time_s), spec.every):
@@ -131,7 +131,7 @@ def _missing(spec: TwinSpec, flights: list[Flight], records: list[Record], folde
 
 
 def _render_all(
-    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shots: list[_Shot], workers: int, tell: Progress
+    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shots: list[_Shot], workers: int, report: Progress
 ) -> None:
     """Render and write all shots."""
     import cv2
@@ -139,14 +139,14 @@ def _render_all(
     cv2.setNumThreads(1)
     rays = {shot.vehicle: lens_rays(shot.flight.lens, spec.rays) for shot in {s.vehicle: s for s in shots}.values()}
     sensor = Sensor(spec.plan.width, spec.plan.height, spec.seed)
-    tell("photos", 0, len(shots))
+    report("photos", 0, len(shots))
 
     def one(shot: _Shot) -> None:
-        write_whole(shot.path, _photo(spec, stage, grid, shot=shot, rays=rays[shot.vehicle], sensor=sensor))
+        write_atomic(shot.path, _photo(spec, stage, grid, shot=shot, rays=rays[shot.vehicle], sensor=sensor))
 
     with ThreadPoolExecutor(workers) as pool:
         for done, _ in enumerate(pool.map(one, shots), start=1):
-            tell("photos", done, len(shots))
+            report("photos", done, len(shots))
 
 
 def _photo(

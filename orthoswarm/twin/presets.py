@@ -1,4 +1,4 @@
-"""What sets of data can be made: presets, kinds of noise, and every knob."""
+"""The parameters of a data set: presets, kinds of noise, and every single value."""
 
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -16,31 +16,31 @@ NOISES: dict[str, Noise] = {
     ),
     "drift": Noise(position_m=0.4, drift_per_photo_m=0.0, follows_plan=True, height_m=0.1),
 }  # fmt: skip
-"""The paper's noise; harder than it; a receiver's drift that the autopilot follows; none."""
+"""No noise; the paper's; harder than the paper's; drift of a receiver that the autopilot follows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TwinSpec:
-    """All that determines a set of data.
+    """All parameters of a data set; equal parameters give equal files.
 
     Attributes:
-        preset: name of the preset that it began with.
-        seed: of everything that is drawn.
+        preset: name of the preset that it is based on.
+        seed: of all random numbers.
         disaster: none, debris, water, haze, or all three.
         noise_name: kind of noise; noise: its values.
         plan: the flight. motion: how calmly it is flown.
         relief_m: ground relief, +- metres (procedural city only).
         follow_ground: legs keep their height above the bare ground; else they are level.
         lens_k: true radial distortion k1, k2 of all lenses.
-        lean: size of the map's lean, metres per metre of height; lean_deg: its azimuth, both drawn if None.
+        lean: relief displacement in the map, metres per metre of height; lean_deg: its azimuth; None: random.
         map_gsd_m: pixel of the basemap. reference_gsd_m: of the reference.
         lat_deg: where the procedural city lies; lon_deg.
         quality: of the JPEGs.
-        rays: rays along the side of a pixel; 2 smooth edges, 1 is four times faster.
+        rays: rays along the side of a pixel; 2 gives smooth edges, 1 is four times faster.
         every: render only every n-th picture of each vehicle (records and truth stay those of the full flight).
         ground: orthoimage and surface model of a real place instead of the city, None for the city.
         margin_m: ground beyond the outermost legs.
-        cars: share of the places for cars that are taken.
+        cars: share of the parking places with a car.
     """
 
     preset: str = "debris"

@@ -1,4 +1,4 @@
-"""What a vehicle records about its pictures: the truth with the errors of receivers, compasses and clocks."""
+"""Recorded poses: the true ones with the errors of GNSS receivers, compasses and clocks."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """Errors of the record (all one sigma or half range, as said).
+    """Errors of recorded poses; each value is one sigma or a half range, as stated.
 
     Attributes:
         position_m: half range of the uniform error of each picture's horizontal position (paper IV.A: 1 m).
@@ -21,9 +21,9 @@ class Noise:
         heading_bias_deg: one sigma of a vehicle's fixed compass error. tilt_bias_deg: of its pitch and roll error.
         angle_deg: one sigma of the angles from picture to picture.
         outlier_share: share of positions that are 5 to 20 m off.
-        lag_s: (least, most) seconds by which positions are late, one draw per vehicle.
+        lag_s: (smallest, largest) delay of positions in seconds, one draw per vehicle.
         height_m: one sigma of the height from picture to picture. height_offset_m: fixed offset of all heights.
-        follows_plan: the autopilot steers by the drifting receiver: the record lies on the plan.
+        follows_plan: the autopilot steers by the drifting receiver, so the recorded positions follow the plan.
     """
 
     position_m: float = 1.0
@@ -54,7 +54,7 @@ class Record:
 
 
 def record(flight: Flight, noise: Noise, vehicle: int, seed: int) -> Record:
-    """The record of a flight; the same seed gives the same errors."""
+    """The recorded poses of a flight; the same seed gives the same errors."""
     rng = np.random.default_rng([seed, 43, vehicle])
     n = len(flight.time_s)
     position = flight.position.copy()

@@ -1,4 +1,4 @@
-"""Where a set lies and under what sky: place, flight direction, disaster zone, suns, the map's lean."""
+"""Site of a data set: place, flight direction, disaster zones, sun positions, relief displacement of the map."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ from orthoswarm.twin.presets import TwinSpec
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where the set lies."""
+    """Grid, centre (easting, northing) and flight direction of a data set."""
 
     grid: LocalGrid
     center: tuple[float, float]
@@ -35,7 +35,7 @@ class Site:
         return cls(grid, (float(east), float(north)), spec.plan.heading_rad)
 
     def build(self, spec: TwinSpec) -> tuple[Scene, list[Slot]]:
-        """The ground before anything happens to it, without cars, and the places for cars."""
+        """The scene before the disaster, without cars, and its parking places."""
         across, along = (0.5 * x + spec.margin_m for x in spec.plan.extent_m)
         c, s = abs(np.cos(spec.plan.heading_rad)), abs(np.sin(spec.plan.heading_rad))
         half = (float(across * c + along * s), float(across * s + along * c))
@@ -47,7 +47,7 @@ class Site:
 
 
 def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, Zone]:
-    """Where disasters strike, by name: one near the middle of the area, or with `all` one in each third of it.
+    """Disaster zones by name: one near the middle of the area, or with `all` one in each third of it.
 
     Raises:
         InputError: for a disaster that does not exist.
@@ -63,7 +63,7 @@ def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, Zone]:
 
 
 def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> Zone:
-    """A disaster's zone, its middle `place` extents along the area's long side, its long side along the area's."""
+    """A disaster's zone, parallel to the area's long side; `place`: its middle along that side, as a share of it."""
     alone = spec.disaster != "all"
     rng = np.random.default_rng([spec.seed, 53] if alone else [spec.seed, 53, list(SIZES_M).index(disaster)])
     across, along = SIZES_M[disaster]
@@ -81,7 +81,7 @@ def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> Zone:
 
 
 def suns(seed: int) -> tuple[Sun, Sun]:
-    """The light of the map and of the photos: two different hours."""
+    """Sun positions of the map and of the photos: two different hours."""
     rng = np.random.default_rng([seed, 61])
     first = rng.uniform(0.6, 1.0)
     azimuth = rng.uniform(1.6, 4.6)
@@ -99,7 +99,7 @@ def light_of(spec: TwinSpec, which: int) -> Sun:
 
 
 def map_lean(spec: TwinSpec) -> tuple[float, float]:
-    """The basemap's lean (east, north), metres of shift per metre of height."""
+    """Relief displacement in the basemap (east, north), metres per metre of height."""
     rng = np.random.default_rng([spec.seed, 67])
     size, azimuth = rng.uniform(0.2, 0.35), rng.uniform(0.0, 360.0)
     size = spec.lean if spec.lean is not None else size
@@ -108,7 +108,7 @@ def map_lean(spec: TwinSpec) -> tuple[float, float]:
 
 
 def with_heading(spec: TwinSpec) -> TwinSpec:
-    """A spec whose flight direction is drawn from its seed (the presets fly north)."""
+    """A spec with a random flight direction from its seed (the presets fly north)."""
     rng = np.random.default_rng([spec.seed, 97])
     quarter = float(rng.choice([0.0, np.pi / 2]))
     if spec.ground is not None:  # the long side of the area along the long side of the place

@@ -1,4 +1,4 @@
-"""Flights over the area: boustrophedon legs per vehicle, true motion with its wobble, and where pictures are taken."""
+"""True flights over the area: boustrophedon legs of each vehicle, deviations from the plan, exposure positions."""
 
 from dataclasses import dataclass, replace
 
@@ -17,10 +17,10 @@ FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """The swarm's task: blocks of parallel legs, one block a vehicle, in rows and columns.
+    """The swarm's flight plan: blocks of parallel legs, one block per vehicle, in rows and columns.
 
     Attributes:
-        columns: vehicles side by side across the legs; rows: one behind the other along them.
+        columns: blocks side by side across the legs; rows: blocks one behind the other along the legs.
         photos: pictures of each vehicle.
         legs: legs of each vehicle.
         spacing_m: distance of pictures along the path.
@@ -45,7 +45,7 @@ class FlightPlan:
 
     @property
     def leg_length_m(self) -> float:
-        """Length of a leg, so that legs and the ways between them take the stated number of pictures."""
+        """Length of a leg for which legs and turns together give the stated number of pictures."""
         return ((self.photos - 1) * self.spacing_m - (self.legs - 1) * self.leg_spacing_m) / self.legs
 
     @property
@@ -82,14 +82,14 @@ class FlightPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flight:
-    """What one vehicle really did.
+    """The true flight of one vehicle.
 
     Attributes:
         vehicle: its id.
         lens: its camera's true lens.
         mount_rad: fixed offsets of the camera from the airframe (yaw, pitch).
         time_s: float64 (N,), UTC epoch seconds of the pictures.
-        planned: float64 (N, 3), where the plan has it at each picture.
+        planned: float64 (N, 3), planned position of each picture.
         position: float64 (N, 3), true position of the camera.
         velocity: float64 (N, 2), true ground speed.
         angles: float64 (N, 3), the camera's true GRID yaw, pitch, roll in radians.
@@ -140,13 +140,13 @@ def _slew(heading: Array, seconds: float, rate_rad_s: float) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """How calmly the swarm flies.
+    """Deviations of the true flight from the plan.
 
     Attributes:
-        track_m: one sigma of the true path about the plan, slowly varying.
+        track_m: one sigma of the horizontal deviation from the plan, slowly varying.
         attitude_deg: one sigma of roll and pitch of the airframe, slowly varying; jitter_deg: from picture to picture.
         height_m: one sigma of the height.
-        drift_m: size of the receiver's drift that the autopilot follows; the true path leaves the plan by it.
+        drift_m: drift of the receiver, which the autopilot follows, so that the true path leaves the plan.
         mount_yaw_deg: range of the camera's fixed yaw offset; mount_pitch_deg: of its pitch offset.
     """
 
@@ -172,8 +172,8 @@ def fly(
     """One vehicle's true flight.
 
     Args:
-        plan: the swarm's task.
-        motion: how calmly it flies.
+        plan: the swarm's flight plan.
+        motion: deviations from it.
         center: grid coordinates of the area's centre.
         vehicle: its number.
         seed: of the set; each vehicle draws its own numbers from it.
@@ -201,7 +201,7 @@ def fly(
     for axis in range(3):
         body[:, axis] += smooth_noise(rng, n, 3.0, calm) + rng.normal(0, jitter, n)
     body[:, 1] -= np.radians(1.0)  # nose down at cruise
-    # the mount holds the camera level but for a share of the airframe's motion
+    # the gimbal lets 80 % of the airframe's tilt through
     angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
     time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
@@ -220,7 +220,7 @@ def fly(
 
 
 def raised(flight: Flight, ground: Terrain) -> Flight:
-    """A flight that keeps its heights above the ground below the plan."""
+    """The flight with its heights above the ground instead of above takeoff (terrain following)."""
     up = np.zeros_like(flight.planned)
     up[:, 2] = ground.height(flight.planned[:, :2])
     return replace(flight, planned=flight.planned + up, position=flight.position + up)

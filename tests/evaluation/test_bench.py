@@ -5,7 +5,7 @@ import json
 import pytest
 
 from gcs_plugin.bench import accuracy, scaling
-from gcs_plugin.bench.benchmark_runs import described, keep, label, linked, pictures
+from gcs_plugin.bench.benchmark_runs import described, label, link_photos, pictures, write_result
 from gcs_plugin.cli.main import main
 
 
@@ -92,8 +92,8 @@ def swarm_of(folder, counts):
 def test_scaling_goes_on_with_runs_that_are_there_and_says_whether_cost_is_flat(tmp_path, capsys):
     folder, out, figures = swarm_of(tmp_path / "city", [600, 600, 600, 600, 7]), tmp_path / "out", tmp_path / "figures"
     for count, cpu_s, rss_mb in ((1, 30.0, 700), (2, 48.0, 800), (4, 92.0, 900)):
-        keep(out / f"city-swarm-{count}x600.json", report(600 * count, cpu_s, rss_mb))
-    keep(out / "city-swarm-4x100.json", report(400, 17.0, 650))
+        write_result(out / f"city-swarm-{count}x600.json", report(600 * count, cpu_s, rss_mb))
+    write_result(out / "city-swarm-4x100.json", report(400, 17.0, 650))
     command = ["bench", "scaling", str(folder), "--vehicles", "1,2,4,8", "--images", "100,600", "--out", str(out)]
     assert main([*command, "--figures", str(figures)]) == 0
     said = capsys.readouterr()
@@ -123,8 +123,8 @@ def test_cost_of_one_block_says_nothing_about_growth():
 def test_photos_are_laid_out_in_folders_or_in_one(tmp_path):
     folder = swarm_of(tmp_path / "city", [2, 1])
     photos = pictures(folder / "photos")
-    linked(photos, folder / "photos", tmp_path / "nested")
-    linked(photos, folder / "photos", tmp_path / "flat", flat=True)
+    link_photos(photos, folder / "photos", tmp_path / "nested")
+    link_photos(photos, folder / "photos", tmp_path / "flat", flat=True)
     assert (tmp_path / "nested" / "uav01" / "DJI_0000.JPG").exists()
     assert [p.name for p in pictures(tmp_path / "flat")] == [
         "uav00_DJI_0000.JPG", "uav00_DJI_0001.JPG", "uav01_DJI_0000.JPG",

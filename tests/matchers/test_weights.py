@@ -51,7 +51,7 @@ def test_a_folder_of_files_is_brought_whatever_their_names(tmp_path, monkeypatch
 def test_damaged_and_unknown_files_are_refused(bare, capsys):
     (bare / "xfeat.pt").write_bytes(b"damaged")
     with pytest.raises(InputError, match="not the published"):
-        weight_files.bring(bare / "xfeat.pt")
+        weight_files.import_weights(bare / "xfeat.pt")
     (bare / "cat.jpg").write_bytes(b"cat")
     assert main(["weights", "import", str(bare / "cat.jpg")]) == 2
     assert "no weights that are known" in capsys.readouterr().err
@@ -61,7 +61,7 @@ def test_damaged_and_unknown_files_are_refused(bare, capsys):
 
 def test_weights_without_a_published_sum_go_by_name(bare):
     (bare / "roma_outdoor.pth").write_bytes(b"made up")
-    ((weight, path),) = weight_files.bring(bare)
+    ((weight, path),) = weight_files.import_weights(bare)
     assert weight.name == "roma" and path.read_bytes() == b"made up" and weight_files.find("roma") == path
 
 

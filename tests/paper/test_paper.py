@@ -97,7 +97,7 @@ def test_outliers_do_not_move_a_mean(seed, share):
     good = rng.normal(0.25, 0.005, 200)
     bad = rng.uniform(0.3, 2.0, int(200 * share))
     found = gaussian(np.concatenate([good, bad]))
-    assert found.mean == pytest.approx(0.25, abs=0.003) and found.kept < 225
+    assert found.mean == pytest.approx(0.25, abs=0.003) and found.inliers < 225
 
 
 @settings(max_examples=30, deadline=None)

@@ -1,1 +1,1 @@
-"""Scripts that run inside the environments of other programs; they import nothing of this one."""
+"""Scripts that run in the virtual environments of other programs; they import nothing from this one."""

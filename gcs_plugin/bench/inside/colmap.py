@@ -1,11 +1,11 @@
-"""Run inside the environment of pycolmap: camera poses of all photos of a folder, in its own frame and scale.
+"""Run in the environment of pycolmap: camera poses of all photos of a folder, in COLMAP's own frame and scale.
 
 Usage: colmap.py PHOTOS OUT THREADS. Sub-folders are one camera each. Writes OUT/poses.json: a list of models, each
 with `cameras` (image -> center, rotation camera to world, width, height, focal_px, k1) and `points` (some of its 3-D
 points).
 
-Features are 1,024 a picture, pairs are neighbours in time (10) and in recorded position (20 nearest), not all pairs:
-on two cores the defaults take days.
+At most 1,024 features a picture are used, and pairs only between neighbours in time (10) and in recorded position
+(the 20 nearest): with the defaults two cores would need days.
 """
 
 import json
@@ -20,7 +20,7 @@ FEATURES, IN_TIME, IN_SPACE, REACH_M = 1024, 10, 20, 150.0
 
 
 def main() -> int:
-    """Features, pairs, mapping; the exit code is 1 where no model came out."""
+    """Extract features, match pairs, map incrementally; the exit code is 1 without a model."""
     photos, out, threads = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     database = out / "database.db"
     pycolmap.set_random_seed(0)
@@ -45,7 +45,7 @@ def main() -> int:
 
 
 def as_text(model: Any) -> dict[str, Any]:
-    """A model as values that JSON can hold."""
+    """A model as JSON values."""
     cameras = {}
     for image in model.images.values():
         if not image.has_pose:

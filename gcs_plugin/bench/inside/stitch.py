@@ -1,4 +1,4 @@
-"""Run inside the environment of OpenCV 4: `Stitcher` in its mode for scans, on all photos of a folder.
+"""Run in the environment of OpenCV 4: `Stitcher` in SCANS mode on all photos of a folder.
 
 Usage: stitch.py PHOTOS OUT THREADS. Writes OUT/picture.png and OUT/said.json with the number of pictures it joined.
 """
@@ -11,7 +11,7 @@ import cv2
 
 
 def main() -> int:
-    """Stitch; the exit code is not 0 where the stitcher says that it failed, with its reason on stderr."""
+    """Stitch; the exit code is 1 if the stitcher reports a failure, with its reason on stderr."""
     photos, out, threads = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     cv2.setNumThreads(threads)
     cv2.ocl.setUseOpenCL(False)

@@ -1,1 +1,1 @@
-"""What a simulated camera makes of the ground: ray marching, sensor, EXIF and XMP tags."""
+"""The simulated camera: rendering by ray marching, sensor model, EXIF and XMP tags."""

@@ -1,4 +1,4 @@
-"""EXIF and XMP as a DJI camera writes them, put into a JPEG; no focal length or field of view (uncalibrated)."""
+"""EXIF and XMP tags as a DJI camera writes them; without focal length and field of view (an uncalibrated camera)."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -37,7 +37,7 @@ _XMP = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoTags:
-    """What a photo says about itself.
+    """The tags of a photo: time, position, attitude and camera.
 
     Attributes:
         time_s: UTC epoch seconds.
@@ -114,7 +114,7 @@ def _rational(value: float, denominator: int) -> tuple[int, int] | Fraction:
 
 
 def _sexagesimal(angle_deg: float) -> tuple[object, object, object]:
-    """Degrees, minutes, seconds to 1e-6 of a second (3e-10 degrees)."""
+    """Degrees, minutes and seconds of arc, rounded to 1e-6 seconds (3e-10 degrees)."""
     micro = round(abs(angle_deg) * 3.6e9)
     degrees, rest = divmod(micro, 3_600_000_000)
     minutes, seconds = divmod(rest, 60_000_000)

@@ -1,7 +1,7 @@
-"""What a camera sees of a scene: true perspective with facades and occlusion, by marching rays through the heights.
+"""Rendering of a scene in true perspective, with facades and occlusion, by marching rays through its height field.
 
-The height field is a set of columns with tilted tops: a ray that enters a column through its side sees the wall,
-one that comes from above sees the top. A table of the highest points of 8 m tiles lets rays skip the air.
+The height field is a set of columns with tilted tops: a ray that enters a column through its side hits the wall, a
+ray from above hits the top. A table of the highest point of each 8 m tile lets rays skip empty air.
 """
 
 from dataclasses import dataclass
@@ -26,15 +26,15 @@ BLOCK = 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
-    """A scene ready for the camera.
+    """A scene prepared for rendering.
 
     Attributes:
         scene: heights and kinds.
         levels: lit colours at 0.25, 0.5 and 1 m, uint8 (rows, columns, 3) each.
-        tiles: float32, highest point in each tile and its neighbours' rims.
+        tiles: float32, highest point of each tile, plus 0.3 m for tilted tops.
         sun: unit vector to the sun (columns, rows, up), for walls; ambient: light in the shade.
-        haze: float32 on 4 m cells, opacity 0 to 1 of the veil, empty (0, 0) for none.
-        noise: float32 (1024, 1024), periodic enough, for glints and haze that move.
+        haze: float32 on 4 m cells, opacity of the haze, 0 to 1; shape (0, 0) without haze.
+        noise: float32 (1024, 1024), read with wrap-around, for moving glints and haze.
     """
 
     scene: Scene
@@ -47,7 +47,7 @@ class Stage:
 
 
 def make_stage(scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambient: float, haze: Floats) -> Stage:
-    """Prepare a scene with its lit colours for rendering."""
+    """Prepare a scene and its lit colours for rendering; arguments as the attributes of `Stage`."""
     import cv2
 
     half = cv2.resize(lit, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -88,7 +88,7 @@ def _march(dsm, tiles, ax, ay, zc, bx, by, top):  # type: ignore[no-untyped-def]
         leave_x = zc - ((tj + stepx) * TILE_CELLS - ax) * invx if invx != 0.0 else -1e9
         leave_y = zc - ((ti + stepy) * TILE_CELLS - ay) * invy if invy != 0.0 else -1e9
         low = max(leave_x, leave_y)
-        if low > highest:  # passes over the whole tile
+        if low > highest:  # the ray stays above everything in this tile
             z, side = min(z, low) - eps, (1 if leave_x >= leave_y else 2)
             continue
         if z > highest:
@@ -170,7 +170,7 @@ def _wall_color(dsm, wall, facade, r, c, side, bx, by, x, y, z, sun, ambient, ca
 
 @kernel
 def _noise_at(noise, x, y):  # type: ignore[no-untyped-def]
-    """Bilinear, wrapping noise."""
+    """Bilinear interpolation in the noise, with wrap-around."""
     xi, yi = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - xi, y - yi
     n = noise.shape[0] - 1
@@ -181,7 +181,7 @@ def _noise_at(noise, x, y):  # type: ignore[no-untyped-def]
 
 @kernel
 def _water_color(noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
-    """Moving water: an even tone with waves and glints that no two pictures share."""
+    """Moving water: an even colour with waves and glints that differ in every picture."""
     wave = _noise_at(noise, x * 17.0 + motion[0], y * 17.0 + motion[1])
     swell = _noise_at(noise, x * 1.3 + motion[2], y * 1.3 + motion[3])
     glint = 420.0 * max(0.0, wave + 0.7 * swell - 0.66)
@@ -191,7 +191,7 @@ def _water_color(noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
 
 @kernel
 def _veil(haze, noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
-    """A white veil of uneven, moving opacity, x, y where the ray crosses it."""
+    """White haze of uneven, moving opacity; the ray crosses the haze layer at x, y."""
     u, v = x / HAZE_CELL_M - 0.5, y / HAZE_CELL_M - 0.5
     c, r = int(np.floor(u)), int(np.floor(v))
     if c < 0 or r < 0 or c >= haze.shape[1] - 1 or r >= haze.shape[0] - 1:
@@ -210,10 +210,10 @@ def _veil(haze, noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
 
 @kernel
 def _highest_below(tiles, rays, rotation, cx, cy, cz, r0, c0, r1, c1, top, floor):  # type: ignore[no-untyped-def]
-    """A height above all that the rays of a small block (corners r0, c0 to r1, c1) can meet.
+    """An upper bound of the heights that the rays of a small block (corners r0, c0 to r1, c1) can hit.
 
-    What they can meet lies in the box around their paths from `top` to the lowest ground; its highest tile is a lower
-    top, for which the box is smaller.
+    The rays stay in the box around their paths from `top` down to the lowest ground. The highest tile of that box is
+    a lower top, which makes the box smaller; three rounds are enough.
     """
     for _ in range(3):
         low_x = low_y = 1e18
@@ -251,7 +251,7 @@ def _shoot(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Colours of all rays of one picture: rays float32 (n R, n C, 2) normalised; averages n x n into out (R, C, 3).
 
-    One long body on purpose: a call for each ray with all these arrays costs as much as the ray itself.
+    One long body on purpose: a function call for each ray with all these arrays would cost as much as the ray itself.
     """
     rows, cols = out.shape[:2]
     n = side_rays
@@ -346,7 +346,7 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
 
 @kernel
 def _rise_inside(x, lean, side):  # type: ignore[no-untyped-def]
-    """Height over its ground point, which is at x, up to which a leaning ray is within a scene's side of 0 to side."""
+    """Height above its ground point x up to which an oblique ray stays inside the scene, which spans 0 to `side`."""
     if abs(lean) < 1e-9:
         return 1e9
     return (x / lean if lean > 0.0 else (x - side) / lean) - 1e-3
@@ -368,7 +368,7 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                 hr, hc, z, side = _march(
                     dsm, tiles, x / CELL_M, y / CELL_M, ground, lean_x / CELL_M, lean_y / CELL_M, top
                 )
-                if hr < 0:  # the ray is outside the scene at the height of its highest thing: begin where it enters
+                if hr < 0:  # at the height of the scene's highest point the ray is outside: start where it enters
                     wide, high = CELL_M * dsm.shape[1], CELL_M * dsm.shape[0]
                     rise = min(_rise_inside(x, lean_x, wide), _rise_inside(y, lean_y, high))
                     hr, hc, z, side = _march(
@@ -392,11 +392,11 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
 
 
 def satellite_view(stage: Stage, lean: tuple[float, float], gsd_m: float) -> tuple[Floats, GroundGrid]:
-    """A map as a satellite sees it, rectified on the bare ground: what stands up leans, and hides what is behind it.
+    """A satellite image rectified on the bare ground: buildings lean (relief displacement) and hide what is behind.
 
     Args:
         stage: the scene with its light.
-        lean: shift in metres per metre of height above the ground, (east, north).
+        lean: relief displacement in metres per metre of height above the ground, (east, north).
         gsd_m: side of a map pixel.
 
     Returns:

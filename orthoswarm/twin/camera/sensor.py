@@ -1,4 +1,4 @@
-"""From light to a JPEG: optics, vignetting, exposure, noise, encoding."""
+"""The sensor model: from light to a JPEG by optics, vignetting, exposure, noise and encoding."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ Floats = NDArray[np.float32]
 
 
 class Sensor:
-    """A small drone camera with an automatic exposure.
+    """A small drone camera with automatic exposure.
 
     Args:
         width: columns; height: rows.
-        seed: of the bank of noise from which each picture takes another part.
+        seed: of the noise array; each picture uses another part of it.
     """
 
     def __init__(self, width: int, height: int, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Drawing a city: its own frame, and polygons, strokes, buildings and trees placed in it."""
+"""Drawing a city: its street-aligned frame, and polygons, strokes, buildings and trees placed in that frame."""
 
 from dataclasses import dataclass, field
 
@@ -26,7 +26,7 @@ CARS: list[Color] = [(225, 225, 225), (60, 60, 64), (150, 152, 156), (150, 40, 3
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """A place where a car may stand: X, Y (metres from the grid's upper left) and direction."""
+    """A parking place for a car: X, Y (metres from the grid's upper left) and direction."""
 
     x: float
     y: float
@@ -123,7 +123,7 @@ class Builder:
         return not bool((self.scene.dsm[part] > self.scene.dtm[part] + 0.5).any())
 
     def slot(self, u: float, v: float, turn: float) -> None:
-        """Remember a place for a car."""
+        """Add a parking place."""
         x, y, angle = self.local(u, v)
         self.slots.append(Slot(x, y, angle + turn))
 

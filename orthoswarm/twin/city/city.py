@@ -1,4 +1,4 @@
-"""A procedural city: streets, blocks, and what makes no two places alike (the twin's usual ground)."""
+"""A procedural city: streets, blocks and surface detail that never repeats (the twin's default ground)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from orthoswarm.twin.city.quarters import fill_block
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
 from orthoswarm.twin.city.stamps import stamp_car
 
-# Grey values of five octaves (0.25, 0.7, 2.3, 9, 45 m) for each kind, and how coarse octaves turn the hue.
+# Amplitudes in grey values of five octaves (0.25, 0.7, 2.3, 9, 45 m) for each kind, and the tint of coarse octaves.
 _DETAIL: dict[int, tuple[tuple[float, float, float, float, float], Color]] = {
     kinds.GRASS: ((11, 13, 13, 15, 14), (1.1, 0.8, 0.5)),
     kinds.ASPHALT: ((7, 5, 6, 8, 8), (1, 1, 1)),
@@ -29,12 +29,12 @@ _DETAIL: dict[int, tuple[tuple[float, float, float, float, float], Color]] = {
 
 
 def build_city(grid: GroundGrid, seed: int, *, relief_m: float = 0.0) -> tuple[Scene, list[Slot]]:
-    """A city on a texture grid, without cars, and the places where cars may stand.
+    """A city on a texture grid, without cars, and its parking places.
 
     Args:
         grid: from `scene_grid`.
-        seed: which city.
-        relief_m: smooth ground relief of about +-relief_m about height 0.
+        seed: of the random city.
+        relief_m: smooth ground relief of about +-relief_m around height 0.
     """
     rng = np.random.default_rng([seed, 11])
     scene = Scene.blank(grid, float(rng.uniform(-0.6, 0.6)))
@@ -69,7 +69,7 @@ def smooth_relief(shape: tuple[int, ...], relief_m: float, seed: int) -> NDArray
 
 
 def place_cars(scene: Scene, slots: list[Slot], seed: int, share: float = 0.55) -> None:
-    """Put cars on a random share of the slots, in place (another seed, other cars elsewhere)."""
+    """Put cars on a random share of the parking places, in place; another seed gives other cars."""
     rng = np.random.default_rng([seed, 23])
     for slot in slots:
         if rng.random() > share:
@@ -140,7 +140,7 @@ def _street(b: Builder, ends: Array, width: float) -> None:
 
 
 def _asphalt_patches(b: Builder, radius: float) -> None:
-    """Repairs and manholes: texture on streets that would else be even."""
+    """Road repairs and manholes: texture on streets, which would otherwise have none."""
     import cv2
 
     s, rng = b.scene, b.rng

@@ -1,4 +1,4 @@
-"""A real place as the twin's ground: an orthoimage, a surface model and (if there is one) its bare ground."""
+"""A real place as the twin's ground: an orthoimage, a surface model (DSM) and, if there is one, a terrain model."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ def _open(path: str, what: str) -> Any:
 
 
 def ground_place(ground: tuple[str, str, str]) -> tuple[int, tuple[float, float], tuple[float, float]]:
-    """EPSG code, centre and size (east, north) of a real ground (orthoimage, surface, bare ground or empty)."""
+    """EPSG code, centre and size (east, north) of a real place; `ground` as in `load_ground`."""
     with _open(ground[0], "orthoimage") as file:
         b = file.bounds
         center = (float(round((b.left + b.right) / 2)), float(round((b.bottom + b.top) / 2)))
@@ -34,7 +34,7 @@ def ground_place(ground: tuple[str, str, str]) -> tuple[int, tuple[float, float]
 
 
 def _heights(path: str, what: str) -> tuple[Floats, Any, int]:
-    """Heights (NaN where unknown), transform and EPSG; uint16 means height = 100 + v/100 m, 65535 none."""
+    """Heights (NaN where unknown), transform and EPSG; uint16 values v mean 100 + v / 100 m, 65535 no data."""
     with _open(path, what) as file:
         raw = file.read(1)
         z = raw.astype(np.float32)
@@ -47,7 +47,7 @@ def _heights(path: str, what: str) -> tuple[Floats, Any, int]:
 
 
 def _fill(z: Floats) -> Floats:
-    """Unknown cells take the height of the nearest known one."""
+    """Fill unknown cells with the height of the nearest known cell."""
     from scipy.ndimage import distance_transform_edt
 
     unknown = np.isnan(z)
@@ -60,11 +60,11 @@ def _fill(z: Floats) -> Floats:
 def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half: tuple[float, float]) -> Scene:
     """A scene of a real place around a centre; beyond the data's border it is mirrored.
 
-    Heights are taken over the median of the bare ground, which becomes the takeoff level. The orthoimage keeps its
-    own shadows: light it with an ambient near 1.
+    Heights are relative to the median of the bare ground, which becomes the takeoff level. The orthoimage keeps its
+    own shadows: light it with `ambient` near 1.
 
     Args:
-        ground: paths of orthoimage, surface model and bare ground (empty: the surface's own lower envelope).
+        ground: paths of orthoimage, surface model and terrain model (empty: the lower envelope of the surface model).
         center: grid coordinates in the orthoimage's CRS.
         half: half extent, east and north, in metres.
 
@@ -83,7 +83,7 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
     top, left, bottom, right = _solid_part(image)
     image = np.ascontiguousarray(image[top:bottom, left:right])
     place = place * place.translation(left, top)
-    dsm = cv2.medianBlur(_fill(dsm), 5)  # wires, poles and gaps in crowns are no surface that a camera could follow
+    dsm = cv2.medianBlur(_fill(dsm), 5)  # without wires, poles and gaps in crowns, which would render as spikes
     scene = Scene.blank(scene_grid(epsg, center, *half))
     surface = _sample(dsm, dsm_place, scene, step=CELL_M, border=image.shape, frame=place)
     if ground[2]:
@@ -103,7 +103,7 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
 
 
 def _solid_part(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Rows and columns (top, left, bottom, right) of a part whose rim has no black wedges."""
+    """Rows and columns (top, left, bottom, right) of the part without the black wedges of a rotated orthoimage."""
     valid: NDArray[np.bool_] = np.asarray(image[::4, ::4].any(axis=2))
     top, left, bottom, right = 0, 0, *valid.shape
     while bottom - top > 8 and right - left > 8:
@@ -158,7 +158,7 @@ def _lower_envelope(surface: Floats) -> Floats:
 
 
 def _classify(scene: Scene) -> None:
-    """What can be told from a picture: high and green is a tree, walls are a darker shade of what lies above."""
+    """Kinds and wall colours guessed from the image: high and green is a tree, walls are a darker shade of the roof."""
     import cv2
 
     scene.kind[:] = PHOTO
@@ -173,7 +173,7 @@ def _classify(scene: Scene) -> None:
 
 
 def _sharpen(scene: Scene) -> None:
-    """Restore the contrast that resampling took, and add a little grain below the orthoimage's resolution."""
+    """Restore the contrast lost in resampling, and add a little grain finer than the orthoimage's resolution."""
     import cv2
 
     rows = scene.albedo.shape[0]

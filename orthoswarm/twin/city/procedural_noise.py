@@ -1,4 +1,4 @@
-"""Procedural noise: hashed lattices, so that texture is rich, never repeats, and depends on nothing but the seed."""
+"""Procedural noise from hashed lattices: detailed texture that never repeats and depends only on the seed."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ def noise_field(shape: tuple[int, int], step_m: float, scale_m: float, octaves: 
         step_m: side of a cell.
         scale_m: size of the largest features; each further octave is about half of it.
         octaves: how many.
-        seed: which noise.
+        seed: of the noise.
     """
     out = np.empty(shape, np.float32)
     _fill(out, step_m, scale_m, octaves, seed)
@@ -62,7 +62,7 @@ def add_detail(albedo, kind, amplitude, tint, seed):  # type: ignore[no-untyped-
     """Add fine texture to colours in place: five octaves (0.25, 0.7, 2.3, 9, 45 m) with amplitudes per kind.
 
     albedo uint8 (R, C, 3), kind uint8 (R, C), amplitude float32 (kinds, 5) in grey values, tint float32 (kinds, 3):
-    how the two coarsest octaves turn the hue.
+    factor of the two coarsest octaves for each colour band.
     """
     rows, cols = kind.shape
     for r in range(rows):

@@ -1,4 +1,4 @@
-"""What stands on the blocks of the city: houses, halls, towers, parks and fields."""
+"""The contents of city blocks: houses, halls, towers, parks and fields."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from orthoswarm.twin.city.stamps import DOME, FLAT, GABLE, HIP
 
 
 def fill_block(b: Builder, block: Area) -> None:
-    """Pave a block's rim and put one kind of quarter on it."""
+    """Pave a block and fill it, inside a pavement of 2 m, with one kind of quarter."""
     u0, v0, u1, v1 = block
     b.polygon(rect(*block), (158, 156, 150), kinds.CONCRETE)
     inner = (u0 + 2.0, v0 + 2.0, u1 - 2.0, v1 - 2.0)
@@ -159,7 +159,7 @@ def _machine(b: Builder, u: float, v: float, lift: float) -> None:
 
 
 def _towers(b: Builder, area: Area) -> None:
-    """High houses in lawns."""
+    """Tower blocks on lawns."""
     u0, v0, u1, v1 = area
     rng = b.rng
     b.polygon(rect(*area), pick(rng, LAWNS), kinds.GRASS)
@@ -204,7 +204,7 @@ def _park(b: Builder, area: Area) -> None:
 
 
 def _field(b: Builder, area: Area) -> None:
-    """A ploughed or grown field with rows, and a hut."""
+    """A ploughed or planted field with rows, and a hut."""
     u0, v0, u1, v1 = area
     rng = b.rng
     base = np.asarray(pick(rng, [(128, 108, 80), (112, 122, 66), (154, 140, 90), (120, 100, 76)]))

@@ -1,4 +1,4 @@
-"""A piece of ground with everything on it: colours, surface, bare ground, and what kind of thing lies where."""
+"""A scene: colours, surface heights, bare-ground heights, and the kind of surface of each texel."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ TILE_CELLS = 16
 """Cells along the side of a tile of the renderer's table of highest points."""
 
 GRASS, ASPHALT, CONCRETE, SOIL, FIELD, WATER, ROOF, TREE, CAR, MARK, RUBBLE, PHOTO = range(12)
-"""Kinds of surface, for texture, season, and for what moves (WATER)."""
+"""Kinds of surface; they decide texture, seasonal colour, and whether the surface moves (WATER)."""
 KINDS = 12
 
 
@@ -73,7 +73,7 @@ class Scene:
         )
 
     def copy(self) -> "Scene":
-        """A scene whose colours and surface may be changed without touching this one (the bare ground is shared)."""
+        """A copy whose colours and surface can be changed independently (the bare ground is shared)."""
         return replace(
             self,
             albedo=self.albedo.copy(),

@@ -1,6 +1,6 @@
-"""Things that are stamped into a scene: roofs, tree crowns, cars. Kernels on the scene's arrays, in metres.
+"""Objects stamped into a scene's arrays: buildings, trees, cars.
 
-Positions are X = easting - west and Y = north - northing (rows grow downwards), angles turn X towards Y.
+Positions in metres: X = easting - west, Y = north - northing (rows grow downwards); angles turn X towards Y.
 """
 
 import numpy as np
@@ -110,7 +110,7 @@ def stamp_tree(albedo, kind, dsm, dtm, wall, facade, x, y, radius, height, color
 
 @kernel
 def stamp_car(albedo, kind, dsm, dtm, wall, facade, x, y, angle, length, color):  # type: ignore[no-untyped-def]
-    """A car: a box of 1.5 m with dark windows; none where something stands already."""
+    """A car: a box of 1.5 m with dark windows; nothing is drawn where something already stands."""
     ca, sa = np.cos(angle), np.sin(angle)
     rows, cols = dsm.shape
     row, col = min(max(int(y / CELL_M), 0), rows - 1), min(max(int(x / CELL_M), 0), cols - 1)

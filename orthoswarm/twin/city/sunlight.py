@@ -1,4 +1,4 @@
-"""Light on a scene: sun, cast shadows, season; gives the colours that a camera sees."""
+"""Lighting of a scene: sun, cast shadows, season; gives the colours that are rendered."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Sun:
-    """Where the light comes from.
+    """Direction of the sun and share of ambient light.
 
     Attributes:
         azimuth_rad: clockwise from grid north. elevation_rad: above the horizon.
@@ -38,7 +38,7 @@ class Sun:
 
 @kernel
 def _shade(dsm, top, sun, ambient, cell, out):  # type: ignore[no-untyped-def]
-    """Light on each cell, 1 for level ground in the sun: lambert on the surface's slope, cast shadows."""
+    """Light on each cell (128 for level ground in the sun): Lambertian reflection by slope, and cast shadows."""
     rows, cols = dsm.shape
     sx, sy, sz = sun
     step = 1.0 / max(abs(sx), abs(sy))
@@ -128,7 +128,7 @@ def _tone(image, kind, matrix, offset, contrast):  # type: ignore[no-untyped-def
 
 
 def change_season(scene: Scene, seed: int, strength: float = 1.0) -> None:
-    """Turn the colours of plants and soil and the contrast of everything, in place: another time of the year."""
+    """Another season: change the colours of plants and soil, and the contrast of everything, in place."""
     rng = np.random.default_rng([seed, 31])
     matrix = np.tile(np.eye(3), (kinds.KINDS, 1, 1))
     offset = np.zeros((kinds.KINDS, 3))
@@ -141,7 +141,7 @@ def change_season(scene: Scene, seed: int, strength: float = 1.0) -> None:
     offset[kinds.PHOTO] = strength * rng.uniform(-14, 14, 3)
     _tone(scene.albedo, scene.kind, matrix, offset, 1.0 + strength * float(rng.uniform(-0.12, 0.08)))
     amplitude = np.zeros((kinds.KINDS, 5), np.float32)
-    # bare and grown ground never looks twice the same: weeds, wear, wet spots
+    # soil and plants also change locally between two dates: weeds, wear, wet spots
     amplitude[[kinds.PHOTO, kinds.TREE]] = (5, 6, 7, 8, 10)
     amplitude[[kinds.GRASS, kinds.SOIL, kinds.FIELD]] = (3, 4, 5, 6, 8)
     add_detail(scene.albedo, scene.kind, strength * amplitude, np.ones((kinds.KINDS, 3), np.float32), seed * 613 + 9)

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    from gcs_plugin.bench.benchmark_runs import check_set, keep
+    from gcs_plugin.bench.benchmark_runs import check_set, write_result
 
     for folder in args.sets:
         check_set(folder)
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         signal.signal(signal.SIGTERM, before)
     thin = f"-every{args.every}" if args.kind == "peers" and args.every > 1 else ""
-    keep(args.out / f"{args.kind}{thin}.json", result)
+    write_result(args.out / f"{args.kind}{thin}.json", result)
     (args.out / f"{args.kind}{thin}.md").write_text(table, encoding="utf-8")
     print(json.dumps(result) if args.json else table)
     return 0 if any("error" not in row for row in result["rows"]) else 1

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     import threading
 
     from gcs_plugin.demo.city_site import build_world
-    from gcs_plugin.demo.following_camera import Crew, Shutter, open_outlet, wait_for_place
+    from gcs_plugin.demo.following_camera import FollowingCameras, Shutter, open_outlet, wait_for_place
     from gcs_plugin.demo.relay import Relay
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.links.signing import find_key
@@ -87,20 +87,20 @@ def run(args: argparse.Namespace) -> int:
             poller.start()
             folder, world = _world(args, place)
             stage, site = build_world(world)
-            crew = Crew(
+            cameras = FollowingCameras(
                 fleet, stage, site, args.stream, seed=args.seed, level=args.level, opened=_opened,
                 rays=1 if args.fast else 2,
                 shutter=lambda: Shutter(every_s=1.0 / args.rate, above_m=args.above, on_trigger=args.on_trigger),
             )  # fmt: skip
             print(f"map: {folder / 'basemap.tif'}; area: {folder / 'area.geojson'}", file=sys.stderr, flush=True)
-            _watch(crew, fleet, stop)
+            _watch(cameras, fleet, stop)
             poller.join(5.0)
-            crew.close()
+            cameras.close()
         finally:
             stop.set()
             if relay is not None:
                 relay.close()
-    rows = [_row(follower) for _, follower in sorted(crew.followers.items())]
+    rows = [_row(follower) for _, follower in sorted(cameras.followers.items())]
     if args.json:
         print(json.dumps({"set": str(folder), "vehicles": rows}))
     else:
@@ -146,20 +146,20 @@ def _opened(follower: "Follower") -> None:
     )
 
 
-def _watch(crew: Any, fleet: "Fleet", stop: "threading.Event") -> None:
+def _watch(cameras: Any, fleet: "Fleet", stop: "threading.Event") -> None:
     """Take pictures; on a terminal print their number every few seconds."""
     import threading
     import time
 
-    def tell() -> None:
+    def report_progress() -> None:
         while not stop.wait(5.0):
             if sys.stderr.isatty():
-                parts = [f"{f.vehicle.id} {f.vehicle.mode} {f.taken} pictures" for f in crew.followers.values()]
+                parts = [f"{f.vehicle.id} {f.vehicle.mode} {f.taken} pictures" for f in cameras.followers.values()]
                 print(f"\r{time.strftime('%H:%M:%S')} {', '.join(parts)}   ", end="", file=sys.stderr, flush=True)
 
     del fleet
-    threading.Thread(target=tell, daemon=True).start()
-    crew.run(stop)
+    threading.Thread(target=report_progress, daemon=True).start()
+    cameras.run(stop)
 
 
 def _row(follower: "Follower") -> dict[str, Any]:

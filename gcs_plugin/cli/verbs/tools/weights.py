@@ -53,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
         rows = [describe(w) for w in weight_files.KNOWN.values()]
         columns = ("name", "state", "matchers", "path")
     elif args.action == "import":
-        rows = [{"name": w.name, "state": "imported", "path": str(p)} for w, p in weight_files.bring(args.source)]
+        rows = [
+            {"name": w.name, "state": "imported", "path": str(p)} for w, p in weight_files.import_weights(args.source)
+        ]
         columns = ("name", "state", "path")
     else:
         rows = [*checked_files(), *checked_matchers()]
