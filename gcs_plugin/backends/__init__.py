@@ -1,4 +1,4 @@
-"""Two ways to talk to vehicles behind one interface: our own (the default) and MAVSDK."""
+"""Two implementations of the connection to vehicles: our own with pymavlink (the default), and MAVSDK."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ def open_backend(
         pose_hz: rate of position and attitude that vehicles are asked for.
 
     Raises:
-        InputError: an address is wrong, or the backend cannot do what is asked.
+        InputError: an address is wrong, or the backend lacks an option.
     """
     if name == "pymavlink":
         from gcs_plugin.backends.direct import DirectBackend

@@ -1,4 +1,4 @@
-"""What a ground station can do with vehicles, whichever library talks to them."""
+"""The interface between the command line and vehicles, independent of the MAVLink library."""
 
 import abc
 import time
@@ -22,11 +22,11 @@ Say = Callable[[str], None]
 
 
 class Backend(abc.ABC):
-    """Vehicles on links. All calls wait until they are done; none does anything to a vehicle that it was not asked for.
+    """Vehicles on links. Calls block until they are done; a vehicle is changed only by `upload` and `command`.
 
     Attributes:
         name: for `--backend`.
-        events: all that has happened so far.
+        events: all events so far.
     """
 
     name: str
@@ -34,11 +34,11 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
-        """Look for vehicles: until all wanted ones are found, else until no further one appears; at most so long.
+        """Wait for vehicles: until all wanted ones are found, without `wanted` until no further one appears.
 
         Args:
-            wait_s: longest time.
-            wanted: system ids.
+            wait_s: longest wait, seconds.
+            wanted: system ids; empty for any.
 
         Returns:
             The system ids that were found, in order.
@@ -46,7 +46,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def autopilot(self, system: int) -> Autopilot:
-        """A vehicle's dialect."""
+        """The type of a vehicle's autopilot."""
 
     @abc.abstractmethod
     def summaries(self) -> list[dict[str, Any]]:
@@ -54,20 +54,20 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def problems(self) -> list[str]:
-        """What is wrong with links, in words."""
+        """Problems of the links, one sentence each."""
 
     @abc.abstractmethod
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
-        """Put missions into vehicles, all at once, and read them back.
+        """Upload missions to all vehicles at the same time, and read them back.
 
         Args:
             missions: by system id.
-            report: called with what is done, how much of it, out of how much.
+            report: called with a name of the step, the number of finished vehicles and their total.
         """
 
     @abc.abstractmethod
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
-        """Read the missions that vehicles hold, all at once; None for one that does not hand it out.
+        """Download the missions of vehicles, all at the same time; None for a vehicle that does not answer.
 
         Args:
             systems: system ids.
@@ -83,35 +83,35 @@ class Backend(abc.ABC):
         starts: Mapping[int, float],
         legal_height_m: float,
     ) -> "list[Check]":
-        """Check vehicles before their start, with what they say at this moment.
+        """Preflight check of vehicles with their present telemetry.
 
         Args:
-            systems: the vehicles. missions: the plan's. stored: what was read from them.
-            starts: takeoffs in seconds after the first. legal_height_m: height that may be flown without asking.
+            systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
+            starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
         """
 
     @abc.abstractmethod
     def command(
         self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
     ) -> "dict[int, Order]":
-        """Give a command to vehicles, and wait for the outcome of each.
+        """Send a command to vehicles and wait for the outcome of each.
 
-        A start that fails holds those that still wait on the ground; one that comes late moves them.
+        A failed start cancels the takeoffs that are still due; a late one delays them.
 
         Args:
-            verb: what to do.
+            verb: the command.
             delays: seconds from now for each system id.
-            say: called with each outcome, and with what follows from it, at once.
-            airspace: the missions that are started, so that later ones can be moved.
+            say: called at once with each outcome and its consequences.
+            airspace: the missions that are started, so that takeoffs that are still due can be delayed.
         """
 
     @abc.abstractmethod
     def pump(self, seconds: float) -> None:
-        """Take what vehicles say, for so long at most."""
+        """Process messages of vehicles for at most so many seconds."""
 
     @abc.abstractmethod
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Follow missions until each has ended, at most so long.
+        """Follow missions until each has ended, for at most so many seconds.
 
         Returns:
             True if all have ended.
@@ -119,7 +119,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Let go of the links."""
+        """Close the links."""
 
 
 ENDED = ("complete", "aborted")
@@ -132,7 +132,7 @@ def command_all(
     say: Say,
     airspace: "Airspace | None",
 ) -> "dict[int, Order]":
-    """Give one command to each vehicle at its time and wait for all outcomes; see `Backend.command`."""
+    """Send one command to each vehicle at its time and wait for all outcomes; see `Backend.command`."""
     schedule = TakeoffSchedule.of(delays, time.monotonic(), airspace)
     orders: dict[int, Order] = {}
     ended: set[int] = set()
@@ -152,11 +152,10 @@ def command_all(
                 for text in schedule.started(system, time.monotonic()):
                     say(text)
                 continue
-            for held in schedule.failed(system):
-                ended.add(held)
-                text = f"vehicle {held} stays on the ground, because vehicle {system} did not take off"
-                orders[held] = type(order)(verb="start", system=held, given_s=time.monotonic(), id=order.id).end(
-                    text, Verdict.NOT_SENT
-                )
+            for cancelled in schedule.failed(system):
+                ended.add(cancelled)
+                text = f"vehicle {cancelled} stays on the ground, because vehicle {system} did not take off"
+                unsent = type(order)(verb="start", system=cancelled, given_s=time.monotonic(), id=order.id)
+                orders[cancelled] = unsent.end(text, Verdict.NOT_SENT)
                 say(text)
     return orders

@@ -1,4 +1,4 @@
-"""The default backend: our own links and protocol machines, with pymavlink for messages; for many vehicles."""
+"""The default backend: our own links and MAVLink protocols, with pymavlink for messages; for many vehicles."""
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -22,11 +22,11 @@ from orthoswarm.model.errors import OrthoSwarmError
 if TYPE_CHECKING:
     from gcs_plugin.mission.track import Airspace
 
-_QUIET_S = 2.2  # two heartbeats: whoever has not been heard by then is not there
+_QUIET_S = 2.2  # two heartbeats: no further vehicle is expected after such a silence
 
 
 class DirectBackend(Backend):
-    """A fleet that is polled while something is asked of it."""
+    """A backend over `Fleet`, which is polled during each call."""
 
     name = "pymavlink"
 
@@ -44,7 +44,7 @@ class DirectBackend(Backend):
         self.fleet.on_event(self.events.append)
 
     def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
-        """Poll until everybody has been heard."""
+        """Poll until all vehicles have been heard."""
         fleet, end = self.fleet, time.monotonic() + wait_s
         found, since = -1, 0.0
         while time.monotonic() < end:
@@ -59,7 +59,7 @@ class DirectBackend(Backend):
         return sorted(fleet.vehicles)
 
     def autopilot(self, system: int) -> Autopilot:
-        """A vehicle's dialect."""
+        """The type of a vehicle's autopilot."""
         return self.fleet.vehicle(system).autopilot
 
     def summaries(self) -> list[dict[str, Any]]:
@@ -68,26 +68,26 @@ class DirectBackend(Backend):
         return [vehicle.summary(now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
     def problems(self) -> list[str]:
-        """Links that do not work, and packets that were not believed."""
+        """Broken links, rejected packets, signing and shared system ids."""
         hub = self.fleet.hub
         problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
         if hub.rejected:
-            problems.append(f"{hub.rejected} packets had no good signature; check the signing key")
+            problems.append(f"{hub.rejected} packets had no valid signature; check the signing key")
         signing = [v for v in self.fleet.vehicles.values() if v.signs and not self.fleet.signed]
         problems += [
-            f"{v.id} signs its messages; it listens only to a station with its key: --signing-key" for v in signing
+            f"{v.id} signs its messages and ignores unsigned ones; give its key with --signing-key" for v in signing
         ]
         shared = [v for v in self.fleet.vehicles.values() if v.claimants]
         problems += [f"several vehicles use the system id of {v.id}: {', '.join(v.claimants)}" for v in shared]
         return problems
 
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
-        """All uploads at once."""
+        """All uploads at the same time."""
         begin = {s: (lambda s=s, m=m: self.fleet.upload(s, m)) for s, m in missions.items()}
         return self._run(begin, "upload", report)
 
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
-        """All downloads at once."""
+        """All downloads at the same time."""
         fleet, jobs = self.fleet, dict[int, MissionDownload]()
 
         def begin(system: int) -> Exchange:
@@ -110,7 +110,7 @@ class DirectBackend(Backend):
         starts: Mapping[int, float],
         legal_height_m: float,
     ) -> list[Check]:
-        """Check with what the fleet knows."""
+        """Preflight check with the fleet's state."""
         vehicles = {s: self.fleet.vehicles[s] for s in systems}
         return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
 
@@ -131,14 +131,14 @@ class DirectBackend(Backend):
         self.fleet.poll(seconds)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Poll and tell until all missions have ended."""
-        self._learn(systems)
-        end, told = time.monotonic() + seconds, 0
+        """Poll and report events until all missions have ended."""
+        self._download_unknown(systems)
+        end, reported = time.monotonic() + seconds, 0
         while True:
-            for event in self.events[told:]:
+            for event in self.events[reported:]:
                 if event.system in systems or not systems:
                     report(event)
-            told = len(self.events)
+            reported = len(self.events)
             ended = {event.system for event in self.events if event.kind in ENDED}
             followed = set(systems) or set(self.fleet.vehicles)
             if followed and followed <= ended:
@@ -151,8 +151,8 @@ class DirectBackend(Backend):
         """Close the fleet."""
         self.fleet.close()
 
-    def _learn(self, systems: Collection[int]) -> None:
-        """Read the missions of vehicles whose missions are not known: how they end decides how that looks."""
+    def _download_unknown(self, systems: Collection[int]) -> None:
+        """Download unknown missions: whether one ends with RTL or LAND decides how its end is detected."""
         fleet = self.fleet
         jobs: list[Exchange] = []
         for system in systems or list(fleet.vehicles):
@@ -168,7 +168,7 @@ class DirectBackend(Backend):
         what: str,
         report: Report,
     ) -> dict[int, Outcome]:
-        """Begin all and poll until each has ended."""
+        """Begin all exchanges and poll until each has ended."""
         outcomes: dict[int, Outcome] = {}
         jobs: dict[int, Exchange] = {}
         for system, start in begin.items():

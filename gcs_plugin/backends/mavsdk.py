@@ -1,9 +1,9 @@
-"""The MAVSDK backend: MAVSDK holds the links and moves missions (`mission_raw`), our machines do the rest.
+"""The MAVSDK backend: links and mission transfer by MAVSDK (`mission_raw`), everything else by our own code.
 
 MAVSDK's high-level `mission` plugin does not suit ArduPilot (no home item, RTL refused), and `is_mission_finished` is
-never true for a mission that ends with LAND; so missions go through `mission_raw`, are read back and compared, and the
-end of a mission is told by the same detector as in the default backend, fed through `mavlink_direct`, which hands every
-message over as JSON. It does not hand over raw packets: no telemetry log, no signing, no telling apart of links.
+never true for a mission that ends with LAND. So missions are transferred by `mission_raw`, downloaded again and
+compared; the end of a mission is found by the same detector as in the default backend, from the messages that
+`mavlink_direct` delivers as JSON. It delivers no raw packets: no telemetry log, no signing, links not distinguished.
 """
 
 import json
@@ -45,7 +45,7 @@ _QUIET_S: Final = 2.2
 
 
 class JsonMessage:
-    """A message of `mavlink_direct` that looks like one of pymavlink's."""
+    """A message of `mavlink_direct` with the interface of a pymavlink message."""
 
     def __init__(self, fields: Mapping[str, Any]) -> None:
         self.__dict__.update(fields)
@@ -86,7 +86,7 @@ class MavsdkBackend(Backend):
             from mavsdk import Configuration, ConnectionResult, Mavsdk, log_subscribe
         except ImportError as error:
             raise InputError(f"MAVSDK cannot be loaded ({error}); pip install mavsdk, or --backend pymavlink") from None
-        log_subscribe(lambda *_: True)  # it would write to stdout, which is for results
+        log_subscribe(lambda *_: True)  # otherwise it logs to stdout, which is reserved for results
         self.events: list[FleetEvent] = []
         self._own = own
         self._queue: queue.SimpleQueue[tuple[int, JsonMessage]] = queue.SimpleQueue()
@@ -99,15 +99,15 @@ class MavsdkBackend(Backend):
                 raise InputError(f"MAVSDK cannot open link {link} ({result.name.lower()}); is the port in use?")
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close the links."""
         self._crafts.clear()
         self._mavsdk.destroy()
 
     def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
-        """Look until everybody has been heard."""
+        """Poll until all vehicles have been heard."""
         end, found, since = time.monotonic() + wait_s, -1, 0.0
         while time.monotonic() < end:
-            self._meet()
+            self._add_systems()
             self.pump(0.1)
             if len(self._crafts) != found:
                 found, since = len(self._crafts), time.monotonic()
@@ -119,7 +119,7 @@ class MavsdkBackend(Backend):
         return sorted(self._crafts)
 
     def autopilot(self, system: int) -> Autopilot:
-        """A vehicle's dialect."""
+        """The type of a vehicle's autopilot."""
         return self._craft(system).vehicle.autopilot
 
     def summaries(self) -> list[dict[str, Any]]:
@@ -128,11 +128,11 @@ class MavsdkBackend(Backend):
         return [craft.vehicle.summary(now) for _, craft in sorted(self._crafts.items())]
 
     def problems(self) -> list[str]:
-        """MAVSDK does not tell."""
+        """Empty: MAVSDK does not report problems of links."""
         return []
 
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
-        """Uploads in threads, for MAVSDK's calls wait."""
+        """Uploads in threads, since MAVSDK's calls block."""
         with ThreadPoolExecutor(max_workers=min(16, max(1, len(missions)))) as pool:
             futures = {s: pool.submit(self._upload, s, mission) for s, mission in missions.items()}
             while not all(future.done() for future in futures.values()):
@@ -146,7 +146,7 @@ class MavsdkBackend(Backend):
         return outcomes
 
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
-        """Downloads one after the other, for MAVSDK's calls wait."""
+        """Downloads one after the other, since MAVSDK's calls block."""
         found: dict[int, Mission | None] = {}
         for system in systems:
             found[system] = self._crafts[system].vehicle.mission = self._read(system)
@@ -161,7 +161,7 @@ class MavsdkBackend(Backend):
         starts: Mapping[int, float],
         legal_height_m: float,
     ) -> list[Check]:
-        """Check with what was heard."""
+        """Preflight check with the telemetry so far."""
         vehicles = {s: self._craft(s).vehicle for s in systems}
         return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
 
@@ -181,23 +181,23 @@ class MavsdkBackend(Backend):
         return command_all(delays, begin, self.pump, say, airspace)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Follow until all missions have ended."""
+        """Report events until all missions have ended."""
         for system in systems or list(self._crafts):
             detector = self._craft(system).vehicle.detector
             if not detector.knows and (mission := self._read(system)) is not None:
                 detector.knows_mission(mission)
-        end, told = time.monotonic() + seconds, 0
+        end, reported = time.monotonic() + seconds, 0
         while True:
-            for event in self.events[told:]:
+            for event in self.events[reported:]:
                 if event.system in systems or not systems:
                     report(event)
-            told = len(self.events)
+            reported = len(self.events)
             followed = set(systems) or set(self._crafts)
             if followed and followed <= {event.system for event in self.events if event.kind in ENDED}:
                 return True
             if time.monotonic() >= end:
                 return False
-            self._meet()
+            self._add_systems()
             self.pump(0.2)
 
     # --- vehicles ---
@@ -209,8 +209,8 @@ class MavsdkBackend(Backend):
             raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
         return craft
 
-    def _meet(self) -> None:
-        """Take in systems that MAVSDK has discovered."""
+    def _add_systems(self) -> None:
+        """Add systems that MAVSDK has discovered."""
         from mavsdk import Autopilot as Kind
         from mavsdk.plugins.mavlink_direct import MavlinkDirect
         from mavsdk.plugins.mission_raw import MissionRaw
@@ -248,7 +248,7 @@ class MavsdkBackend(Backend):
         return take
 
     def pump(self, seconds: float) -> None:
-        """Take what has come, and let time pass for what is under way."""
+        """Process received messages, and the time-outs of exchanges in progress."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             try:
@@ -302,7 +302,7 @@ class MavsdkBackend(Backend):
     # --- missions and commands ---
 
     def _upload(self, system: int, mission: Mission) -> Outcome:
-        """Upload and read back; in a thread of its own."""
+        """Upload and read back; runs in its own thread."""
         craft = self._crafts.get(system)
         if craft is None:
             return Outcome(ok=False, text=f"vehicle {system} is not on the links; check links and system ids")
@@ -326,7 +326,7 @@ class MavsdkBackend(Backend):
         return Outcome(ok=False, text=wrong)
 
     def _write(self, craft: _Craft, mission: Mission) -> str:
-        """Upload; returns why it failed."""
+        """Upload; returns the reason of a failure, empty on success."""
         from mavsdk.plugins.mission_raw import MissionItem as RawItem
         from mavsdk.plugins.mission_raw import MissionRawError
 
@@ -345,7 +345,7 @@ class MavsdkBackend(Backend):
         return ""
 
     def _read(self, system: int) -> Mission | None:
-        """The mission in a vehicle, None if it does not say."""
+        """The mission stored in a vehicle, None if the download fails."""
         from mavsdk.plugins.mission_raw import MissionRawError
 
         craft = self._crafts[system]

@@ -1,1 +1,1 @@
-"""The daemon's HTTP side: API, map tiles, live events, and the web page."""
+"""The daemon's web server: HTTP API, map tiles, live events, and the web page."""

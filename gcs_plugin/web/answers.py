@@ -1,4 +1,4 @@
-"""Answers of the HTTP API, and how the program's errors become answers; requests' JSON bodies."""
+"""Responses of the HTTP API, the HTTP status of each error, and JSON bodies of requests."""
 
 import asyncio
 import json
@@ -21,7 +21,7 @@ _BODY_S: Final = 30.0
 
 
 class JsonAnswer(Response):
-    """JSON in ASCII, so that any text (lone surrogates included) can be sent."""
+    """JSON in ASCII, so that any text, even with lone surrogates, can be sent."""
 
     media_type = "application/json"
 
@@ -31,14 +31,14 @@ class JsonAnswer(Response):
 
 
 def status_of(error: OrthoSwarmError) -> int:
-    """The HTTP status for an error of ours."""
+    """The HTTP status of one of this program's errors."""
     if isinstance(error, InputError):
         return 422
     return 507 if isinstance(error, DiskFullError) else 409
 
 
 def install_error_answers(app: FastAPI) -> None:
-    """Have errors answered as JSON with `detail`, wherever in a route they arise."""
+    """Answer errors raised anywhere in a route as JSON with `detail`."""
 
     async def own(_: Request, error: Exception) -> Response:
         assert isinstance(error, OrthoSwarmError)
@@ -54,7 +54,7 @@ def install_error_answers(app: FastAPI) -> None:
     async def invalid(_: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         found = "; ".join(f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors())
-        return JsonAnswer({"detail": f"the address is not as it should be ({found}); see /docs"}, status_code=422)
+        return JsonAnswer({"detail": f"the address is not valid ({found}); see /docs"}, status_code=422)
 
     app.add_exception_handler(OrthoSwarmError, own)
     app.add_exception_handler(TimeoutError, timed_out)
@@ -83,7 +83,7 @@ async def body_of(request: Request, most_bytes: int) -> bytes:
     """The body of a request.
 
     Raises:
-        HTTPException: it is larger than that, came too slowly, or was broken off.
+        HTTPException: it is larger than that, too slow, or the client disconnected.
     """
     request._receive = bounded(request.receive, most_bytes)
     try:
@@ -94,11 +94,11 @@ async def body_of(request: Request, most_bytes: int) -> bytes:
     except TimeoutError:
         raise HTTPException(408, "the request did not arrive in time; send it again") from None
     except ClientDisconnect:
-        raise HTTPException(400, "the request was not sent to its end; send it again") from None
+        raise HTTPException(400, "the request is incomplete; send it again") from None
 
 
 def parse_json(data: bytes | str) -> Any:
-    """A JSON value; NaN and infinities, which JSON does not have, are refused.
+    """A JSON value; NaN and infinities, which are not JSON, are refused.
 
     Raises:
         ValueError: it is not JSON, or nested too deeply.

@@ -1,4 +1,4 @@
-"""The HTTP API (FastAPI): thin routes over the daemon; everything that waits runs in threads."""
+"""The HTTP API (FastAPI): thin routes over the daemon; blocking calls run in threads."""
 
 import asyncio
 import contextlib
@@ -33,10 +33,10 @@ _TYPES: Final = {"webp": "image/webp", "png": "image/png"}
 
 
 class Routes:
-    """The routes' functions and what they share.
+    """The functions of the routes.
 
     Args:
-        daemon: what they are about.
+        daemon: the daemon that they call.
     """
 
     def __init__(self, daemon: Daemon) -> None:
@@ -48,7 +48,7 @@ class Routes:
         self.commands = CommandRoutes(daemon, self.standstill)
 
     def close(self) -> None:
-        """Let go of the threads."""
+        """Stop the threads."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         self._tiles.shutdown(wait=False, cancel_futures=True)
         self.uploads.close()
@@ -61,10 +61,10 @@ class Routes:
     # -- reading --------------------------------------------------------------------------------------------------
 
     async def health(self) -> Response:
-        """Liveness, version, and what is wrong at present."""
+        """Liveness, version, and present problems."""
         problems, waiting = self.daemon.problems(), self.uploads.waiting
         if waiting:
-            problems.append(f"{waiting} posted pictures wait for their turn; they are taken as soon as others are done")
+            problems.append(f"{waiting} uploads are waiting; they are accepted as soon as others are done")
         refused = self.daemon.refused.rows()
         return JsonAnswer({"status": "ok", "version": __version__, "problems": problems, "refused": refused})
 
@@ -88,7 +88,7 @@ class Routes:
         since: str | None = Query(None, description="ISO 8601, or epoch seconds: frames taken then or later"),
         limit: int | None = Query(None, ge=0),
     ) -> Response:
-        """Frames in the order in which they came."""
+        """Frames in the order of their arrival."""
         moment = None if since is None else await self.work(_moment, since)
         most = None if limit is None else min(limit, 2**62)  # larger ones do not fit the journal's integers
         rows = await self.work(self.daemon.frames, vehicle, moment, most)
@@ -103,7 +103,7 @@ class Routes:
         return JsonAnswer(await self.work(lambda: [job.document() for job in self.daemon.jobs.all()]))
 
     async def tile(self, request: Request, *, layer: str, z: int, x: int, y: int, suffix: str) -> Response:
-        """A map tile; transparent where nothing is drawn. The ETag changes with the content."""
+        """A map tile; transparent where there is no picture. The ETag changes with the content."""
         address = TileAddress(z, x, y)
         if layer not in self.daemon.tiles.names or suffix not in _TYPES or not address.valid:
             raise HTTPException(404, "there is no such tile; see /api/layers")
@@ -138,7 +138,7 @@ class Routes:
         return JsonAnswer(job.document(), status_code=202)
 
     async def exported(self, job: int, kind: str) -> Response:
-        """A file that an export job has made; a folder as a ZIP without compression."""
+        """A file of an export job; a folder is sent as a ZIP file."""
         path = await self.work(self._exported, job, kind)
         return FileResponse(path, filename=path.name)
 
@@ -163,7 +163,7 @@ class Routes:
         return JsonAnswer(await self.work(self.daemon.legs))
 
     async def completions(self) -> Response:
-        """When vehicles completed their missions, when their refinement began and ended, who was still flying."""
+        """Times of vehicles' completions and of their refinements, and the vehicles still flying then."""
         return JsonAnswer(await self.work(self.daemon.completions))
 
     async def plan(self, request: Request) -> Response:
@@ -179,10 +179,10 @@ class Routes:
         """A plan as GeoJSON: area, legs, ways, starts."""
         return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
 
-    # -- what pages share -----------------------------------------------------------------------------------------
+    # -- state shared by all open pages ---------------------------------------------------------------------------
 
     async def console_plan(self) -> Response:
-        """The operator's plan as all pages see it: `area`, `settings`, `plan` (id), `vehicles`, `version`.
+        """The operator's plan, shared by all pages: `area`, `settings`, `plan` (id), `vehicles`, `version`.
 
         `dem` is the name of the height model that plans follow, null without one.
         """
@@ -214,7 +214,7 @@ class Routes:
         return JsonAnswer(await self.work(self.daemon.exports.find_pictures, number))
 
     async def picture(self, seq: int) -> Response:
-        """A picture as it came; `seq` is its number in /api/frames."""
+        """A picture as received; `seq` is its number in /api/frames."""
         return FileResponse(await self.work(self.daemon.exports.picture, seq))
 
     async def places(self) -> Response:
@@ -223,7 +223,7 @@ class Routes:
         return JsonAnswer({"type": "FeatureCollection", "features": [feature(place) for place in found]})
 
     async def events(self, socket: WebSocket) -> None:
-        """News as they come, and a heartbeat each second."""
+        """Live events, and a heartbeat each second."""
         await stream_events(socket, self.daemon.events)
 
 
@@ -254,12 +254,12 @@ _FORM: Final = {
             }
         },
     },
-    "responses": {"201": {"description": "new, and safe on disk"}, "200": {"description": "was there already"}},
+    "responses": {"201": {"description": "new, and stored on disk"}, "200": {"description": "already known"}},
 }
 
 
 def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
-    """The ASGI application of a daemon that was started."""
+    """The ASGI application of a running daemon."""
     routes = Routes(daemon)
 
     @contextlib.asynccontextmanager

@@ -1,4 +1,4 @@
-"""Reading an area from a file that a page was given: the reader of the command line, behind an upload."""
+"""Reading an uploaded area file with the reader of the command line."""
 
 import asyncio
 import tempfile
@@ -28,7 +28,7 @@ async def read_area(
 
 
 def area_of(data: bytes, name: str) -> dict[str, Any]:
-    """What a file holds, as JSON values; see `read_area`.
+    """The content of an area file as JSON values; see `read_area`.
 
     Raises:
         InputError: it cannot be read.

@@ -1,9 +1,8 @@
-"""Commands to vehicles over HTTP: each has an id and an outcome, and is never executed 5 s after it was given.
+"""Commands to vehicles over HTTP: each has an id and an outcome, and expires 5 s after it was issued.
 
-When it was given the client says by the daemon's clock (`given_s`, which it learns from the heartbeats of the event
-stream). Without that it is the moment when the request was read, unless the daemon stood still just before: then
-nobody can tell how old the request is, and it is not executed. The same id sent again gets the same outcome, without
-the command being given twice.
+The client states the time of issue by the daemon's clock (`given_s`; heartbeats of the event stream carry that clock).
+Without it the time of issue is when the request was read, unless the daemon was suspended just before: the age of the
+request is then unknown, and it is not executed. A repeated id gets the same outcome; the command is not sent twice.
 """
 
 import asyncio
@@ -38,11 +37,11 @@ _THREADS: Final = 128
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
-    """A command as it was given.
+class Issue:
+    """Id and time of issue of a command.
 
     Attributes:
-        id: of the client or new. at: UTC epoch seconds by the daemon's clock.
+        id: from the client, or a new one. at: UTC epoch seconds by the daemon's clock.
     """
 
     id: str
@@ -50,7 +49,7 @@ class Given:
 
     @property
     def age_s(self) -> float:
-        """How long ago that was."""
+        """Seconds since then."""
         return time.time() - self.at
 
 
@@ -58,7 +57,7 @@ class CommandRoutes:
     """The routes of commands to vehicles.
 
     Args:
-        daemon: whose vehicles. standstill: of the loop in which requests are read.
+        daemon: the daemon with the links. standstill: watches the event loop that reads requests.
     """
 
     def __init__(self, daemon: Daemon, standstill: Standstill) -> None:
@@ -67,11 +66,11 @@ class CommandRoutes:
         self._known: OrderedDict[str, tuple[tuple[str, str], asyncio.Task[Rows]]] = OrderedDict()
 
     def close(self) -> None:
-        """Let go of the threads."""
+        """Stop the threads."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
-        """Give a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
+        """Send a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
 
         Body: `id` and `given_s` (epoch seconds by the daemon's clock). Answers once the outcome is known, with `id`,
         `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
@@ -99,25 +98,25 @@ class CommandRoutes:
         if known[0] != what:
             raise HTTPException(409, f"the id {number} was used for another command; give each command its own")
         if known[1].done() and (known[1].cancelled() or known[1].exception() is not None):
-            return None  # it was not a command: a wrong plan, for example
+            return None  # nothing was sent, for example because the plan was wrong: the id can be used again
         return known[1]
 
-    def _given(self, body: Mapping[str, Any]) -> Given:
+    def _given(self, body: Mapping[str, Any]) -> Issue:
         number, at = body.get("id"), body.get("given_s")
         if number is None:
             number = new_id()
         if not isinstance(number, str) or not 0 < len(number) <= _MOST_ID:
             raise InputError(f"id is not a text of 1 to {_MOST_ID} characters; send one, or none for a new one")
         if at is None:
-            return Given(number, time.time() - self._standstill.length_s())
+            return Issue(number, time.time() - self._standstill.length_s())
         if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < 1e11 or not math.isfinite(at):
-            raise InputError("given_s is not a time; send epoch seconds by the daemon's clock, as its heartbeats tell")
-        return Given(number, float(at))
+            raise InputError("given_s is not a time; send epoch seconds by the daemon's clock (`time` of a heartbeat)")
+        return Issue(number, float(at))
 
     def _carry_out(
-        self, links: VehicleLinks, vehicle: str, verb: str, given: Given, body: dict[str, Any]
+        self, links: VehicleLinks, vehicle: str, verb: str, given: Issue, body: dict[str, Any]
     ) -> Rows:  # fmt: skip
-        """Give a command to the end; in a thread."""
+        """Execute a command and publish its outcome; runs in a thread."""
         names = _names(links) if vehicle == ALL else [vehicle]
         late = _late(given)
         if late is not None:
@@ -132,7 +131,7 @@ class CommandRoutes:
             self._daemon.events.publish("command", **row)
         return rows
 
-    def _upload(self, links: VehicleLinks, vehicle: str, given: Given, body: dict[str, Any]) -> dict[str, Any]:
+    def _upload(self, links: VehicleLinks, vehicle: str, given: Issue, body: dict[str, Any]) -> dict[str, Any]:
         def result(outcome: Verdict, reason: str) -> dict[str, Any]:
             return CommandResult(given.id, vehicle, "upload", outcome, reason).document()
 
@@ -149,7 +148,7 @@ class CommandRoutes:
     # -- plans ----------------------------------------------------------------------------------------------------
 
     async def preflight(self, number: str, request: Request) -> Response:
-        """Check a plan's vehicles before their start ({"sortie": 1, "vehicles": {"v1": "alpha"}}).
+        """Preflight check of a plan's vehicles ({"sortie": 1, "vehicles": {"v1": "alpha"}}).
 
         Answers `checks`: a row a vehicle with `vehicle`, `state` and `items` (`name`, `state`: `ok`, `warning`, `red`;
         `reason`), and the plan's `start_s`, `height_m` and `time_s`.
@@ -191,7 +190,7 @@ class CommandRoutes:
 
 def _begin(
     takeoffs: Takeoffs,
-    given: Given,
+    given: Issue,
     number: str,
     *,
     sortie: int,
@@ -204,8 +203,8 @@ def _begin(
     return takeoffs.begin(number, sortie, names, override)
 
 
-def _late(given: Given) -> str | None:
-    """Why a command is not executed because of its time, None if it is fresh."""
+def _late(given: Issue) -> str | None:
+    """Why a command has expired or lies in the future, None if it is valid."""
     age = given.age_s
     if age > COMMAND_S:
         return f"it was given {age:.0f} s ago, too long to be executed now; look at the vehicle and give it again"

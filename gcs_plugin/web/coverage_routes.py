@@ -1,4 +1,4 @@
-"""The routes of the coverage: shares and gaps, the gaps as GeoJSON, and a picture of the cells."""
+"""HTTP routes of the coverage: shares and gaps, gaps as GeoJSON, cells as PNG, flights over gaps."""
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -10,10 +10,10 @@ from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
 
 
 class CoverageRoutes:
-    """The routes' functions.
+    """The functions of the routes.
 
     Args:
-        daemon: whose coverage.
+        daemon: the daemon with the coverage.
     """
 
     def __init__(self, daemon: Daemon) -> None:
@@ -29,7 +29,7 @@ class CoverageRoutes:
         app.add_api_route("/api/coverage/flight", self.flight, methods=["POST"], status_code=201)
 
     async def vehicles(self) -> Response:
-        """Vehicles that could fly the gaps: battery, minutes left (null: to be asked), and why one cannot now."""
+        """Vehicles that could fly the gaps: battery, minutes left (null: unknown), and why one cannot at present."""
         return JsonAnswer(await in_thread(self._threads, self._daemon.gap_flights.vehicles))
 
     async def flight(self, request: Request) -> Response:
@@ -49,7 +49,7 @@ class CoverageRoutes:
         return JsonAnswer(self._daemon.coverage.gaps, media_type="application/geo+json")
 
     async def cells(self, request: Request) -> Response:
-        """The states of the cells as a PNG, to be laid between the `corners` of /api/coverage."""
+        """The states of the cells as a PNG, an overlay with the `corners` of /api/coverage."""
         data: bytes = self._daemon.coverage.png
         if not data:
             raise HTTPException(404, "there is no area yet; plan one, or draw it")

@@ -1,4 +1,4 @@
-"""The event stream: what changes, as it changes, and each second the daemon's time, which shows that it is alive."""
+"""The event stream over a WebSocket: changes as they happen, and each second a heartbeat with the daemon's time."""
 
 import asyncio
 import contextlib
@@ -15,7 +15,7 @@ HEARTBEAT_S: Final = 1.0
 
 
 async def stream_events(socket: WebSocket, events: Events) -> None:
-    """News as JSON texts, one a message, until the client goes.
+    """Send events as JSON texts, one per message, until the client disconnects.
 
     `hello` comes first, `heartbeat` each second; both carry `time`, the daemon's clock in UTC epoch seconds.
     """

@@ -1,4 +1,4 @@
-"""Who may ask: same-origin pages and local programs; commands, and everything from other machines, need the token.
+"""Access control: same-origin pages and local programs; commands, and all requests of other machines, need the token.
 
 A page of another site cannot reach the daemon: a foreign Origin is refused (cross-site requests), and so is a Host
 that is not the daemon's address (DNS rebinding). Commands need the token in a header, which no foreign form can set.
@@ -31,17 +31,17 @@ _HEADERS: Final = [
 
 
 def take_token(path: Path) -> str:
-    """The token in a file, made if there is none.
+    """The token in a file; a missing file is created with a new token.
 
     Raises:
-        InputError: the file holds none, or cannot be read or written.
+        InputError: the file has no valid token, or cannot be read or written.
     """
     try:
-        # a file without content is one that was being written when the power went
+        # an empty file is left by a power failure while it was written
         if path.exists() and path.read_bytes().strip(b"\0 \r\n"):
             token = path.read_text(encoding="ascii").strip()
             if len(token) < 8:
-                raise InputError(f"{path} holds no token; put at least eight characters there, or remove it")
+                raise InputError(f"{path} contains no token; put at least eight characters there, or remove it")
             return token
         token = secrets.token_urlsafe(24)
         part = path.with_name(f".{path.name}.part")
@@ -58,12 +58,12 @@ def take_token(path: Path) -> str:
 
 
 class Guard:
-    """ASGI middleware that lets requests through or answers them itself.
+    """ASGI middleware that passes requests on or refuses them.
 
     Args:
         app: the application.
-        token: what commands need.
-        bind: the address that is served; another than a loopback one makes the token needed for everything.
+        token: required for commands.
+        bind: the address that is served; if it is not a loopback address, all requests need the token.
     """
 
     def __init__(self, app: Any, token: str, bind: str = "127.0.0.1") -> None:
@@ -103,9 +103,9 @@ class Guard:
         return None
 
     def _token_refusal(self, scope: dict[str, Any], headers: dict[str, str], *, query: bool) -> tuple[int, str] | None:
-        """Why a request's token does not do, None if it does.
+        """HTTP status and reason if a request's token is missing or wrong, else None.
 
-        It comes in a header, or (with `query`, for what changes nothing: tile sources, events) in the address.
+        It comes in a header or, with `query` and for requests that change nothing (tiles, events), in the address.
         """
         sent = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
         reading = scope["type"] == "websocket" or scope["method"] in _SAFE
@@ -123,7 +123,7 @@ _TOKEN_WRONG: Final = (401, f"this is not this daemon's token, each workspace ha
 
 
 def _is_same_site(origin: str, host: str) -> bool:
-    """Whether an Origin header names the daemon itself; one that cannot be read is foreign."""
+    """Whether an Origin header names the daemon itself; an unreadable one is foreign."""
     try:
         parts = urlsplit(origin)
     except ValueError:
@@ -164,13 +164,13 @@ class TooLarge(OrthoSwarmError):
 
 def bounded(receive: Any, most_bytes: int) -> Any:
     """An ASGI receive that raises TooLarge once a body grows beyond a size."""
-    seen = 0
+    size = 0
 
     async def receiving() -> Any:
-        nonlocal seen
+        nonlocal size
         message = await receive()
-        seen += len(message.get("body", b""))
-        if seen > most_bytes:
+        size += len(message.get("body", b""))
+        if size > most_bytes:
             raise TooLarge(f"the request is larger than {most_bytes // 1_000_000} MB; send a smaller picture")
         return message
 

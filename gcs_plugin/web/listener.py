@@ -1,4 +1,4 @@
-"""The socket on which HTTP is served."""
+"""The listening socket of the web server."""
 
 import socket
 
@@ -6,13 +6,13 @@ from orthoswarm.model.errors import InputError
 
 
 def open_listener(address: str, port: int) -> socket.socket:
-    """A bound TCP socket whose connections send each answer at once.
+    """A bound TCP socket without Nagle's algorithm on its connections.
 
-    The protocol is named because asyncio switches Nagle's algorithm off (TCP_NODELAY) only where a socket says that it
-    is TCP; with it, an answer on a kept connection waits for the client's delayed acknowledgement, 40 ms on Linux.
+    The protocol is stated because asyncio sets TCP_NODELAY only on sockets with IPPROTO_TCP. With Nagle's algorithm an
+    answer on a persistent connection waits for the client's delayed acknowledgement, 40 ms on Linux.
 
     Args:
-        address: IPv4 or IPv6 address, or a host name. port: 0 takes any free one.
+        address: IPv4 or IPv6 address, or a host name. port: 0 for any free one.
 
     Raises:
         InputError: it cannot be bound.

@@ -1,6 +1,6 @@
-"""Whether the process itself stood still: stopped, swapped out, or the laptop was closed.
+"""Detects that the process was suspended: stopped, swapped out, or the laptop was closed.
 
-What lay in the sockets meanwhile is read at once afterwards, and nothing in it tells how old it is.
+Requests that arrived meanwhile are read at once afterwards, and carry no sign of their age.
 """
 
 import asyncio
@@ -32,17 +32,17 @@ class Standstill:
         self._length_s, self._ended = 0.0, float("-inf")
 
     def tick(self) -> None:
-        """Say that the loop runs."""
+        """Note that the loop runs."""
         now = self._clock()
         if self._ticked is not None and now - self._ticked > STILL_S:
             self._length_s, self._ended = now - self._ticked, now
         self._ticked = now
 
     def length_s(self) -> float:
-        """How long the process stood still just now, at most a second ago; 0 if it did not."""
+        """Length of a suspension that ended at most a second ago, seconds; 0 without one."""
         now = self._clock()
         if self._ticked is not None and now - self._ticked > STILL_S:
-            return now - self._ticked  # what was waiting in the socket is read before the next tick
+            return now - self._ticked  # requests waiting in the socket are read before the next tick
         return self._length_s if now - self._ended < _AFTER_S else 0.0
 
     async def run(self) -> None:

@@ -1,7 +1,7 @@
-"""Posted pictures: as many at once as memory bears, no client more than its share, none that stands still for long.
+"""Uploads of pictures, limited in number in total and per client, with time-outs for stalled ones.
 
-A radio that vanishes leaves its upload half-sent and its connection open. Without a time-out a few hundred of these
-would stop all posting.
+A radio link that is lost leaves an upload incomplete and its connection open. Without a time-out a few hundred of these
+would block all further uploads.
 """
 
 import asyncio
@@ -32,12 +32,12 @@ _THREADS: Final = 12
 
 @dataclass(frozen=True, slots=True)
 class UploadLimits:
-    """What uploads may use.
+    """Limits of uploads.
 
     Attributes:
-        most: uploads at once. share: of one client (address) at once; more of it wait.
-        idle_s: without a byte, after which one is given up. slow_s: after that time one must have come at
-            `least_bytes_s` bytes a second since its beginning.
+        most: simultaneous uploads. share: simultaneous uploads of one client (address); further ones wait.
+        idle_s: seconds without a byte after which an upload is aborted. slow_s: seconds after which its mean rate must
+            be at least `least_bytes_s` bytes per second.
     """
 
     most: int = 256
@@ -48,13 +48,13 @@ class UploadLimits:
 
 
 class UploadRoute:
-    """The route that takes pictures.
+    """The route that receives pictures.
 
     Args:
-        daemon: to which they go. limits: see UploadLimits.
+        daemon: stores them. limits: see UploadLimits.
 
     Attributes:
-        waiting: posts that wait for their turn.
+        waiting: number of uploads that are waiting.
     """
 
     def __init__(self, daemon: Daemon, limits: UploadLimits = UploadLimits()) -> None:
@@ -66,15 +66,15 @@ class UploadRoute:
         self.waiting = 0
 
     def close(self) -> None:
-        """Let go of the threads."""
+        """Stop the threads."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def post_frame(self, request: Request) -> Response:
-        """Take a picture with its pose. 201 once it is safe on disk, 200 if it was there already.
+        """Upload a picture with its pose. 201 once it is stored on disk, 200 if it was already known.
 
         Multipart: file `image`, JSON `pose` with `vehicle`, `image`, `time`, `lat_deg`, `lon_deg`, `height_m`,
         `yaw_deg`, `pitch_deg`, `roll_deg`; `gps_fix` (MAVLink's GPS_FIX_TYPE) if known. Under load the answer waits;
-        an upload that stands still for 10 s is given up with 408.
+        an upload without a byte for 10 s is aborted with 408.
         """
         refused = self._daemon.refused
         async with self._slot(request):
@@ -125,10 +125,10 @@ class UploadRoute:
         except TooLarge as error:
             raise self._refuse(413, "picture", str(error)) from None
         except TimeoutError:
-            text = "the upload stood still or was slower than 1 kB/s; send it again when the radio is better"
+            text = "the upload stalled or was slower than 1 kB/s; send it again when the radio is better"
             raise self._refuse(408, "time", text, {"Connection": "close"}) from None
         except ClientDisconnect:
-            raise self._refuse(400, "time", "the upload was broken off; send it again") from None
+            raise self._refuse(400, "time", "the upload is incomplete; send it again") from None
         except InputError as error:
             self._daemon.refused.note("pose", str(error))
             raise
@@ -164,7 +164,7 @@ class UploadRoute:
 
     @contextlib.asynccontextmanager
     async def _one_at_a_time(self, vehicle: str, image: str) -> AsyncIterator[None]:
-        """The same picture sent twice at once is stored once."""
+        """Serialise uploads of the same picture, so that it is stored once."""
         key = (vehicle, image)
         lock, users = self._names.get(key, (asyncio.Lock(), 0))
         self._names[key] = (lock, users + 1)
@@ -180,7 +180,7 @@ class UploadRoute:
 
 
 def moving(receive: Callable[[], Awaitable[Any]], limits: UploadLimits) -> Callable[[], Awaitable[Any]]:
-    """An ASGI receive that raises TimeoutError where a body stands still, or comes too slowly on the whole."""
+    """An ASGI receive that raises TimeoutError if a body stalls, or its mean rate is too low."""
     loop = asyncio.get_running_loop()
     began, size = loop.time(), 0
 

@@ -1,1 +1,1 @@
-"""Where and how work runs: compiled kernels, worker processes, a Dask cluster, the time of each stage."""
+"""Execution of the work: compiled kernels, worker processes, a Dask cluster, the time of each stage."""

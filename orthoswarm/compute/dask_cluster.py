@@ -1,7 +1,7 @@
 """Work on a Dask cluster (paper III.E): the second implementation of `workers.Workers`.
 
 Tasks and results travel over the network; pictures, map and output folder do not: every worker must see them under the
-same paths, through a shared folder (docs/cluster.md). A task whose worker dies is done again by another one.
+same paths, through a shared folder (docs/cluster.md). A task whose worker dies is repeated by another one.
 """
 
 import os
@@ -47,7 +47,7 @@ class Cluster:
 
     Raises:
         InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
-            does not see a shared path or that uses several threads for sums.
+            cannot read a shared path or that uses several BLAS threads.
     """
 
     def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float | None = None) -> None:
@@ -64,7 +64,7 @@ class Cluster:
 
     @property
     def count(self) -> int:
-        """How many items are worked on at once: the workers that are there now."""
+        """Number of items processed at the same time: the present workers."""
         return max(1, len(self._workers()))
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
@@ -108,7 +108,7 @@ class Cluster:
 
     def _submit(self, function: Callable[[Any], Any], item: Any) -> Any:
         payload = pickle.dumps((function, item, overridden()), pickle.HIGHEST_PROTOCOL)
-        # A name of its own, so that equal items are worked on each, as in Processes.
+        # A unique key, so that Dask processes equal items separately, as Processes does.
         return self._client.submit(_work, payload, key=f"orthoswarm-{uuid4().hex}", pure=False)
 
     def _take(self, future: Any) -> Any:
@@ -146,7 +146,7 @@ class Cluster:
             raise InputError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
         for worker, found in self._client.run(_inspect, [str(p) for p in shared]).items():
             version, missing, process, cpu_s, alone = found
-            if not alone:  # sums over several threads differ in their last digits, and threads fight over the cores
+            if not alone:  # sums over several threads differ in their last digits, and threads compete for the cores
                 raise InputError(
                     f"the worker {worker} uses several threads for sums; start it without --no-nanny, or with "
                     "OMP_NUM_THREADS=1 in its environment"
@@ -169,9 +169,9 @@ def _connect(address: str) -> Any:
         from distributed import Client
     except ImportError:
         raise InputError("a cluster needs dask.distributed; pip install orthoswarm[cluster]") from None
-    if not re.search(r":\d+/?$", address):  # Dask would complain in its own words, and hang on leaving
+    if not re.search(r":\d+/?$", address):  # Dask's own message is obscure, and it hangs at exit
         raise InputError(f"{address} is not an address of a Dask scheduler; give one like tcp://192.168.1.10:8786")
-    # States of vehicles are megabytes large; they have to travel, and a warning for each helps nobody.
+    # States of vehicles are megabytes large and must be sent; Dask would warn about each.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
     try:
         return Client(address, timeout=active().compute.cluster_connect_s, set_as_default=False)
@@ -191,7 +191,7 @@ def _work(payload: bytes) -> _Outcome:
     raised = False
     try:
         value = pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)
-    except Exception as error:  # told at its item's turn, as by Processes; Dask would try some again
+    except Exception as error:  # raised again at its item's turn, as by Processes; Dask would retry some
         value, raised = pickle.dumps(error, pickle.HIGHEST_PROTOCOL), True
     return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())
 

@@ -14,7 +14,7 @@ class Stage:
 
     Attributes:
         name: begins with load, realtime, coarse, fine or final.
-        wall_s: seconds. cpu_s: CPU seconds of this process and the workers. items: what was worked on.
+        wall_s: wall seconds. cpu_s: CPU seconds of this process and the workers. items: number of items processed.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Clock:
 
     @contextmanager
     def stage(self, name: str, items: int = 0) -> Iterator[Stage]:
-        """Measure what is done inside; the stage is recorded when it ends."""
+        """Context manager that measures its body; the stage is recorded when it ends."""
         stage = Stage(name, items=items)
         wall, cpu = time.perf_counter(), self._cpu_now()
         yield stage

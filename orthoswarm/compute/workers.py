@@ -1,8 +1,8 @@
-"""Where work runs: in this process, or in several processes of this machine (paper III.E).
+"""Parallel tasks: in this process, or in several processes of this machine (paper III.E).
 
-Work is a function of one item. Results come back in the order of the items, so that nothing depends on the number
-of workers or on which of them was faster. Every item is pickled, also for work in this process, so that a function
-that changes what it was given changes the same copy everywhere: hand over paths and small arrays.
+A task is a function of one item. Results are returned in the order of the items, so that they do not depend on the
+number and speed of workers. Every item is pickled, also for tasks in this process, so that a function that changes its
+argument always changes a copy: pass paths and small arrays.
 """
 
 import contextlib
@@ -39,9 +39,9 @@ def prepare_process() -> None:
     BLAS, OpenMP and OpenCV get one thread each, since small matching calls take ten times as long otherwise; settings
     that the user made in the environment stay.
 
-    OpenCV is imported here, because nothing else may happen meanwhile. A second thread that imports it finds it half
-    made. It also puts its own folder, which holds a module `typing`, first on the path for that time; a process that
-    another thread spawns then inherits this path and ends at its first import.
+    OpenCV is imported here, while no other thread runs. A second thread that imports it at the same time gets a partly
+    initialised module. Its import also puts its own folder, which contains a module `typing`, first on the path; a
+    process spawned meanwhile by another thread inherits this path and fails at its first import.
     """
     for name in _THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -51,14 +51,14 @@ def prepare_process() -> None:
 
 
 def spawn_context() -> SpawnContext:
-    """How worker processes are started: spawned, since forking a process with threads can hang."""
+    """The multiprocessing context of workers: spawn, since forking a process with threads can hang."""
     prepare_process()
     return multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What the other processes have used so far.
+    """Resources that the other processes have used so far.
 
     Attributes:
         cpu_s: their CPU seconds (user and system).
@@ -70,11 +70,11 @@ class Usage:
 
 
 class Workers(Protocol):
-    """The seam: something that maps a function over items."""
+    """Interface of everything that maps a function over items."""
 
     @property
     def count(self) -> int:
-        """How many items are worked on at once."""
+        """Number of items processed at the same time."""
 
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Results in the order of the items; items are taken as workers become free.
@@ -84,10 +84,10 @@ class Workers(Protocol):
         """
 
     def usage(self) -> Usage:
-        """What the workers outside this process have used since they started."""
+        """Resources used by the workers outside this process since they started."""
 
     def close(self) -> None:
-        """Stop the workers; what they are at is given up."""
+        """Stop the workers; unfinished items are abandoned."""
 
 
 class Serial:
@@ -113,7 +113,7 @@ class Processes:
     The others start with the first map, see `spawn_context`.
 
     Args:
-        count: how many items are worked on at once, the calling process included (2 starts one more process).
+        count: number of items processed at the same time, the calling process included (2 starts one more process).
     """
 
     def __init__(self, count: int) -> None:
@@ -208,7 +208,7 @@ def _measured(function: Callable[[Item], Result], item: Item, config: Overrides)
 
 
 def _tidily(function: Callable[[Item], Result], item: Item) -> Result:
-    """Apply a function; what a long one leaves unused goes back to the system, or it piles up over a hundred tasks."""
+    """Apply a function, and after a long one return unused memory to the system, since it piles up over many tasks."""
     begun = time.process_time()
     value = function(item)
     if time.process_time() - begun > active().compute.trim_after_s:
@@ -217,19 +217,19 @@ def _tidily(function: Callable[[Item], Result], item: Item) -> Result:
 
 
 def trim_memory() -> None:
-    """Give unused memory of the C library's heap back to the system, where there is a call for it (glibc)."""
+    """Return unused heap memory to the system (glibc only)."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _own(item: Item) -> Item:
-    """A copy that nobody else sees, as another process would get it."""
+    """A private copy, as another process would receive it."""
     copy: Item = pickle.loads(pickle.dumps(item, pickle.HIGHEST_PROTOCOL))
     return copy
 
 
 def _alone(function: Callable[[Item], Result], item: Item) -> Result:
-    """Apply a function here as another process would: nothing is shared, and what is not pickled is let go."""
+    """Apply a function in this process as in another one: argument and result are pickled copies."""
     return _own(_tidily(function, _own(item)))
 
 
@@ -250,7 +250,7 @@ def prepare_worker() -> None:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as the one that started it is gone, killed or not; a pool's workers would wait on."""
+    """End this process as soon as its parent ends, even if killed; a pool's workers would wait for ever."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -263,7 +263,7 @@ def end_with_parent() -> None:
 
 
 def workers(count: int | None = None) -> Serial | Processes:
-    """Workers for a number of items at once; None takes one for each core."""
+    """Workers for a number of simultaneous items; None for one per core."""
     count = count or cores()
     return Serial() if count == 1 else Processes(count)
 

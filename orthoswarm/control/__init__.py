@@ -1,1 +1,1 @@
-"""Ground control: surveyed points that move a refined block onto the ground."""
+"""Ground control points: the similarity that moves a refined block onto surveyed points."""

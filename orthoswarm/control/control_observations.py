@@ -1,7 +1,7 @@
-"""Where a refined block puts surveyed points: by the photos that show them, or by their place on the basemap.
+"""Positions of surveyed points in a refined block: by the photos that show them, or by their position on the basemap.
 
-Photos that lie on the basemap and photos that lie where receivers say are two frames of reference, each with an error
-of its own against the ground. A point that photos of both show is one observation of each.
+Photos registered on the basemap and photos positioned by GNSS receivers are two frames of reference, each with its own
+error. A point in photos of both gives one observation for each.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,8 +26,8 @@ class ControlObservation:
 
     Attributes:
         name: of the point.
-        placed: float64 (2,), east and north where the block has it. surveyed: float64 (2,), where it is; same grid.
-        sigma_m: of the difference, an axis: survey, pointing, and the block's bends at that place.
+        placed: float64 (2,), east and north in the block. surveyed: float64 (2,), east and north by survey; same grid.
+        sigma_m: of the difference, per axis: survey, pointing, and deformation of the block at that point.
     """
 
     name: str
@@ -39,10 +39,10 @@ class ControlObservation:
 def check_control(
     points: Sequence[Checkpoint], recorded: Sequence[PlacedFrame], grid: LocalGrid, has_map: bool
 ) -> None:
-    """Refuse control points that can be of no use, before the work begins.
+    """Refuse unusable control points before the work begins.
 
     Raises:
-        InputError: no point is seen in a photo or on the basemap, or one lies far from all photos.
+        InputError: no point is marked in a photo or on the basemap, or one is far from all photos.
     """
     images = {p.frame.image: p for p in recorded}
     seen = [p for p in points if (has_map and p.on_map is not None) or _photos(p, images)]
@@ -91,7 +91,7 @@ def in_photos(
 
 
 def on_basemap(points: Iterable[Checkpoint], grid: LocalGrid, map_gsd_m: float) -> list[ControlObservation]:
-    """Points by their place on the basemap, measured there to a pixel."""
+    """Points by their position on the basemap, measured with a sigma of one pixel."""
     return [
         ControlObservation(
             point.name, _in_grid(point.on_map, grid), _in_grid(point.surveyed, grid),

@@ -1,1 +1,1 @@
-"""Which ground of an area the pictures have seen well enough, what they have missed, and why."""
+"""Coverage of an area by pictures: ground seen well enough, ground missed, and the causes."""

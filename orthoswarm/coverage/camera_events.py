@@ -1,7 +1,7 @@
-"""Camera events against pictures.
+"""Comparison of camera events with pictures.
 
-An exposure without a picture has not arrived (it is on the card, or its link is dead); a hole in a leg without an
-exposure was not triggered.
+A camera event without a picture: the picture has not arrived (it is on the card, or the link is lost). A hole in a leg
+without a camera event: the camera was not triggered.
 """
 
 from collections import defaultdict
@@ -23,7 +23,7 @@ class CameraEvent:
     """An exposure as a vehicle reported it.
 
     Attributes:
-        vehicle: whose. number: as counted by the vehicle. time_s: UTC epoch seconds.
+        vehicle: its id. number: as counted by the vehicle. time_s: UTC epoch seconds.
         position: float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it
             from another level than maps do); None where the event has none.
     """
@@ -36,11 +36,11 @@ class CameraEvent:
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """What is missing.
+    """Missing pictures.
 
     Attributes:
-        pictures: missing pictures, of which those that have not arrived are named by their event's number.
-        warnings: events that could not be used, in words.
+        pictures: missing pictures; those that have not arrived are named by their event's number.
+        warnings: reasons why events could not be used.
     """
 
     pictures: list[MissingPicture]
@@ -50,7 +50,7 @@ class Missing:
 def missing_by_events(
     views: Sequence[View], events: Iterable[CameraEvent], rejected: Iterable[Exposure] = ()
 ) -> Missing:
-    """Missing pictures of all vehicles; those of vehicles without events by holes in their rows alone.
+    """Missing pictures of all vehicles; for vehicles without events only from holes in their legs.
 
     Args:
         views: pictures that were placed. events: in any order. rejected: files that could not be used.
@@ -73,7 +73,7 @@ def missing_by_events(
             continue
         without = _without_picture(own, np.array([*(v.time_s for v in timed), *(e.time_s for e in files)], float))
         if len(own) - len(without) < active().coverage.least_matched * len(timed):
-            warnings.append(f"the camera events of {vehicle} are not at the times of its pictures: they are not used")
+            warnings.append(f"the camera events of {vehicle} do not match the times of its pictures and are not used")
             found += missing_pictures(row, files)
             continue
         waiting = [_not_arrived(event, timed) for event in without]
@@ -90,7 +90,7 @@ def missing_by_events(
 
 
 def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[View]) -> list[MissingPicture]:
-    """The pictures of a vehicle of which none has arrived, each seen as by the nearest picture of another vehicle."""
+    """The pictures of a vehicle of which none has arrived, with the camera of the nearest other vehicle's picture."""
     if not views:
         return []
     places = np.array([view.position[:2] for view in views])
@@ -106,7 +106,7 @@ def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[V
 
 
 def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[CameraEvent]:
-    """Events that no picture was taken at; each picture takes the nearest event."""
+    """Events without a picture; each picture is assigned to its nearest event."""
     at = np.array([e.time_s for e in events])
     slack = active().coverage.match_share * float(np.median(np.diff(at)))
     nearest = np.abs(at[None, :] - times[:, None]).argmin(1)
@@ -115,7 +115,7 @@ def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[Camera
 
 
 def _not_arrived(event: CameraEvent, timed: Sequence[View]) -> MissingPicture | None:
-    """The picture of an event, seen as by the vehicle's camera at the nearest picture; None without a place."""
+    """The picture of an event, with the vehicle's camera at its nearest picture; None without a position."""
     if event.position is None:
         return None
     times = np.array([v.time_s for v in timed], float)

@@ -1,4 +1,4 @@
-"""The cells of an area, to which pictures are added as they arrive and in which they are replaced once placed.
+"""The coverage grid of an area: pictures are added as they arrive, and replaced once their pose is refined.
 
     cover = CoverageGrid(Cells.of_area(epsg, ground, no_fly), Terrain.flat(), Demands())
     cover.put(views_of_a_leg)                 # recorded poses, in flight
@@ -49,10 +49,10 @@ class State(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Demands:
-    """What counts as well seen.
+    """Requirements for ground to count as well seen.
 
     Attributes:
-        gsd_m: largest ground pixel, None for any. sigma_m: largest sigma of a picture's place, None for any.
+        gsd_m: largest GSD, None for any. sigma_m: largest sigma of a picture's position, None for any.
     """
 
     gsd_m: float | None = None
@@ -64,7 +64,7 @@ class Cells:
     """The cells of an area.
 
     Attributes:
-        grid: where they lie. wanted: bool (rows, columns), cells whose centre is to be mapped. excluded: bool, cells in
+        grid: their grid. wanted: bool (rows, columns), cells whose centre is to be mapped. excluded: bool, cells in
             no-fly zones within the area's outline.
     """
 
@@ -117,7 +117,7 @@ class Shares:
 
 @dataclass
 class CoverageGrid:
-    """What pictures have seen of an area's cells so far.
+    """The state of an area's cells by the pictures so far.
 
     Attributes:
         cells: the cells. terrain: ground in the datum of the cameras. demands: what counts as well seen.
@@ -147,7 +147,7 @@ class CoverageGrid:
         """Add pictures; one of the same vehicle and name is replaced. Returns the box of changed cells, None if none.
 
         Args:
-            views: in any order. A view whose sigma is not a number is counted as 1000 m: seen, but nowhere well.
+            views: in any order. An unknown sigma (NaN) counts as 1000 m: the view sees ground, but nowhere well.
             gone: vehicle and name of pictures to be removed.
         """
         fresh = [((v.vehicle, v.image), v) for v in views]
@@ -166,7 +166,7 @@ class CoverageGrid:
             for key, view in self._views.items():
                 if key not in new:
                     self._paint(view, _common(self._boxes[key], cleared))
-        for key, view in fresh:  # all that the replaced ones had entered lay in the cleared box
+        for key, view in fresh:  # replaced views had entered only cells of the cleared box
             self._paint(view, self._boxes[key])
         changed = [b for b in (*replaced, *(self._boxes[key] for key, _ in fresh)) if b[0] < b[1] and b[2] < b[3]]
         return _union(changed) if changed else None
@@ -175,8 +175,8 @@ class CoverageGrid:
         """State of each cell, uint8 (rows, columns).
 
         Args:
-            due: cells whose flight is over, bool (rows, columns) or one value for all: what no picture saw of them is
-                missed, and not merely planned.
+            due: cells whose flight is over, bool (rows, columns) or one value for all: of these, cells in no picture
+                are MISSED, else PLANNED.
         """
         state = np.full(self.best.shape, State.OUTSIDE, np.uint8)
         wanted = self.cells.wanted
@@ -236,7 +236,7 @@ class CoverageGrid:
 
 
 def _descents() -> tuple[float, float]:
-    """Least descent of a ray per unit of length that is not oblique, and that counts as seeing the ground at all."""
+    """Cosines of the largest off-nadir angle that is not oblique, and of the largest that sees the ground at all."""
     return math.cos(math.radians(active().coverage.oblique_deg)), least_descent()
 
 

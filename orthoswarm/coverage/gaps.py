@@ -23,7 +23,7 @@ _TOLD_FIRST = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE
 
 @dataclass(frozen=True, slots=True)
 class PlannedFlight:
-    """What was to be flown.
+    """The planned flight.
 
     Attributes:
         legs: float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres.
@@ -43,8 +43,8 @@ class CoverageGap:
 
     Attributes:
         polygon: shapely Polygon in the grid of the cells. area_m2: its size.
-        cause: why. detail: the flaw, for ground seen poorly; else empty. confidence: how sure the cause is, 0 to 1.
-        vehicle: whose pictures are missing or narrow, empty where that is not known.
+        cause: why. detail: the flaw, for ground seen poorly; else empty. confidence: of the cause, 0 to 1.
+        vehicle: the vehicle whose pictures are missing or narrow, empty if unknown.
     """
 
     polygon: Geometry
@@ -90,10 +90,10 @@ def find_gaps(
 ) -> Gaps:
     """Gaps and their causes.
 
-    A cause is found by asking what would have seen a cell: a picture that is missing; else the same pictures through
-    the lens that the plan relies on; else a leg of the plan, which then was not flown (or none, so that the plan itself
-    leaves the ground out). Without a plan, whatever no missing picture explains counts as not flown, with confidence
-    one half.
+    The cause of a gap is the first of these that would have covered it: a missing picture; the same pictures with the
+    planned field of view (the lens is narrower than planned); a planned leg (it was not flown). Otherwise the plan
+    itself leaves the ground out. Without a plan, gaps that no missing picture explains count as not flown, with
+    confidence 0.5.
 
     Args:
         cover: with all pictures. missing: of `missing_pictures`. plan: what was to be flown, None if not known.
@@ -201,7 +201,7 @@ def _polygons(cover: CoverageGrid, explained: _Explained, vehicles: Sequence[str
 
 
 def _worst_flaw(best: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The one flaw of each cell that is told: of several, the one of the whole picture."""
+    """The flaw of each cell that is reported: of several, one that affects the complete picture comes first."""
     worst = np.zeros(best.shape, np.uint8)
     for flaw in _TOLD_FIRST:
         worst[(worst == 0) & (best != UNSEEN) & ((best & int(flaw)) > 0)] = int(flaw)

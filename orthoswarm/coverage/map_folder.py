@@ -24,13 +24,13 @@ from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapFolder:
-    """What a map says about its pictures.
+    """The pictures of a finished map.
 
     Attributes:
         epsg: grid of the map. ground_z_m: level of the mapped ground, same datum as the cameras.
-        views: placed pictures. rejected: files that were not, with a time.
-        root: folder that names of pictures are relative to, None where the report does not say.
-        warnings: what the user should know.
+        views: placed pictures. rejected: files that were not placed, with a time.
+        root: folder that names of pictures are relative to, None if the report does not state it.
+        warnings: for the user.
     """
 
     epsg: int
@@ -50,7 +50,7 @@ def read_map(folder: Path) -> MapFolder:
     report, rows = _documents(folder)
     placed = [row for row in rows if row.get("stage") != "rejected"]
     if not placed:
-        raise InputError(f"{folder} has no placed picture; the coverage of no picture is nothing")
+        raise InputError(f"{folder} has no placed picture, so there is no coverage; make the map again")
     zones = sorted({int(row["epsg"]) for row in placed})
     if len(zones) > 1:
         raise InputError(f"{folder} has pictures in several grids (EPSG {zones}); make one map of each area")
@@ -64,7 +64,7 @@ def read_map(folder: Path) -> MapFolder:
     warnings = []
     unplaced = sum(not v.placed for v in views)
     if unplaced:
-        warnings.append(f"{unplaced} of {len(views)} pictures lie as recorded, not placed on the map")
+        warnings.append(f"{unplaced} of {len(views)} pictures have only recorded poses, which are not refined")
     unsure = sum(not math.isfinite(v.sigma_m) for v in views)
     if unsure:
         warnings.append(f"{unsure} pictures have no known position error and count nowhere as well seen")
@@ -82,7 +82,7 @@ def _documents(folder: Path) -> tuple[Mapping[str, Any], list[dict[str, Any]]]:
             f"{folder} has no readable {missing}; give the output folder of `orthoswarm mosaic` or a workspace"
         ) from None
     except ValueError as error:
-        raise InputError(f"{folder} holds a broken report.json or frames.jsonl ({error}); make the map again") from None
+        raise InputError(f"{folder} has a damaged report.json or frames.jsonl ({error}); make the map again") from None
     if not isinstance(report, dict):
         raise InputError(f"{folder / 'report.json'} is not the report of a map; make the map again")
     return report, rows

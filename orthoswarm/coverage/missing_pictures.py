@@ -1,4 +1,4 @@
-"""Pictures that should be there and are not: holes in the even row of pictures on a straight leg."""
+"""Missing pictures: holes in the evenly spaced pictures of a straight leg."""
 
 import re
 from collections import defaultdict
@@ -26,10 +26,10 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """An event of a camera as the vehicle recorded it, or a picture file that could not be used.
+    """A camera event recorded by the vehicle, or a picture file that could not be used.
 
     Attributes:
-        vehicle: whose. time_s: UTC epoch seconds. image: name of the file, empty for an event without one.
+        vehicle: its id. time_s: UTC epoch seconds. image: name of the file, empty for an event without one.
     """
 
     vehicle: str
@@ -39,10 +39,10 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class MissingPicture:
-    """A picture that is not there.
+    """A missing picture.
 
     Attributes:
-        view: what it would have seen; its image is the name of the file where that is known.
+        view: its expected camera; its image is the name of the file where that is known.
         after: name of the picture before the hole. cause: why it is missing. confidence: 0 to 1.
     """
 
@@ -53,12 +53,12 @@ class MissingPicture:
 
 
 def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) -> list[MissingPicture]:
-    """Holes in the rows of pictures.
+    """Holes in the legs.
 
-    Between two pictures in line with the flight before or after them, a distance of 1.6 or more usual steps of the
-    vehicle (their median) is a hole. What is known about it says why: exposures with a file were rejected, exposures
-    without one have not arrived; without a record of exposures, numbers in the file names that were left out have not
-    arrived, and numbers that go on mean that the camera was not triggered.
+    A hole is a distance of at least 1.6 times the vehicle's median spacing between two successive pictures that are in
+    line with the flight before or after them. Its cause: exposures with a file were rejected, exposures without one
+    have not arrived. Without recorded exposures the numbers in file names decide: skipped numbers mean pictures that
+    have not arrived, consecutive ones that the camera was not triggered.
 
     Args:
         views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
@@ -105,7 +105,7 @@ def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture
 
 
 def _why(before: View, after: View, count: int, lost: Sequence[Exposure]) -> tuple[Cause, float, list[str]]:
-    """Cause of a hole, how sure, and names of its pictures where they are known."""
+    """Cause of a hole, its confidence (0 to 1), and names of its pictures where they are known."""
     if before.time_s is not None and after.time_s is not None:
         times = (before.time_s + active().coverage.slack_s, after.time_s - active().coverage.slack_s)
         within = [e for e in lost if times[0] < e.time_s < times[1]]

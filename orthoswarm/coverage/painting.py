@@ -11,7 +11,7 @@ _EDGE, _OBLIQUE, _COARSE = 1, 2, 64
 
 @kernel
 def _count(flaws):  # type: ignore[no-untyped-def]
-    """How many bits are set."""
+    """Number of set bits."""
     number = 0
     while flaws > 0:
         number += flaws & 1

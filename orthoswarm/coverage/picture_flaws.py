@@ -14,8 +14,9 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     """Flaws of one camera's pictures, in flying order; none for a picture that was not measured.
 
     Blurred: less than half as sharp as the median of the 15 pictures before and after. Haze: less than a quarter of
-    their contrast, or less than 4 grey levels, or half of the pixels saturated. Damaged: a tenth of the blocks more
-    than usual is of one single value. The thresholds are ours; sharpness over a wood and over a lake differ by less.
+    their median contrast, or less than 4 grey levels, or half of the pixels saturated. Damaged: the share of blocks of
+    one single value exceeds their median by a tenth. The thresholds are ours; sharpness over a wood and over a lake
+    differs by less.
     """
     config = active().coverage
     flaws = [Flaw(0)] * len(qualities)

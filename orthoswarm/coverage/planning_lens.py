@@ -1,8 +1,8 @@
-"""The field of view with which a flight over gaps is planned: what pictures saw from the heights that were recorded.
+"""The field of view for planning a flight over gaps: the solved footprint at the recorded height.
 
-An autopilot flies the next mission at heights of its own record. Where that record is wrong by a constant factor, or
-where a solution exchanged height for focal length (straight down over flat ground only their ratio is observable), the
-solved lens alone gives a wrong footprint; the solved footprint at the recorded height is right in both cases.
+An autopilot flies the next mission by its own height measurement. If that has a scale error, or if the adjustment
+exchanged height for focal length (in nadir views of flat ground only their ratio is observable), the solved lens alone
+gives a wrong footprint; the solved footprint at the recorded height is right in both cases.
 """
 
 import math

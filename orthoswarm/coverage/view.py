@@ -1,4 +1,4 @@
-"""What one picture sees of the ground: its camera, how sure its place is, and what is wrong with the picture."""
+"""One picture's view of the ground: its camera, the sigma of its position, and the flaws of the picture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Flaw(IntFlag):
-    """Why a view of a cell does not count as well seen; a view may have several flaws."""
+    """Why a cell does not count as well seen in a view; a view may have several flaws."""
 
     EDGE = 1
     """Within two sigma of the footprint's edge: it may lie outside."""
@@ -29,9 +29,9 @@ class Flaw(IntFlag):
     HAZE = 16
     """Glare or haze: too little contrast to be matched."""
     POSITION = 32
-    """The picture's own sigma is larger than asked for."""
+    """The sigma of the picture's position is larger than required."""
     COARSE = 64
-    """The ground pixel is larger than asked for."""
+    """The GSD is larger than required."""
 
 
 NO_FLAW = Flaw(0)
@@ -48,17 +48,17 @@ FLAW_NAMES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
-    """A picture as the coverage needs it.
+    """A picture's data for the coverage.
 
     Attributes:
-        image: its name. vehicle: who took it. time_s: UTC epoch seconds, None if unknown.
+        image: its name. vehicle: id. time_s: UTC epoch seconds, None if unknown.
         position: float64 (3,), east, north, height, metres (heights share the datum of the ground).
         to_camera: float64 (3, 3), from ground point minus position to camera axes (x right, y down, z = depth, m).
         lens: its lens.
         sigma_m: horizontal error of its place on the ground, one sigma per axis.
         focal_sigma: relative error of the focal length, one sigma.
-        flaws: what is wrong with the whole picture.
-        placed: True where the map or neighbours hold it, False for a recorded pose.
+        flaws: flaws of the complete picture.
+        placed: True for a refined pose, False for a recorded one.
         ground: the terrain with which the camera was solved, in the datum of its position; None for that of the grid.
         recorded_height_m: recorded height above the takeoff level, None if unknown.
     """
@@ -148,7 +148,7 @@ class View:
         )
 
     def moved_to(self, position: Array, image: str, time_s: float | None = None) -> "View":
-        """The same camera somewhere else: a picture that was not taken, or has not arrived."""
+        """The same camera at another position: for a picture that was not taken or has not arrived."""
         return replace(self, position=position, image=image, time_s=time_s)
 
     def with_fov(self, fov_rad: float) -> "View":

@@ -134,13 +134,13 @@ class RasterMap:
         return self._stretch.apply(data) if self._stretch is not None else np.asarray(data, np.uint8)
 
     def _level(self, grid: GroundGrid) -> int | None:
-        """The overview to read from: made by anyone in any way, so a factor of two is left to our own averaging."""
+        """The overview to read from; at least twice finer than needed, since its resampling method is unknown."""
         ratio = grid.gsd_m / self.native_gsd_m
         usable = [i for i, f in enumerate(self._factors) if f <= ratio / 2]
         return usable[-1] if usable else None
 
     def _bands_of(self, grid: GroundGrid) -> list[GroundGrid]:
-        """A grid in bands of rows for which not too many pixels are read at once: maps need not have overviews."""
+        """A grid in bands of rows, to limit the pixels read at once from maps without overviews."""
         t = self._open(self._level(grid)).transform
         read = grid.width * (grid.gsd_m / t.a) * (grid.gsd_m / -t.e)
         rows = max(1, int(active().compute.map_pixels_at_once / max(read, 1.0)))
@@ -150,7 +150,7 @@ class RasterMap:
         ]
 
     def _read_aligned(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
-        """A window of a raster that lies on the area's own grid, north up: several times cheaper than warping."""
+        """A window of a north-up raster in the area's CRS: several times cheaper than warping."""
         from rasterio.windows import Window
 
         source = self._open(self._level(grid))
@@ -177,7 +177,7 @@ class RasterMap:
         return resample(data, valid, first, scale, (grid.width, grid.height))
 
     def _warp(self, grid: GroundGrid, nearest: bool = False) -> tuple[NDArray[Any], Mask]:
-        """The bands and the validity of a window, resampled: averaged where it is coarser than the map."""
+        """The bands and the validity of a window, warped; averaged where it is coarser than the map."""
         from rasterio.enums import Resampling
         from rasterio.vrt import WarpedVRT
 
@@ -332,7 +332,7 @@ def _alpha_range(dtype: str) -> float:
 
 
 def _blank(values: NDArray[Any]) -> Mask:
-    """Where a map without a mask is uniformly black or white over a patch: a collar, which has only false edges."""
+    """Uniformly black or white patches of a map without a mask: its collar, whose edges would be false features."""
     import cv2
 
     side = active().raster.collar_px

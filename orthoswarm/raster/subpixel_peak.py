@@ -1,4 +1,4 @@
-"""The top of a curve between its samples."""
+"""Subpixel position of a correlation peak."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ _STRAIGHT = 1e-9
 
 @kernel
 def vertex(left, middle, right):  # type: ignore[no-untyped-def]
-    """Where the parabola through three neighbouring samples has its top: -0.5 to 0.5 steps from the middle one.
+    """Vertex of the parabola through three neighbouring samples: -0.5 to 0.5 steps from the middle one.
 
     Args:
         left, middle, right: floats, the middle one the largest; where they do not bend down the answer is 0.

@@ -99,7 +99,7 @@ class TileFolder:
         return [self.native_gsd_m * 2 ** (self._zoom - zoom) for zoom in self._columns]
 
     def require_complete(self, bounds: BoundingBox) -> None:
-        """Nothing to compare: each tile is a file of its own, and one that cannot be decoded is a hole in the map."""
+        """Does nothing: each tile is a separate file, and one that cannot be decoded is a hole in the map."""
 
     def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
         """Colours uint8 (3, rows, columns), also where grey is enough, and validity of a window."""

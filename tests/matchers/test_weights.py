@@ -54,7 +54,7 @@ def test_damaged_and_unknown_files_are_refused(bare, capsys):
         weight_files.import_weights(bare / "xfeat.pt")
     (bare / "cat.jpg").write_bytes(b"cat")
     assert main(["weights", "import", str(bare / "cat.jpg")]) == 2
-    assert "no weights that are known" in capsys.readouterr().err
+    assert "no known weights" in capsys.readouterr().err
     assert main(["weights", "import", str(bare / "nothing")]) == 2
     assert not (bare / "own").exists()
 
