@@ -1,4 +1,4 @@
-"""The surface model: which pictures are compared, and how the heights of all pairs become one."""
+"""The surface model: selection of pairs, matching, and merging of the heights of all pairs."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ class StereoConfig:
     best_base: float = 0.4
     """Distance of two cameras over their height above ground at which a pair is preferred. Single pairs of a simulated
     city had ground heights within (68 %) 1.4, 0.64, 0.49 and 0.21 m at 0.13, 0.25, 0.4 and 0.7 at 0.67 m a pixel; the
-    higher, the more lies hidden behind roofs."""
+    higher, the more ground is hidden behind roofs."""
     least_base: float = 0.12
-    """Pairs with a smaller ratio tell little of heights (chosen)."""
+    """Pairs with a smaller ratio give inaccurate heights (chosen)."""
     most_base: float = 0.9
     """With a larger ratio the two views differ too much to be matched (chosen)."""
     least_overlap: float = 0.4
-    """Share of a picture's footprint that the other one sees, too, at least (chosen)."""
+    """Least share of a picture's footprint that the other one also covers (chosen)."""
     most_turn_deg: float = 40.0
     """Angle between the two lines of sight at most, degrees (chosen)."""
     partners: int = 3
-    """Pictures with which each picture is compared at most; the time grows with it (chosen)."""
+    """Largest number of partners of each picture; the time grows with it (chosen)."""
 
     # Matching
     longest_px: int = 960
@@ -38,9 +38,9 @@ class StereoConfig:
     disparity_sigma_px: float = 0.25
     """One sigma of a disparity, pixels: the 68 % above are 0.24 of it at a base of 0.25 and 0.22 at 0.7."""
     depth_m: float = 10.0
-    """How far below the terrain heights are sought, metres (chosen)."""
+    """Search range below the terrain, metres (chosen)."""
     tallest_m: float = 60.0
-    """How far above the terrain heights are sought, metres (chosen: a tower block)."""
+    """Search range above the terrain, metres (chosen: a tower block)."""
     tallest_heights: float = 0.45
     """The same as a share of the camera's height above the ground; the lower of both counts (chosen)."""
 

@@ -4,13 +4,13 @@
     ├── OrthoSwarmError                nothing could be made of valid input (exit code 1)
     │   ├── InputError                 an argument or an input file is wrong (exit code 2)
     │   │   └── UnreadableMapError     the basemap cannot be read here      raster.map_check
-    │   ├── AdjustmentError            photos of a vehicle do not hold together
+    │   ├── AdjustmentError            photos of a vehicle are not connected by tie points
     │   ├── PictureError               a picture cannot be decoded          raster.picture_file
     │   ├── StorageError               a file cannot be written; the same may succeed later
     │   │   └── DiskFullError          there is no room on the disk
-    │   ├── WorkerStoppedError         a worker process was ended from outside
+    │   ├── WorkerStoppedError         a worker process was killed
     │   ├── SolutionFileError          a refined sortie's file is damaged or old    gcs_plugin.daemon.jobs.solution_file
-    │   ├── OutdatedError              somebody else changed the shared plan meanwhile  gcs_plugin.daemon.store
+    │   ├── OutdatedError              the shared plan was changed by another user meanwhile  gcs_plugin.daemon.store
     │   └── TooLarge                   a request's body is too large        gcs_plugin.web.guard
     ├── UnavailableError               a matcher's weights or packages are missing  matchers.matcher
     ├── Unreadable                     bytes are not of the format they claim       telemetry.samples.unreadable
@@ -34,7 +34,7 @@ class InputError(OrthoSwarmError):
 
 
 class AdjustmentError(OrthoSwarmError):
-    """Photos of a vehicle do not hold together: its normal equations are singular."""
+    """Photos of a vehicle are not connected by tie points: its normal equations are singular."""
 
 
 class StorageError(OrthoSwarmError):
@@ -46,4 +46,4 @@ class DiskFullError(StorageError):
 
 
 class WorkerStoppedError(OrthoSwarmError):
-    """A worker process was ended from outside, mostly for lack of memory; the same may succeed later."""
+    """A worker process was killed, mostly for lack of memory; the same may succeed later."""

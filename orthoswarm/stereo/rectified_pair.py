@@ -66,25 +66,25 @@ class PairPoints:
 
 
 def match_pair(first: View, second: View, terrain: Terrain) -> PairPoints:
-    """Heights of what two pictures show.
+    """Ground points of two overlapping pictures, with the sigmas of their heights.
 
     Args:
-        first, second: the pictures. terrain: ground around which heights are sought.
+        first, second: the pictures. terrain: ground around which heights are searched.
 
     Returns:
-        The points of all consistent matches, none if the pictures have too little in common.
+        The points of all consistent matches, none if the pictures overlap too little.
     """
     frame = _common_frame(first, second, terrain)
     if frame is None:
         return PairPoints(np.zeros((0, 3)), np.zeros(0))
-    left, seen_left = _resampled(first, frame, 0)
-    right, seen_right = _resampled(second, frame, frame.shift)
+    left, valid_left = _resampled(first, frame, 0)
+    right, valid_right = _resampled(second, frame, frame.shift)
     disparity = _disparities(left, right, frame.count)
-    rows, columns = np.nonzero(seen_left & (disparity >= 0.0))
+    rows, columns = np.nonzero(valid_left & (disparity >= 0.0))
     found = disparity[rows, columns]
     other = np.rint(columns - found).astype(np.intp)
     within = other >= 0
-    within[within] = seen_right[rows[within], other[within]]
+    within[within] = valid_right[rows[within], other[within]]
     rows, columns, total = rows[within], columns[within], found[within] + frame.shift
     positive = total > 0.0
     rows, columns, total = rows[positive], columns[positive], total[positive]
@@ -134,7 +134,7 @@ def _rim(camera: Camera) -> Array:
 
 
 def _outline(camera: Camera, axes: Array) -> Array | None:
-    """The border in normalised coordinates (8, 2) of the rectified frame; None where it looks away from it."""
+    """The border in normalised coordinates (8, 2) of the rectified frame; None if a point lies behind it."""
     lens = camera.lens
     xy = lens.undistort((_rim(camera) - np.array(lens.principal_point)) / lens.focal_px)
     ray = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ (camera.rotation.T @ axes)

@@ -1,4 +1,4 @@
-"""Pairs of pictures: which are compared, the heights that they give, and how heights of many pairs become one."""
+"""Selection of pairs, heights of a pair, and merging of the heights of many pairs."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def view(flight, index, factor=1):
 
 @pytest.mark.parametrize("yaws", [(0.0, 0.0), (40.0, 220.0), (90.0, 95.0)])
 @pytest.mark.parametrize("towards", [(40.0, 0.0), (-25.0, 30.0), (0.0, -45.0)])
-def test_heights_of_a_pair_are_those_of_the_ground_whatever_headings_and_directions(yaws, towards):
+def test_heights_of_a_pair_are_true_for_all_headings_and_tilts(yaws, towards):
     flight = Flight()
     flight.take(camera(yaw_deg=yaws[0], pitch_deg=-86.0, roll_deg=3.0, lens=LENS), hills)
     flight.take(camera(*towards, height=103.0, yaw_deg=yaws[1], roll_deg=-4.0, lens=LENS), hills)
@@ -38,12 +38,12 @@ def test_heights_of_a_pair_are_those_of_the_ground_whatever_headings_and_directi
     assert 0.2 < np.median(found.sigma_m) < 0.8
 
 
-def test_pictures_that_look_past_each_other_give_nothing():
+def test_pictures_without_overlap_give_no_points():
     flight = Flight().take(camera(lens=LENS)).take(camera(east=900.0, lens=LENS))
     assert len(match_pair(view(flight, 0), view(flight, 1), FLAT).points) == 0
 
 
-def test_pairs_have_a_base_that_tells_heights_and_views_alike():
+def test_pairs_have_a_sufficient_base_and_similar_views():
     flight = Flight()
     for k in range(12):
         flight.take(camera(east=10.0 * k))
