@@ -55,7 +55,7 @@ class Order:
     """One command to one vehicle, under way or ended.
 
     Attributes:
-        verb: what to do. system: the vehicle.
+        verb: the command. system: the vehicle's system id.
         given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND_S after that.
         id: of the command.
         exchange: the dialogue with the vehicle, None if none was started.

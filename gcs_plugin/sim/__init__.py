@@ -1,5 +1,5 @@
 """Simulated vehicles: small autopilots that speak real MAVLink, for tests, demonstrations and load measurements.
 
-They behave as ArduCopter 4.7 and PX4 were measured to behave (docs/vehicles.md), oddities included; they are no
-replacement for the real ones, against which the same tests run where there are any.
+They reproduce the measured behaviour of ArduCopter 4.7 and PX4 (docs/vehicles.md), with its peculiarities. They do not
+replace the real autopilots, against which the same tests can be run.
 """

@@ -23,7 +23,7 @@ class Faults:
         delay_s: least and greatest delay; packets overtake each other within it.
         silent: intervals (from, to) in seconds in which nothing gets through.
         seed: equal seeds give equal faults.
-        bytes_s: what it carries; packets wait for those before them, and those that would wait a second are lost.
+        bytes_s: capacity, bytes per second; packets queue up, and those that would wait longer than a second are lost.
     """
 
     loss: float = 0.0
@@ -35,7 +35,7 @@ class Faults:
 
     @property
     def any(self) -> bool:
-        """True if the link does anything at all."""
+        """True if any fault is set."""
         slow = self.bytes_s < math.inf
         return bool(self.loss or self.duplicate or self.delay_s[1] or self.silent or slow)
 
@@ -49,7 +49,7 @@ class Channel(Generic[Cargo]):
 
     Attributes:
         faults: what it does.
-        lost: packets that vanished; sent: packets that were put in.
+        lost: number of lost packets; sent: number of packets sent.
     """
 
     faults: Faults

@@ -56,10 +56,10 @@ class SimLink(Link):
         self._framers = [Framer() for _ in self.vehicles]
 
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
-        """Nothing to wait for."""
+        """Does nothing: there is no file descriptor to wait for."""
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Does nothing: there is nothing to close."""
 
     @property
     def polled(self) -> Any:

@@ -1,4 +1,4 @@
-"""The vehicle's side of the mission protocol, in both dialects, with their oddities."""
+"""The vehicle's side of the mission protocol, as ArduPilot and PX4 implement it."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -203,7 +203,7 @@ class MissionStore:
         """An item as ArduPilot returns it: see `mission.comparison`."""
         if seq == 0:
             return self.home
-        params = tuple(_kept(value) for value in item.params)
+        params = tuple(_stored_parameter(value) for value in item.params)
         if item.command in (WAYPOINT, TAKEOFF):
             params = (float(int(params[0])), 0.0, 0.0, 0.0)
         if not item.has_place:
@@ -244,6 +244,6 @@ class MissionStore:
         return dialect.MAVLink_mission_ack_message(to.system, to.component, code, kind)
 
 
-def _kept(value: float) -> float:
-    """A parameter as it is kept (NaN becomes 0)."""
+def _stored_parameter(value: float) -> float:
+    """A parameter as ArduPilot stores it (NaN becomes 0)."""
     return 0.0 if math.isnan(value) else float(value)

@@ -138,13 +138,13 @@ class Motion:
         self._track.append((time_s, self.north, self.east, self.up, self.yaw, self.pitch, self.roll))
 
     def go(self, target: tuple[float, float, float], *, along_line: bool = False) -> None:
-        """Fly to a point; along the line from the target before, or straight from here."""
+        """Fly to a point: along the line from the previous target, or straight from the present position."""
         before = self.target
         self._start = (before[0], before[1]) if along_line and before is not None else self.seen
         self.target = target
 
     def stop(self) -> None:
-        """Stop as soon as possible."""
+        """Brake to a stop with the largest acceleration."""
         north, east = self.seen
         after_s = math.hypot(self.vn, self.ve) / (2.0 * self.airframe.accel_m_s2) + 0.7
         self.go((north + self.vn * after_s, east + self.ve * after_s, self.up))
@@ -240,7 +240,7 @@ class Motion:
         self._lean()
 
     def _carrot(self, target: tuple[float, float, float], north: float, east: float) -> tuple[float, float]:
-        """The way to a point on the line to the target, a little ahead of where the line is nearest."""
+        """Vector to a point on the line to the target, a little ahead of the nearest point (carrot chasing)."""
         ln, le = target[0] - self._start[0], target[1] - self._start[1]
         length = math.hypot(ln, le)
         if length < 1e-6:

@@ -219,7 +219,7 @@ class SimVehicle:
 
     @property
     def _has_fix(self) -> bool:
-        """Its receiver knows where it is; ArduCopter's filter takes half a minute longer to believe it."""
+        """Whether its receiver has a fix; ArduCopter's EKF accepts the position half a minute later."""
         return self._now - self._booted >= _FIX_SHARE * self.ready_s
 
     @property
@@ -408,7 +408,7 @@ class SimVehicle:
         return dialect.MAVLink_sys_status_message(said, said, health, 250, 15800, 1200, left, 0, 0, 0, 0, 0, 0)
 
     def _filter(self) -> Message:
-        """Its message about the filter, with the flags that ArduCopter 4.7 and PX4 were observed to send."""
+        """The EKF or estimator status, with the flags that ArduCopter 4.7 and PX4 were observed to send."""
         if self.autopilot is Autopilot.PX4:
             flags = 0x3FF if self._ready else 0xA5
             return dialect.MAVLink_estimator_status_message(self._boot_ms * 1000, flags, *(0.0,) * 8)

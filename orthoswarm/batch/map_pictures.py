@@ -1,4 +1,4 @@
-"""The rasters of a run: which frames each shows, and drawing them as COGs."""
+"""The rasters of a run: selection of the frames of each, and rendering as COGs."""
 
 import shutil
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The refinement stage of a run: which frames are refined, what happens when that fails, and what it leaves."""
+"""The refinement stage of a run: selection of frames, the refiner, its failures, and its results."""
 
 import logging
 from collections import Counter

@@ -1,4 +1,4 @@
-"""The surface model of a run, where it was asked for."""
+"""The surface model of a run (`--surface`)."""
 
 import statistics
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ def make_surface(
 ) -> dict[str, Any] | None:
     """Write the file of --surface; returns its figures for the report, None if it could not be made.
 
-    What keeps it from being made is a warning: the orthoimage stands.
+    A failure becomes a warning, since the orthoimage is valid without it.
 
     Args:
         run, state: the run; its terrain is on the level of the cameras before they were moved.

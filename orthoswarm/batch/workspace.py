@@ -84,14 +84,14 @@ class Workspace:
         return False
 
     def recall(self, name: str) -> Any:
-        """What an earlier run remembered under a name; None if nothing usable."""
+        """A result stored by an earlier run under a name; None without a usable one."""
         try:
             return pickle.loads((self._work / f"{name}.pickle").read_bytes())
         except Exception:  # damaged or of another version: do it again
             return None
 
     def remember(self, name: str, value: Any) -> None:
-        """Keep a result for a later run.
+        """Store a result for a later run.
 
         Raises:
             OrthoSwarmError: if the disk is full.
@@ -100,7 +100,7 @@ class Workspace:
             pickle.dump(value, file, pickle.HIGHEST_PROTOCOL)
 
     def file(self, name: str) -> Path:
-        """A file of intermediate results that a later run goes on from, whether it is there or not."""
+        """Path of a file of intermediate results for a later run; it need not exist."""
         return self._work / name
 
     def scratch(self, name: str) -> Path:
@@ -114,11 +114,11 @@ class Workspace:
         return path
 
     def clear_scratch(self) -> None:
-        """Remove what cannot be gone on from."""
+        """Remove temporary files that a later run cannot use."""
         _remove(self._work / "scratch")
 
     def remembering(self, name: str, run: Callable[..., Iterable[Result]]) -> "RememberingRun[Result]":
-        """A `run` (function, items) that keeps each result, and asks for none that is there already."""
+        """A `run` (function, items) that stores each result, and does not repeat stored ones."""
         return RememberingRun(self, name, run)
 
     def complete(self) -> None:
@@ -127,7 +127,7 @@ class Workspace:
         _remove(self._work)
 
     def close(self) -> None:
-        """Let another run write to the folder; what was remembered stays."""
+        """Release the folder for other runs; stored results stay."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -172,19 +172,19 @@ class RememberingRun(Generic[Result]):
 
 
 def missing(folder: Path) -> list[Path]:
-    """The folders that have to be made for one to be there: itself and its parents, the innermost first."""
+    """A folder and its parents that do not exist yet, the innermost first."""
     return [p for p in (folder, *folder.parents) if not p.exists()]
 
 
 def unmake(folders: Iterable[Path]) -> None:
-    """Remove folders that nothing came into, the innermost first."""
+    """Remove empty folders, the innermost first."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
 
 
 def _try_lock(file: IO[bytes]) -> bool:
-    """Take a lock that goes with the process, however it ends."""
+    """Lock a file; the lock ends with the process in any case."""
     try:
         if os.name == "nt":
             import msvcrt

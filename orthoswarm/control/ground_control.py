@@ -1,8 +1,8 @@
 """Moving a refined block onto surveyed points, photos and terrain together.
 
-The control points do not enter the bundle adjustment: against the basemap a block is exact to centimetres, and what
-separates the map from the ground is one shift (and a little turn and scale) for all vehicles, so this is what the
-points are asked for. Bends within the block stay; they are part of the stated sigma.
+The control points do not enter the bundle adjustment: relative to the basemap a block is accurate to centimetres, and
+the map's own error is one shift (with a small rotation and scale) common to all vehicles, so only this similarity is
+estimated. Deformations within the block remain; they are part of the stated sigma.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class GroundControl:
-    """What control points did.
+    """Result of the ground control.
 
     Attributes:
-        on_map: the fit of the photos that lie on the basemap; by_receivers: of the others. None where no control point
-            concerns them.
+        on_map: the fit of the photos registered on the basemap; by_receivers: of the others. None without a control
+            point in these photos.
         warnings: findings in plain words.
     """
 
@@ -64,11 +64,11 @@ def place_on_control(
     """Move the fine cameras and their terrain onto control points.
 
     Args:
-        refinement: as the refiner left it; it stays as it is. points: surveyed points. grid: the area's.
+        refinement: result of the refiner; not modified. points: surveyed points. grid: the area's.
         map_gsd_m: the basemap's pixel, None without a basemap.
 
     Returns:
-        The moved refinement, and what the points did.
+        The moved refinement, and the result of the ground control.
 
     Raises:
         InputError: a point's pixel lies outside its photo.
@@ -118,7 +118,7 @@ def _restated(legs: Sequence[Leg], placed: Sequence[PlacedFrame]) -> list[Leg]:
 
 
 def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
-    """Of the photos that lie where receivers say: the error that all of them have in common, metres."""
+    """The common error of the photos positioned by receivers, metres: the smallest of their sigmas."""
     values = [p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)]
     return min(values, default=0.0)
 
@@ -184,5 +184,5 @@ def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> li
     for on_map, where in ((True, "on the basemap"), (False, "where the receivers say")):
         others = sum((p.stage == "fine") == on_map for p in placed)
         if others and on_map not in fits:
-            said.append(f"no control point is seen in the {others} photos that lie {where}: they stay there")
+            said.append(f"no control point is marked in the {others} photos that lie {where}: they are not moved")
     return said

@@ -53,7 +53,7 @@ class Similarity:
         return np.asarray(self.middle + away @ np.linalg.inv(matrix).T)
 
     def sigma_m(self, east_north: Array) -> Array:
-        """Sigma, an axis, (...,) of moved points by that of the similarity, by where they were (..., 2) before it."""
+        """Sigma per axis (...,) of moved points from the similarity's covariance; points (..., 2) before the move."""
         a = _design(np.asarray(east_north, float) - self.middle)
         variance = np.einsum("...ij,jk,...ik->...i", a, self.covariance, a)
         return np.asarray(np.sqrt(variance.mean(axis=-1)))
@@ -61,13 +61,13 @@ class Similarity:
 
 @dataclass(frozen=True, slots=True)
 class ControlFit:
-    """A similarity and what the control points say of it.
+    """A similarity and the residuals of the control points.
 
     Attributes:
         similarity: from the block to the ground.
-        used: the observations behind it. residual: float64 (n, 2), what is left at each of them, block minus survey.
-        left_out: observations that contradict the others.
-        contradiction: True where the observations disagree, and they are too few to tell which one is wrong.
+        used: the observations used. residual: float64 (n, 2), of each of them, block minus survey.
+        left_out: observations rejected as outliers.
+        contradiction: True where the observations disagree, but are too few to find the outlier.
     """
 
     similarity: Similarity
@@ -80,11 +80,11 @@ class ControlFit:
 def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, border_m: float) -> ControlFit:
     """The similarity that moves a block onto its control points.
 
-    A point that the others contradict is left out, the worst first, as long as three others remain to contradict it.
+    Outliers are rejected, the worst first, as long as three other observations remain.
 
     Args:
-        observations: at least one. nadirs: float64 (N, 2), the photos' places: their middle and size.
-        border_m: sigma of turn and scale, by what each does at the photos' root-mean-square radius, metres.
+        observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
+        border_m: prior sigma of rotation and scale, as the displacement at the photos' rms radius, metres.
     """
     middle = np.asarray(nadirs.mean(axis=0))
     radius = max(float(np.sqrt(((nadirs - middle) ** 2).sum(axis=1).mean())), 1.0)
@@ -125,7 +125,7 @@ def _solved(used: Sequence[ControlObservation], middle: Array, prior: Array) -> 
 
 
 def _left_out_chi2(used: Sequence[ControlObservation], middle: Array, prior: Array) -> Array:
-    """Squared sigmas (n,) by which each observation lies from where the others put it (two axes)."""
+    """Squared Mahalanobis distance (n,) of each observation from its prediction by the others (two axes)."""
     if len(used) < 2:
         return np.zeros(1)
     out = []

@@ -1,4 +1,4 @@
-"""Where pictures and their ground lie: bounds, the drawn part of a canvas, the ground's level, cover by a map."""
+"""Extents: bounds of pictures and ground, drawn part of a canvas, level of the ground, overlap with a map."""
 
 from collections.abc import Sequence
 from dataclasses import replace

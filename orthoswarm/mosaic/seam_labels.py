@@ -1,4 +1,4 @@
-"""Which frame each map pixel is taken from: the nearest nadir point among the frames that really see it.
+"""Labels of map pixels: each is drawn from the frame with the nearest nadir point of those that really see it.
 
 Without the frames' borders this is the Voronoi diagram of the nadir points. Blocks of pixels are solved one by one:
 candidates in order of their least distance to the block, until none can be nearer than what the block has.

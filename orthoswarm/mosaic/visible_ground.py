@@ -1,4 +1,4 @@
-"""What any frame sees of the ground, at low resolution: what the orthoimage's completeness is measured against."""
+"""Ground visible in any frame, at low resolution: the reference for the orthoimage's completeness."""
 
 from collections import defaultdict
 from collections.abc import Sequence

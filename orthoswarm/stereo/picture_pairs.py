@@ -1,4 +1,4 @@
-"""Which pictures are compared with which: bases that tell heights, views that can be matched."""
+"""Selection of picture pairs for matching: a sufficient base for heights, and similar lines of sight."""
 
 from collections.abc import Sequence
 

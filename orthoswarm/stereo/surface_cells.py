@@ -1,4 +1,4 @@
-"""The heights of many pairs on the cells of a grid, and the surface that they agree on."""
+"""Merging the heights of many pairs into one surface on the cells of a grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,14 +16,14 @@ Float32 = NDArray[np.float32]
 
 _HEIGHT_BITS, _HEIGHT_STEP_M = 20, 1e-3
 _HIGHEST = (1 << _HEIGHT_BITS) - 1
-"""Cell and height in one whole number, which is sorted in a third of the time of a pair of numbers."""
+"""Cell and height are packed into one integer, which is sorted in a third of the time of two columns."""
 _ROWS_AT_ONCE = 256
 """Rows of cells that are merged at a time, for memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class CellHeights:
-    """A pair's height in each cell that it sees: int64 (N,) cell, float32 (N,) metres, float32 (N,) sigma."""
+    """The heights of one pair by cell: int64 (N,) cell, float32 (N,) metres, float32 (N,) sigma."""
 
     cell: NDArray[np.int64]
     height_m: Float32
@@ -63,7 +63,7 @@ def cell_heights(found: PairPoints, grid: GroundGrid) -> CellHeights:
 
 
 class SurfaceCells:
-    """Gathers the heights of pairs, in a folder, so that memory does not grow with the area."""
+    """Collects the heights of pairs in files of a folder, so that memory does not grow with the area."""
 
     def __init__(self, grid: GroundGrid, folder: Path) -> None:
         self.grid = grid
@@ -74,7 +74,7 @@ class SurfaceCells:
         self._count = np.zeros(shape[1], np.uint8)
 
     def add(self, pairs: Sequence[CellHeights]) -> None:
-        """Add pairs; a cell that has enough of them keeps those it has."""
+        """Add pairs; a cell with the largest number of pairs ignores further ones."""
         for pair in pairs:
             room = self._count[pair.cell] < len(self._height)
             cell = pair.cell[room]
@@ -102,7 +102,7 @@ class SurfaceCells:
 def merge_heights(
     height_m: NDArray[np.floating], sigma_m: NDArray[np.floating], count: NDArray[np.uint8]
 ) -> tuple[Float32, Float32, NDArray[np.uint8]]:
-    """The weighted mean of what agrees with the median, cell by cell.
+    """The weighted mean of the heights that agree with the median, cell by cell.
 
     Args:
         height_m, sigma_m: (K, N), the first `count` values of a column count.

@@ -1,4 +1,4 @@
-"""The surface model of placed frames: pairs are matched in parallel, their heights gathered on one grid."""
+"""The surface model of placed frames: pairs are matched in parallel, their heights merged on one grid."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from orthoswarm.stereo.surface_cells import CellHeights, SurfaceCells, SurfaceMo
 _PAIRS_PER_TASK = 12
 """Pairs of a task: enough of them share pictures."""
 _PICTURES_HELD = 8
-"""Decoded pictures that a task keeps for its next pairs."""
+"""Number of decoded pictures that a task caches for its next pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +48,16 @@ def surface_model(
 
     Args:
         frames: with solved cameras.
-        terrain: ground below them: heights are sought around it.
-        epsg: the grid of the area. scratch: an empty folder for what does not fit into memory.
-        run: where the work runs. progress: called with the pairs done and all pairs.
+        terrain: ground below them; heights are searched around it.
+        epsg: the grid of the area. scratch: an empty folder for temporary files.
+        run: runs the tasks. progress: called with the pairs done and all pairs.
 
     Raises:
         OrthoSwarmError: if no two pictures overlap enough.
     """
     pairs = choose_pairs(frames, terrain)
     if not pairs:
-        raise OrthoSwarmError("no two pictures overlap enough to tell heights")
+        raise OrthoSwarmError("no two pictures overlap enough to measure heights")
     cells = SurfaceCells(_grid(frames, terrain, epsg, pairs), scratch)
     done = 0
     for found, count in run(_match, _tasks(frames, pairs, terrain, cells.grid)):

@@ -1,4 +1,4 @@
-"""For each cell of a tile the pictures that it may be taken from, what each costs there, and its grey level there.
+"""Candidate pictures of each cell of a tile, with their costs and grey levels in the cell.
 
 The cost of a picture grows with the squared tangent of its view angle (obliqueness), with the contrast that it lacks
 against the clearest picture on the same ground (haze), and with the sharpness that it lacks as a whole (blur).

@@ -1,4 +1,4 @@
-"""Steps of tone that are left at seams are taken out: a smooth correction of each picture where it is drawn.
+"""Seam leveling: a smooth correction of each picture in its drawn part, which removes remaining steps at seams.
 
 Seam leveling (Lempitsky and Ivanov 2007; Waechter, Moehrle and Goesele 2014). The unknowns are the logarithms of
 factors of red, green and blue for each picture in each cell of the map where it is drawn. Three kinds of equations are

@@ -1,4 +1,4 @@
-"""Small grey copies of all pictures in one file: what seam lines are chosen by before the pictures are read again.
+"""Small grey copies of all pictures in one file, from which seam lines are chosen without reading the pictures again.
 
 Each picture has a record of fixed size, whatever its shape, so that processes write their own without a lock. A record
 that was never written is zero (the file is sparse).
