@@ -49,10 +49,10 @@ def test_events_that_are_a_little_late_still_belong_to_their_pictures() -> None:
     assert missing_by_events(views, _events(views, later_s=0.3)).pictures == []
 
 
-def test_events_of_another_time_are_not_used_and_that_is_said() -> None:
+def test_events_of_another_time_are_not_used_with_a_warning() -> None:
     views = _views()
     found = missing_by_events(views, _events(views, later_s=86_400.0))
-    assert found.pictures == [] and "not at the times" in found.warnings[0]
+    assert found.pictures == [] and "do not match the times" in found.warnings[0]
 
 
 def test_a_vehicle_of_which_no_picture_has_arrived_is_listed_by_its_events() -> None:
