@@ -21,6 +21,10 @@ from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, grid_on_groun
 
 _BLOCK_PX = 4
 """Side of a block in pixels of the thumbnails."""
+_PARTS = 7
+"""Pixels of the map across a block."""
+_COVERED = 0.9
+"""Least share of a block that the map shows: what lies in its holes may be darker or brighter."""
 
 
 class ColorMap(Protocol):
@@ -65,6 +69,8 @@ def map_colors(
 
 def _at(tone: ColorMap, ground: NDArray[np.float64], columns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The map's means (N, P, 3) about places (N, P, 2), and where there are any."""
+    import cv2
+
     known = np.asarray(np.isfinite(ground).all(axis=-1))
     if not known.any():
         return np.zeros((*ground.shape[:2], 3)), known
@@ -72,7 +78,11 @@ def _at(tone: ColorMap, ground: NDArray[np.float64], columns: int) -> tuple[NDAr
     block = max(float(np.nanmedian(across)) / max(columns - 1, 1), 0.1)
     low, high = ground[known].min(0) - block, ground[known].max(0) + block
     bounds = BoundingBox(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    colors, mask = tone.rgb(bounds, block)
-    cell = np.rint(GroundGrid.around(0, bounds, block).to_pixel(np.where(known[..., None], ground, low))).astype(int)
+    fine = block / _PARTS
+    colors, mask = tone.rgb(bounds, fine)
+    share = cv2.blur(mask.astype(np.float32), (_PARTS, _PARTS))
+    means = cv2.blur(np.where(mask[..., None], colors, 0).astype(np.float32), (_PARTS, _PARTS))
+    cell = np.rint(GroundGrid.around(0, bounds, fine).to_pixel(np.where(known[..., None], ground, low))).astype(int)
     column, row = cell[..., 0].clip(0, mask.shape[1] - 1), cell[..., 1].clip(0, mask.shape[0] - 1)
-    return colors[row, column].astype(np.float64), known & mask[row, column]
+    covered = share[row, column]
+    return means[row, column] / np.maximum(covered, 1e-3)[..., None], known & (covered > _COVERED)

@@ -185,6 +185,20 @@ def test_a_map_of_a_part_of_the_area_is_enough_for_its_tone():
     assert applied.std(0).max() < 0.07  # and where there is none pictures still agree with the others
 
 
+class MapWithoutDarkGround(TintedMap):
+    """A map with holes where the ground is dark, such as crowns that a reconstruction could not measure."""
+
+    def rgb(self, bounds, gsd_m):
+        colour, valid = super().rgb(bounds, gsd_m)
+        return colour, valid & (colour.mean(-1) > 120)
+
+
+def test_holes_of_a_map_do_not_change_its_tone():
+    flight = scene.survey(2)
+    fields = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=MapWithoutDarkGround())
+    assert middle(fields).mean() == pytest.approx(1.0, abs=0.05)
+
+
 def test_a_grey_map_gives_no_hue():
     flight = scene.survey(2)
     fields = estimate_fields(flight.frames, thumbnails_of(flight), FLAT, tone=TintedMap((0.8, 0.8, 0.8), grey=True))
