@@ -189,8 +189,12 @@ class MapWithoutDarkGround(TintedMap):
     """A map with holes where the ground is dark, such as crowns that a reconstruction could not measure."""
 
     def rgb(self, bounds, gsd_m):
-        colour, valid = super().rgb(bounds, gsd_m)
-        return colour, valid & (colour.mean(-1) > 120)
+        ground = scene.pixel_centres(GroundGrid.around(0, bounds, gsd_m))
+        steps = gsd_m * (np.arange(6) - 2.5) / 6
+        parts = np.stack([scene.colour(ground + np.array([e, n])) for e in steps for n in steps])
+        shown = parts.mean(-1, keepdims=True) > 120
+        count = shown.sum(0)
+        return ((parts * shown).sum(0) / np.maximum(count, 1)).clip(0, 255).astype(np.uint8), count[..., 0] > 0
 
 
 def test_holes_of_a_map_do_not_change_its_tone():
