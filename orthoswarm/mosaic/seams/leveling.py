@@ -178,12 +178,12 @@ class Leveling:
             pull = weight * ratio[:, channel]
             right[:, channel] = np.bincount(other, pull, count) - np.bincount(one, pull, count)
         diagonal = anchor + np.bincount(first, links, count) + np.bincount(second, links, count)
-        log = _conjugate_gradients(first, second, links, anchor, diagonal, right)
+        log = _conjugate_gradients(first, second, links, anchor=anchor, diagonal=diagonal, right=right)
         return np.asarray(log - self._pixels @ log / self._pixels.sum())
 
 
 def _conjugate_gradients(
-    first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, anchor: Array, diagonal: Array, right: Array
+    first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, *, anchor: Array, diagonal: Array, right: Array
 ) -> Array:
     """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
     config = active().radiometry
