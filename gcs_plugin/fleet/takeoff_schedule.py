@@ -65,7 +65,7 @@ class TakeoffSchedule:
         if self.airspace is None:
             return said
         for other, _, at, metres in self._met():
-            said.append(f"v{system} will come within {metres:.0f} m of v{other} in {at - now:.0f} s: pause one of them")
+            said.append(f"v{system} may come within {metres:.0f} m of v{other} in {at - now:.0f} s: pause one of them")
         for waiter in sorted(self.waiting, key=lambda s: self.waiting[s]):
             others = {**self.flown, **{s: at for s, at in self.waiting.items() if at < self.waiting[waiter]}}
             start = self.airspace.next_start(waiter, max(now, self.waiting[waiter]), others)

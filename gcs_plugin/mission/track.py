@@ -1,25 +1,27 @@
 """Positions of vehicles over time on their missions, and the separation of missions, by the planner's own model.
 
 A mission is a path: takeoff at home, waypoints, the way back. The planner's `Motion` says when each point of it is
-passed (orthoswarm.planning.sorties.flight_time), and vehicles keep apart if at any moment, and a few seconds earlier or
+passed (orthoswarm.planning.sorties.flight_time), and vehicles keep apart if at any moment, and some seconds earlier or
 later, they are far enough from each other or at another height (orthoswarm.planning.sorties.deconfliction).
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, LOITER_TIME, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
+from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _STEP_S: Final = 0.5
 _GROUND_M: Final = 2.0
@@ -106,6 +108,20 @@ def highest_m(mission: "Mission") -> float | None:
     return max(heights, default=None)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Approaches:
+    """Pairs of samples of two flights that are too near each other.
+
+    Attributes:
+        delay: int64 (n,), by how many samples the second flight must start later for the pair to be at one time.
+        at: int64 (n,), sample of the first flight. distance_m: float64 (n,), horizontal distance.
+    """
+
+    delay: Ints
+    at: Ints
+    distance_m: Array
+
+
 @dataclass(slots=True)
 class Airspace:
     """Missions that are flown together, and their safe start times.
@@ -119,8 +135,9 @@ class Airspace:
     tracks: dict[int, Track]
     distance_m: float = 10.0
     height_m: float = 5.0
-    slack_s: float = 3.0
+    slack_s: float = field(default_factory=lambda: active().planning.schedule_slack_s)
     launch_s: float = 5.0
+    _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
@@ -133,29 +150,31 @@ class Airspace:
 
         None if they stay separated by the plan's measure: at any time, and `slack_s` earlier or later.
         """
-        a, b = self.tracks[one].places, self.tracks[other].places
-        if not len(a) or not len(b):
+        near = self._approaches(one, other)
+        slack, shift = math.ceil(self.slack_s / _STEP_S), round(later_s / _STEP_S)
+        within = np.flatnonzero(np.abs(near.delay - shift) <= slack)
+        if not len(within):
             return None
-        shared = self._share_a_start(one, other)
-        pads = [self.tracks[system].pad(_PAD * self.distance_m) for system in (one, other)]
-        worst: tuple[float, float] | None = None
-        slack = math.ceil(self.slack_s / _STEP_S)
-        for offset in range(-slack, slack + 1):
-            shift = round(later_s / _STEP_S) + offset
-            first, last = max(0, shift), min(len(a), len(b) + shift)
-            if last <= first:
-                continue
-            p, q = a[first:last], b[first - shift : last - shift]
-            apart = np.hypot(*(p[:, :2] - q[:, :2]).T)
-            flying = (p[:, 2] > _GROUND_M) & (q[:, 2] > _GROUND_M)
-            if shared:
-                flying &= ~(pads[0][first:last] & pads[1][first - shift : last - shift])
-            near = flying & (apart < self.distance_m) & (np.abs(p[:, 2] - q[:, 2]) < self.height_m - _HAIR_M)
-            if near.any():
-                at = int(np.argmin(np.where(near, apart, np.inf)))
-                if worst is None or apart[at] < worst[1]:
-                    worst = ((first + at) * _STEP_S, float(apart[at]))
-        return worst
+        at = within[np.argmin(near.distance_m[within])]
+        return float(near.at[at]) * _STEP_S, float(near.distance_m[at])
+
+    def _approaches(self, one: int, other: int) -> "_Approaches":
+        """All moments of two flights that lie too near each other, found once; they meet for some delays of the other.
+
+        Not counted is what lies about a start that they share: there only time keeps vehicles apart.
+        """
+        known = self._found.get((one, other))
+        if known is None:
+            a, b = self.tracks[one].places, self.tracks[other].places
+            i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
+            counted = np.abs(a[i, 2] - b[j, 2]) < self.height_m - _HAIR_M
+            if self._share_a_start(one, other):
+                pads = [self.tracks[system].pad(_PAD * self.distance_m) for system in (one, other)]
+                counted &= ~(pads[0][i] & pads[1][j])
+            i, j = i[counted], j[counted]
+            known = _Approaches(delay=i - j, at=i, distance_m=np.hypot(*(a[i, :2] - b[j, :2]).T))
+            self._found[one, other] = known
+        return known
 
     def conflicts(self, starts: Mapping[int, float]) -> list[tuple[int, int, float, float]]:
         """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres."""
@@ -188,6 +207,20 @@ class Airspace:
     def _share_a_start(self, one: int, other: int) -> bool:
         a, b = self.tracks[one].places, self.tracks[other].places
         return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < _PAD * self.distance_m)
+
+
+def _near(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
+    """Pairs of samples (n, 3), (m, 3) in the air that are less than a horizontal distance apart: their numbers."""
+    from scipy.spatial import cKDTree
+
+    flying_a, flying_b = (np.flatnonzero(places[:, 2] > _GROUND_M) for places in (a, b))
+    if not len(flying_a) or not len(flying_b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    found = cKDTree(a[flying_a, :2]).query_ball_tree(cKDTree(b[flying_b, :2]), distance_m)
+    i = np.repeat(flying_a, [len(row) for row in found])
+    j = flying_b[np.fromiter((k for row in found for k in row), np.int64)]
+    nearer = np.hypot(*(a[i, :2] - b[j, :2]).T) < distance_m
+    return i[nearer], j[nearer]
 
 
 def _home_of(mission: "Mission") -> tuple[float, float] | None:

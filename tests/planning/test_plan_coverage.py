@@ -8,9 +8,11 @@ import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.robustness.late_vehicles import CORNER, LATE_S, flown_late, met
 from gcs_plugin.plans.plan_files import mission_files
 from orthoswarm.model.errors import InputError
-from orthoswarm.planning.area.area import make_area
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area, plan_lines
@@ -368,3 +370,19 @@ def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep
     plan = plan_area(area, 4, 40.0, footprint(40.0, np.radians(60.0)), method="columns", options=options)
     assert plan.covered_share >= 0.999
     assert max(sortie.time_s for vehicle in plan.vehicles for sortie in vehicle.sorties) <= 660.0
+
+
+def test_vehicles_as_late_as_real_autopilots_do_not_meet():
+    grid = LocalGrid(32632)
+    start = tuple(grid.to_geographic(CORNER + np.array([-20.0, 300.0])).tolist())
+    corners = [(0, 0), (600, 0), (600, 600), (0, 600)]
+    area = Area(grid, shapely.Polygon([CORNER + np.array(c) for c in corners]), shapely.MultiPolygon())
+
+    def meetings(options):
+        plan = plan_area(area, 16, 60.0, footprint(60.0, np.radians(75.0)), options=options)
+        late = [np.array(LATE_S["PX4" if k % 2 else "ArduCopter"]) for k in range(16)]
+        homes = [(v.sorties[0].home_lat_deg, v.sorties[0].home_lon_deg) for v in plan.vehicles]
+        return met(flown_late(plan, late), grid.to_grid(*np.array(homes).T) - CORNER)[0]
+
+    assert meetings(Options(starts=[start], separation=Separation(slack_s=3.0))) > 0  # so the flights do cross
+    assert meetings(Options(starts=[start])) == 0

@@ -1,14 +1,14 @@
 """Keeping vehicles apart: heights for the ways out and home, and times of takeoff.
 
 Vehicles are placed one after the other, the longest flight first. Each takes the takeoff time and the layers (heights
-of its way out and of its way home) that cost least and keep it apart from all placed before: at any moment, and a few
+of its way out and of its way home) that cost least and keep it apart from all placed before: at any moment, and some
 seconds earlier or later, far enough away or at another height. For one pair of layers every moment at which two paths
 come close forbids a short interval of takeoff times, so the earliest time left is found in one pass. Around their own
 starts vehicles that share one are kept apart by time alone, because they stand some metres apart there.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class Separation:
     distance_m: float = 10.0
     height_m: float = 5.0
     layers: int = 4
-    slack_s: float = 3.0
+    slack_s: float = field(default_factory=lambda: active().planning.schedule_slack_s)
     launch_s: float = 5.0
     swap_s: float = 120.0
 
