@@ -485,13 +485,8 @@ class Daemon:
 
     def problems(self) -> list[str]:
         """The present problems, in words."""
-        found = [
-            self.drawer.problem,
-            self.drawer.overload,
-            self.jobs.problem,
-            self.tak.problem,
-            *self.refused.problems(),
-        ]
+        components = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
+        found = [*components, *self.refused.problems()]
         for source in self.sources:
             if source.without_pose:
                 text = f"{source.without_pose} pictures of {source.vehicle} have no pose"
