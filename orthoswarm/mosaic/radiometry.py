@@ -256,18 +256,25 @@ def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ig
 
 @kernel
 def _diagonal(frame, place, vehicle, free, vehicles, weight, out):  # type: ignore[no-untyped-def]
-    """The diagonal of the normal matrix, each side of a sample by itself (added to out)."""
-    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
+    """The diagonal of the normal matrix (added to out).
+
+    Of two frames of one vehicle, its unknowns count by the difference of the two places, which for the gain is none.
+    """
+    of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty(_OWN)
     for m in range(len(frame)):
         for side in range(2):
             k = frame[m, side]
-            if free[k] == 0.0:
-                continue
-            _bases(place[m, side], of_vehicle, of_frame)
-            for q in range(_COMMON):
-                out[_COMMON * vehicle[k] + q] += weight[m] * of_vehicle[q] * of_vehicle[q]
+            _bases(place[m, side], of_vehicle[side], of_frame)
+            of_vehicle[side] *= free[k]
             for q in range(_OWN):
-                out[_COMMON * vehicles + _OWN * k + q] += weight[m] * of_frame[q] * of_frame[q]
+                out[_COMMON * vehicles + _OWN * k + q] += weight[m] * free[k] * of_frame[q] * of_frame[q]
+        one, other = vehicle[frame[m, 0]], vehicle[frame[m, 1]]
+        for q in range(_COMMON):
+            if one == other:
+                out[_COMMON * one + q] += weight[m] * (of_vehicle[0, q] - of_vehicle[1, q]) ** 2
+            else:
+                out[_COMMON * one + q] += weight[m] * of_vehicle[0, q] ** 2
+                out[_COMMON * other + q] += weight[m] * of_vehicle[1, q] ** 2
 
 
 def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.config import override
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields, tone_warning, uniform
@@ -78,6 +79,32 @@ def test_a_vehicle_follows_those_that_are_drawn_already():
     found = np.log(middle(gains, flight))
     late = np.array([f.frame.vehicle == "uav2" for f in flight.frames])
     assert np.abs((found + truth)[late]).mean() < 0.35 * np.abs(truth[late]).mean()  # no common factor is free now
+
+
+def test_a_dark_flight_that_meets_another_at_a_corner_takes_its_tone():
+    rng = np.random.default_rng(4)
+    flight, drawn = scene.Flight(), {}
+    for line in range(8):  # the second vehicle's half lies north-east of the first one's
+        late = line >= 4
+        for along in range(16):
+            east, north = -70 + 15 * line + 35 * late, -75 + 8 * along + 140 * late
+            yaw, roll, pitch = rng.normal(0, 4, 3)
+            view = scene.camera(
+                east, north, 35.0, yaw_deg=180.0 * (line % 2) + yaw, roll_deg=roll, pitch_deg=pitch - 90
+            )
+            gain = (0.75 if late else 1.0) * np.exp(rng.normal(0, 0.03, 3))
+            flight.take(view, vehicle="uav1" if late else "uav0", gain=gain)
+            if not late:
+                drawn[flight.frames[-1].frame.image] = uniform(1.0 / gain)
+    small = thumbnails_of(flight)
+    found = middle(estimate_fields(flight.frames, small, FLAT, held=drawn))
+    override({"radiometry": {"reweightings": 20, "solver_tolerance": 1e-6, "solver_steps": 1000}})
+    try:
+        exact = middle(estimate_fields(flight.frames, small, FLAT, held=drawn))
+    finally:
+        override({})
+    assert np.abs(np.log(found / exact)).max() < 0.005  # half a grey level of 100
+    assert np.abs(np.log(0.75 * exact[64:])).mean() < 0.1  # of 0.29
 
 
 def test_even_pictures_are_left_alone():
