@@ -26,7 +26,7 @@ from orthoswarm.model.errors import InputError, StorageError
 
 MOST_PICTURE_BYTES: Final = 96_000_000
 _MOST_POSE_BYTES: Final = 16_000_000
-_BACKLOG: Final = 1500
+_SHORT_POSE: Final = 65_536
 _THREADS: Final = 12
 
 
@@ -73,14 +73,12 @@ class UploadRoute:
         """Upload a picture with its pose. 201 once it is stored on disk, 200 if it was already known.
 
         Multipart: file `image`, JSON `pose` with `vehicle`, `image`, `time`, `lat_deg`, `lon_deg`, `height_m`,
-        `yaw_deg`, `pitch_deg`, `roll_deg`; `gps_fix` (MAVLink's GPS_FIX_TYPE) if known. Under load the answer waits;
-        an upload without a byte for 10 s is aborted with 408.
+        `yaw_deg`, `pitch_deg`, `roll_deg`; `gps_fix` (MAVLink's GPS_FIX_TYPE) if known. An upload without a byte for
+        10 s is aborted with 408.
         """
         refused = self._daemon.refused
         async with self._slot(request):
             pose, data = await self._upload(request)
-            while self._daemon.drawer.backlog > _BACKLOG:
-                await asyncio.sleep(0.02)
             async with self._one_at_a_time(pose.vehicle, pose.image):
                 try:
                     seq, new = await in_thread(self._threads, self._daemon.add_picture, pose, data)
@@ -157,8 +155,9 @@ class UploadRoute:
                 text = (await text.read(_MOST_POSE_BYTES)).decode("utf-8", "replace")
             if not isinstance(text, str):
                 raise InputError("the form has no 'pose'; send JSON there")
-            pose = await in_thread(self._threads, _pose, text, image.filename)
-            return pose, await image.read()
+            if len(text) <= _SHORT_POSE:  # a wait for a thread would take longer than parsing it
+                return _pose(text, image.filename), await image.read()
+            return await in_thread(self._threads, _pose, text, image.filename), await image.read()
         finally:
             await form.close()
 
