@@ -32,6 +32,7 @@ from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
+from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, facts_of
 from gcs_plugin.daemon.layers.anchor import Anchor
@@ -114,33 +115,17 @@ class Daemon:
         )  # fmt: skip
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
         publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
-        self.coarse = LegPlacement(
-            journal=self.journal,
-            store=self.store,
-            publisher=publisher,
-            workers=self.background,
-            basemap=settings.basemap,
-            on_published=self._published,
-        )
+        shared: dict[str, Any] = {"journal": self.journal, "publisher": publisher, "on_published": self._published}
+        self.coarse = LegPlacement(store=self.store, workers=self.background, basemap=settings.basemap, **shared)
         self.refinement = SortieRefinement(
-            journal=self.journal,
-            store=self.store,
-            publisher=publisher,
-            workers=self.workers,
-            drawer=self.drawer,
-            basemap=settings.basemap,
-            on_published=self._published,
-            make_way=self._make_way,
-            stopped=lambda: self.jobs.stopping,
-        )
+            store=self.store, workers=self.workers, drawer=self.drawer, basemap=settings.basemap,
+            make_way=self._make_way, stopped=lambda: self.jobs.stopping, **shared,
+        )  # fmt: skip
         self.together = JointRefinement(
-            journal=self.journal,
-            publisher=publisher,
-            workers=self.background,
-            basemap=settings.basemap,
-            least_px=settings.redraw_px,
-            on_published=self._published,
+            workers=self.background, basemap=settings.basemap, least_px=settings.redraw_px, **shared
         )
+        layer = "coarse" if settings.basemap is None else "fine"
+        self.tones = ToneBalance(workers=self.background, layer=layer, **shared)
         self.exports = Exports(
             settings=settings,
             journal=self.journal,
@@ -155,7 +140,8 @@ class Daemon:
         )
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
-            "redraw": lambda job, tell: publisher.draw_again(self.background, tell), "export": self.exports.write,
+            "tones": self.tones.balance, "export": self.exports.write,
+            "redraw": lambda job, tell: publisher.draw_again(self.background, tell),
         }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
@@ -434,6 +420,7 @@ class Daemon:
     def _make_way(self, vehicle: str, layer: str | None) -> None:
         """A refinement begins or needs a layer: background jobs give way."""
         self.together.give_up()
+        self.tones.give_up()
         if layer is None:
             self.jobs.drop("coarse", vehicle, _REPLACED)
         self.coarse.give_up(None, layer)
@@ -443,9 +430,9 @@ class Daemon:
         if job.kind == "refine":
             self._note_refined(job)
             self.jobs.wake()
-        elif job.kind not in ("together", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
+        elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
             return
-        if not self.jobs.open("refine", "together", "coarse", "redraw"):
+        if not self.jobs.open("refine", "together", "tones", "coarse", "redraw"):
             self.jobs.add("export", formats=["cog", "gpkg"])
 
     def _note_refined(self, job: Job) -> None:

@@ -51,6 +51,9 @@ class RadiometryConfig:
     """A picture's own curvatures, x^2, xy, y^2; chosen with the slopes."""
     hue_share: float = 0.35
     """How much less than brightness hue may vary, but for a vehicle's white balance; chosen by looking at four sets."""
+    redraw_tone: float = 0.015
+    """Log factors of a flight's pictures, 95 %: if balancing all flights together changes them by more, it is drawn
+    again (chosen: 1.5 grey levels of 100, less than is seen as a step)."""
     greatest_factor: float = 1.8
     """Greatest factor, and the least is its inverse: what would need more has another cause (burnt out, cloud shadow;
     chosen)."""

@@ -2,8 +2,8 @@
 
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
 journal change that also marks it as done. Refinements have their own threads; background jobs
-(coarse maps in flight, joint refinements of neighbours, exports) run one at a time in another thread. Coarse maps and
-joint refinements start only while no refinement waits or runs.
+(coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. Coarse
+maps, joint refinements and tones start only while no refinement waits or runs.
 """
 
 import json
@@ -22,10 +22,10 @@ from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStopped
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
 _KEPT: Final = 1000
-_BACKGROUND: Final = frozenset({"coarse", "together", "redraw", "export"})
+_BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
-_PREEMPTED: Final = frozenset({"coarse", "together"})
+_PREEMPTED: Final = frozenset({"coarse", "together", "tones"})
 _WAITING_THREADS: Final = 2
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
@@ -36,7 +36,8 @@ class Job:
     """One job.
 
     Attributes:
-        id: number. kind: refine, together, coarse, redraw or export. vehicle: its id, None for all. sortie: its number.
+        id: number. kind: refine, together, tones, coarse, redraw or export.
+        vehicle: its id, None for all. sortie: its number.
         state: queued, running, done or failed. progress: 0 to 1. message: the present step, or why it failed.
         created, started, ended: UTC epoch seconds. attempts: number of starts. detail: JSON values.
     """

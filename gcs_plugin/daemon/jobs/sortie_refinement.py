@@ -181,6 +181,7 @@ class SortieRefinement:
             then.append(new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"}))
             if before is None:
                 then += together_jobs(self.journal, job, solved.bounds)
+        then.append(new_job("tones", None, None, {}))
 
         def change(db: sqlite3.Connection) -> None:
             stands(db)

@@ -271,6 +271,7 @@ def facts_of(
         ),
         *_summed("coarse: in flight", "coarse", jobs),
         *_summed("fine: neighbours together", "together", jobs),
+        *_summed("tones of all", "tones", jobs),
     ]  # fmt: skip
     document = {
         "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),

@@ -19,7 +19,7 @@ export async function refine(vehicle) {
 }
 
 // Work in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
-const worth = (job) => !["coarse", "together"].includes(job.kind) || job.state === "running" || job.state === "failed";
+const worth = (job) => !["coarse", "together", "tones"].includes(job.kind) || job.state === "running" || job.state === "failed";
 
 export function jobPanel() {
   const list = make("ul", { class: "jobs" });

@@ -1,0 +1,188 @@
+"""Balancing of the tones of all refined sorties together.
+
+When a sortie is refined, its tones follow those drawn before, which stay. Where two that hardly overlap were drawn
+first, each has a tone of its own, and one that comes between them would have to change from the one to the other.
+Once nothing more urgent is to be done, the tones of all are solved together, and sorties whose tones change visibly
+are drawn again.
+"""
+
+import sqlite3
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress
+from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.layers.layers import new_name
+from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
+from orthoswarm.config import active
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.radiometry import estimate_fields
+
+_GROUND_STEP_M = 10.0
+_MOST_NODES = 250_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToneTask:
+    """The sorties of a layer, to be balanced together.
+
+    Attributes:
+        solutions: their solution files. targets: paths of the new ones.
+    """
+
+    solutions: list[Path]
+    targets: list[Path]
+
+
+def balance_tones(task: ToneTask) -> tuple[list[float], int, float]:
+    """Write new solution files of the sorties whose tones change visibly.
+
+    Returns:
+        For each sortie, by how much its pictures' log factors change (95 %); a new file is written if by more than
+        `redraw_tone` of the configuration. The number of pictures; CPU seconds used.
+    """
+    began = time.process_time()
+    sorties = [read_solution(path) for path in task.solutions]
+    frames: list[PlacedFrame] = []
+    small: dict[str, Bytes] = {}
+    names: list[dict[str, str]] = []
+    for sortie in sorties:
+        mine: dict[str, str] = {}
+        for placed in sortie.solution.placed:
+            frame = uniquely_named(placed, len(frames), own=True)
+            frames.append(frame)
+            mine[placed.frame.image] = frame.frame.image
+            if placed.frame.image in sortie.thumbnails:
+                small[frame.frame.image] = sortie.thumbnails[placed.frame.image]
+        names.append(mine)
+    found = estimate_fields(frames, small, _common_ground(sorties))
+    balanced = [
+        {image: found[name] for image, name in mine.items() if name in found and image in sortie.gains}
+        for sortie, mine in zip(sorties, names, strict=True)
+    ]
+    changes = [_changes(sortie.gains, gains) for sortie, gains in zip(sorties, balanced, strict=True)]
+    common = np.median(np.concatenate(changes), axis=0)  # the map as a whole stays as bright as it was drawn
+    greatest = [float(np.percentile(np.abs(each - common), 95)) if len(each) else 0.0 for each in changes]
+    for sortie, gains, change, target in zip(sorties, balanced, greatest, task.targets, strict=True):
+        if change > active().radiometry.redraw_tone:
+            factor = np.exp(-common).astype(np.float32)[:, None]
+            replace(sortie, gains={**sortie.gains, **{k: v * factor for k, v in gains.items()}}).write(target)
+    return greatest, len(frames), round(time.process_time() - began, 3)
+
+
+def _changes(before: dict[str, Gain], now: dict[str, Gain]) -> NDArray[np.float64]:
+    """Changes of the log factors (N, 3) in the middles of N pictures."""
+    factors = [np.array([gains[image][:, 0] for image in now], float).reshape(-1, 3) for gains in (before, now)]
+    return np.asarray(np.log(factors[1] / np.maximum(factors[0], 1e-3)))
+
+
+def _common_ground(sorties: list[SolutionFile]) -> Terrain:
+    """One terrain under all sorties: at each node the height that the sortie of the nearest picture has there."""
+    from scipy.spatial import cKDTree
+
+    at: NDArray[np.float64] = np.array([p.camera.position[:2] for s in sorties for p in s.solution.placed])
+    whose = np.repeat(np.arange(len(sorties)), [len(s.solution.placed) for s in sorties])
+    reach = max(float(p.camera.position[2]) for s in sorties for p in s.solution.placed)
+    box = BoundingBox.around_points(at)
+    west, south = box.west - reach, box.south - reach
+    width, height = box.width + 2 * reach, box.height + 2 * reach
+    step = max(_GROUND_STEP_M, float(np.sqrt(width * height / _MOST_NODES)))
+    columns, rows = int(np.ceil(width / step)) + 1, int(np.ceil(height / step)) + 1
+    nodes = np.stack(np.meshgrid(west + step * np.arange(columns), south + step * np.arange(rows)), -1)
+    nearest = whose[cKDTree(at).query(nodes)[1]]
+    z = np.empty((rows, columns), np.float32)
+    for number, sortie in enumerate(sorties):
+        here = nearest == number
+        z[here] = sortie.terrain.height(nodes[here])
+    return Terrain(west, south, step, z)
+
+
+@dataclass(slots=True, kw_only=True)
+class ToneBalance:
+    """Does the jobs `tones`.
+
+    Attributes:
+        journal, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
+        layer: name of the refined layer. on_published: called with layer and job when pixels have changed.
+    """
+
+    journal: Journal
+    publisher: Publisher
+    workers: WorkerPool
+    layer: str
+    on_published: Callable[[str, Job], None] = lambda layer, job: None
+    _working: bool = False
+    _aside: bool = False
+
+    def balance(self, job: Job, tell: ReportProgress) -> Change:
+        """The handler of `tones`."""
+        began = time.monotonic()
+        self._working, self._aside = True, False
+        targets: list[Path] = []
+        try:
+            self._balance(job, tell, targets)
+        except OrthoSwarmError:
+            if self._aside:
+                raise Preempted from None
+            raise
+        finally:
+            self._working = False
+            for target in targets:  # of those that were not published
+                target.unlink(missing_ok=True)
+        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return lambda db: None
+
+    def give_up(self) -> None:
+        """Stop the running job; it is done later."""
+        if self._working:
+            self._aside = True
+            self.workers.abandon()
+
+    def _balance(self, job: Job, tell: ReportProgress, targets: list[Path]) -> None:
+        refined = {(r["vehicle"], r["sortie"]) for r in self.journal.rows("SELECT vehicle, sortie FROM solutions")}
+        shown = {key: row for key, row in self.publisher.shown(self.layer).items() if key in refined}
+        if len({vehicle for vehicle, _ in shown}) < 2:
+            job.detail["note"] = "there is one vehicle only"
+            return
+        tell(0.05, f"balancing the tones of {len(shown)} flights")
+        targets += [self.publisher.solutions / f"{new_name('solution')}.pickle" for _ in shown]
+        task = ToneTask(solutions=[path for path, _ in shown.values()], targets=list(targets))
+        changes, pictures, cpu_s = self.workers.run(balance_tones, task)
+        job.detail |= {"frames": pictures, "tones_changed": round(max(changes), 4), "solve_cpu_s": cpu_s, "drawn": 0}
+        todo = [(key, target) for key, target in zip(shown, task.targets, strict=True) if target.exists()]
+        for n, (key, target) in enumerate(todo):
+            tell(0.2 + 0.8 * n / len(todo), f"drawing {unpacked(key[0])}")
+            if self._draw(key, shown[key], target):
+                targets.remove(target)
+                job.detail["drawn"] += 1
+                self.on_published(self.layer, job)
+
+    def _draw(self, key: tuple[str, int], before: tuple[Path, BoundingBox], target: Path) -> bool:
+        """Draw and publish a sortie; False if it was refined anew meanwhile."""
+        old, ground = before
+        with self.publisher.turn(self.layer):
+            if self.publisher.shown(self.layer).get(key, (None,))[0] != old:
+                return False
+            sortie = (unpacked(key[0]), key[1])
+            self.publisher.publish(
+                self.layer, self.workers, sortie, target=target, changed=ground,
+                change=lambda rejected: _another_file(key, target.name),
+            )  # fmt: skip
+        self.publisher.retire(old)
+        return True
+
+
+def _another_file(key: tuple[str, int], name: str) -> Change:
+    def change(db: sqlite3.Connection) -> None:
+        db.execute("UPDATE solutions SET path = ? WHERE vehicle = ? AND sortie = ?", (name, *key))
+
+    return change
