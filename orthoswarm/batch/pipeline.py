@@ -39,6 +39,7 @@ from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map,
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel, check_dem
+from orthoswarm.raster.picture_store import PictureStore
 
 __all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "Load", "Options", "Progress", "run"]
 
@@ -163,6 +164,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     if run.options.until != "realtime":
         images = [p.frame.image for p in state.recorded.placed]
         state.previews = PreviewFile.create(run.space.file("previews"), images)
+        state.pictures = PictureStore.create(run.space.file("pictures"), state.ingest.frames)
     known = run.space.recall("realtime")
     if known is not None and (run.out / REALTIME).exists():
         stats, stage = known

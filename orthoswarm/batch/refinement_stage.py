@@ -86,7 +86,9 @@ def _refined(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refin
 
 
 def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:
-    refiner = make_refiner(run.options.refine, state.grid.epsg, local_origin(state.grid, frames), state.dem)
+    refiner = make_refiner(
+        run.options.refine, state.grid.epsg, local_origin(state.grid, frames), state.dem, state.pictures
+    )
     vehicles: dict[str, list[Frame]] = {}
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)

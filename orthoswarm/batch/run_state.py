@@ -19,10 +19,13 @@ from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.recorded_pose import Recorded
+from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Blend
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.height_model import HeightModel
+from orthoswarm.raster.picture_file import read_rgb
+from orthoswarm.raster.picture_store import PictureStore
 from orthoswarm.refine.registration.map_offset import MapOffset
 
 Bytes = NDArray[np.uint8]
@@ -108,7 +111,7 @@ class RunState:
         thumbnails, gains: image -> small picture, brightness gains.
         still: frames of vehicles that hovered. odd: frames of another camera or direction than their vehicle's others.
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
-        previews: small copies of the pictures, for the seams.
+        previews: small copies of the pictures, for the seams. pictures: those that are decoded, None to read the files.
         undrawn: image -> why the real-time picture does not show it.
         control_points: surveyed points to move the map onto. control: their result, None before or without them.
         map_offset: offset between map and receivers, None without a map.
@@ -130,11 +133,16 @@ class RunState:
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     previews: PreviewFile | None = None
+    pictures: PictureStore | None = None
     undrawn: Mapping[str, str] = field(default_factory=dict)
     control_points: list[Checkpoint] = field(default_factory=list)
     control: GroundControl | None = None
     map_offset: MapOffset | None = None
     fault: str | None = None
+
+    def read_rgb(self) -> Read:
+        """Reads a picture's colours for drawing."""
+        return read_rgb if self.pictures is None else self.pictures.rgb
 
     def leave_out(self, reasons: Mapping[str, str], placed: Iterable[PlacedFrame]) -> None:
         """Move frames to the rejected ones."""

@@ -1,11 +1,11 @@
-"""Maps and height models that are read, and measures of a picture's quality."""
+"""Maps, pictures and height models that are read."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RasterConfig:
-    """Maps and height models that are read."""
+    """Maps, pictures and height models that are read."""
 
     # Maps
     collar_px: int = 15
@@ -18,6 +18,12 @@ class RasterConfig:
     """Windows a side of the lattice at which a map's pixels are read before the work begins (chosen for its time)."""
     check_window_px: float = 4.0
     """Side of these windows, pixels (chosen for its time)."""
+
+    # Pictures
+    grey_pictures_mb: float = 1500.0
+    """Grey pictures at the refiner's working size that take no more than this together, megabytes, are kept on disk
+    during a batch run (chosen for the disk). They come from the colours then: a grey level off by rounding, a few
+    where a colour is clipped."""
 
     # Height models
     dem_finest_m: float = 2.0

@@ -18,7 +18,6 @@ from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
 from orthoswarm.refine.strategy.vehicle_passes import (
     Options,
     learned_registration,
-    read_frame,
     refine_matched,
     refine_tracked,
     registered_by,
@@ -58,7 +57,9 @@ def first_passes(
     lost: dict[int, str] = {}
     if unfollowed:
         watch = Stopwatch()
-        opened = _sparse_flights([units[k] for k in unfollowed], grid, origin, run, progress)
+        opened = _sparse_flights(
+            [units[k] for k in unfollowed], grid, origin, options=options, run=run, progress=progress
+        )
         watch.lap("tracks")
         lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
         flights = [flight for flight in opened if not isinstance(flight, str)]
@@ -72,18 +73,25 @@ def first_passes(
 
 
 def _sparse_flights(
-    units: Sequence[list[Frame]], grid: LocalGrid, origin: Array, run: Run, progress: Progress | None
+    units: Sequence[list[Frame]],
+    grid: LocalGrid,
+    origin: Array,
+    *,
+    options: Options,
+    run: Run,
+    progress: Progress | None,
 ) -> list[Flight | str]:
     """Flights whose photos are matched and adjusted together, each by itself where that fails; else the reason.
 
     A vehicle whose photos match nothing must not keep the others from being adjusted.
     """
     try:
-        return list(open_sparse_flights(units, grid, origin, read_frame, run=run, progress=progress))
+        return list(open_sparse_flights(units, grid, origin, options.read, run=run, progress=progress))
     except AdjustmentError as error:
         if len(units) == 1:
             return [str(error)]
-    return [flight for unit in units for flight in _sparse_flights([unit], grid, origin, run, progress)]
+    alone = partial(_sparse_flights, grid=grid, origin=origin, options=options, run=run, progress=progress)
+    return [flight for unit in units for flight in alone([unit])]
 
 
 def _learned_registrations(

@@ -1,6 +1,6 @@
 """The first pass of one vehicle: its block adjusted without a map, then registered on the map."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -42,6 +42,7 @@ from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.trajectory.legs import leads_one_way
 
 Array = NDArray[np.float64]
+ReadGray = Callable[[Frame], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +52,12 @@ class Options:
     Attributes:
         fov_start_rad: field of view to start from where the tags hint at none.
         dem: given height model of the ground, None to find the ground from the pictures.
+        read: reads a frame's grey picture, see `read_frame`; picklable.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
     dem: HeightModel | None = None
+    read: ReadGray = field(default_factory=lambda: read_frame)
 
     def ground(self, origin: Array) -> GroundModel:
         """The ground before any picture is used, in the local frame: level, or the given height model."""
@@ -75,7 +78,7 @@ def refine_alone(
     state = refine_tracked(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
     if state is None:
         watch = Stopwatch()
-        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, read_frame)
+        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, options.read)
         watch.lap("tracks")
         state = registered_state(
             flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap=basemap, watch=watch
@@ -104,7 +107,7 @@ def refine_tracked(
     watch = Stopwatch()
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
-    flight = open_flight(frames, LocalGrid(epsg), origin, read_frame, start)
+    flight = open_flight(frames, LocalGrid(epsg), origin, options.read, start)
     watch.lap("tracks")
     if flight is None:
         return None

@@ -1,0 +1,102 @@
+"""Grey pictures of a run on disk, so that each file is decoded once for all stages that read its grey values."""
+
+import contextlib
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.frame import Frame
+from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
+
+Bytes = NDArray[np.uint8]
+_SHAPE = np.dtype("<i4")
+
+
+@dataclass(frozen=True, slots=True)
+class PictureStore:
+    """Grey pictures as they were decoded first, one file each; what cannot be written is decoded again.
+
+    Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
+    anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time: a
+    file appears as a whole.
+
+    Attributes:
+        folder: where the files are; an existing folder.
+    """
+
+    folder: Path
+
+    @classmethod
+    def create(cls, folder: Path, frames: Iterable[Frame]) -> "PictureStore | None":
+        """A store for these frames, with what an earlier run left in the folder.
+
+        Returns:
+            None where it would take more than `grey_pictures_mb` megabytes, or the folder cannot be made.
+        """
+        sizes = (frame.width * frame.height // _factor(frame.width, frame.height) ** 2 for frame in frames)
+        if sum(sizes) > active().raster.grey_pictures_mb * 1e6:
+            return None
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError:
+            return None
+        return cls(folder)
+
+    def rgb(self, path: Path) -> Bytes:
+        """See `read_rgb`; the grey values are stored."""
+        picture = read_rgb(path)
+        if _factor(picture.shape[1], picture.shape[0]) == 1 and not self._file(path).exists():
+            self._keep(path, _luma(picture))
+        return picture
+
+    def gray(self, frame: Frame) -> Bytes:
+        """A frame's grey picture, uint8 (rows, columns), reduced where it is larger than what the refiner works on.
+
+        Raises:
+            PictureError: see `read_gray`.
+        """
+        picture = self._kept(frame.path)
+        if picture is None:
+            factor = _factor(frame.width, frame.height)
+            picture = _luma(read_rgb(frame.path)) if factor == 1 else read_gray(frame.path, factor)
+            self._keep(frame.path, picture)
+        return picture
+
+    def _file(self, path: Path) -> Path:
+        return self.folder / blake2b(os.fsencode(path), digest_size=16).hexdigest()
+
+    def _kept(self, path: Path) -> Bytes | None:
+        """The stored picture; None if it is not stored."""
+        try:
+            with self._file(path).open("rb", buffering=0) as file:
+                rows, columns = np.fromfile(file, _SHAPE, 2).tolist()
+                return np.fromfile(file, np.uint8, rows * columns).reshape(rows, columns)
+        except (OSError, ValueError):
+            return None
+
+    def _keep(self, path: Path, picture: Bytes) -> None:
+        file = self._file(path)
+        part = file.with_suffix(f".{os.getpid()}")
+        try:
+            with part.open("wb", buffering=0) as out:
+                np.array(picture.shape, _SHAPE).tofile(out)
+                np.ascontiguousarray(picture).tofile(out)
+            part.replace(file)
+        except OSError:  # the disk is full: what is needed more is written there next
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _luma(picture: Bytes) -> Bytes:
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
+
+
+def _factor(width: int, height: int) -> int:
+    return reduction(width, height, active().features.work_width_px)
