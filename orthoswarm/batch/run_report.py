@@ -28,7 +28,7 @@ def write_products(
 
         surface = make_surface(run, state, stated, z - level, refinement)
     with run.clock.stage("final: report", len(placed)) as stage:
-        write_frames(run.out, stated, list(state.rejected.values()), state.grid, z)
+        write_frames(run.out, stated, list(state.rejected.values()), state.grid, z, covariance=run.options.covariance)
         report = _report(run, state, placed, refinement, z) | {"surface": surface}
         _add_checkpoints(run, report, z)
         left_out = list(state.rejected.values())

@@ -63,6 +63,7 @@ class Options:
         blend: mix the two pictures at each seam, see Seams.
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
+        covariance: write the covariance of each camera's position and rotation to frames.jsonl.
         config: thresholds that replace the defaults.
     """
 
@@ -80,6 +81,7 @@ class Options:
     control: Path | None = None
     checkpoints: Path | None = None
     pixel_scale: float = 1.0
+    covariance: bool = False
     config: Overrides = field(default_factory=dict)
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.stage_times import Stage
+from orthoswarm.config import active
 from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.model.angles import wrap_deg
-from orthoswarm.model.camera import Camera, Lens, angles_from_rotation
+from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
@@ -158,10 +159,46 @@ def iso_time(time_s: float | None) -> str | None:
     return f"{head}.{tail[:3] if tail.endswith('000') else tail}Z"
 
 
+def pose_covariance(placed: PlacedFrame, ground_z_m: float) -> Array | None:
+    """Covariance of a frame's exterior orientation that agrees with its stated error on the ground.
+
+    The adjustment's covariance lacks errors that pictures have in common (the map's own offset and distortion, the
+    receiver without a map): a horizontal shift of the camera and its ground. Its variance is what the stated sigma has
+    more at the picture's centre than the adjustment's covariance gives there.
+
+    Returns:
+        float64 (6, 6) of east, north, up (metres) and rotation about the camera's own axes right, down and forward
+        (radians); None where the adjustment gives none.
+    """
+    config, camera = active().bundle, placed.camera
+    if placed.pose_covariance is None:
+        return None
+    covariance = placed.pose_covariance.astype(np.float64)
+    height = max(float(camera.position[2]) - ground_z_m, 1.0)
+    j = ground_jacobian(camera.rotation, height, config.oblique_axis_down)
+    if j is None or not math.isfinite(placed.sigma_m):
+        return covariance
+    variance = (placed.sigma_m / config.stated_sigma_factor) ** 2
+    own = float(np.trace(j @ covariance @ j.T)) / 2
+    if own > variance:
+        return covariance * (variance / own)
+    covariance[[0, 1], [0, 1]] += variance - own
+    return covariance
+
+
 def write_frames(
-    out: Path, placed: Sequence[PlacedFrame], rejected: Sequence[Rejection], grid: LocalGrid, z: float
+    out: Path,
+    placed: Sequence[PlacedFrame],
+    rejected: Sequence[Rejection],
+    grid: LocalGrid,
+    z: float,
+    *,
+    covariance: bool = False,
 ) -> None:
     """Write frames.jsonl and footprints.gpkg into the output folder.
+
+    Args:
+        z: level of the ground plane, metres. covariance: add each camera's, see pose_covariance.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
@@ -174,6 +211,8 @@ def write_frames(
             row = rejection_row(one, grid.epsg) if isinstance(one, Rejection) else frame_row(one, grid, z)
             if "camera" in row and row["vehicle"] in levels:
                 row["camera"]["altitude_m"] = row["camera"]["height_m"] + levels[row["vehicle"]]
+            if covariance and isinstance(one, PlacedFrame) and (of_pose := pose_covariance(one, z)) is not None:
+                row["camera"]["covariance"] = [[float(f"{v:.6g}") for v in line] for line in of_pose]
             yield json.dumps(row, ensure_ascii=False) + "\n"
 
     write_text(out / "frames.jsonl", lines())

@@ -121,6 +121,29 @@ class Lens:
         return np.asarray(d * np.where(rd > 1e-12, r / np.maximum(rd, 1e-12), 1.0))
 
 
+def ground_jacobian(rotation: Array, height_m: float, least_down: float) -> Array | None:
+    """How the point where a picture's optical axis meets level ground moves with the picture's exterior orientation.
+
+    Args:
+        rotation: (3, 3), camera to ground. height_m: of the camera above the ground.
+        least_down: least downward component of the axis (unit vector).
+
+    Returns:
+        float64 (2, 6): east and north by position (3) and by rotation about the camera's own axes (3, radians). None
+        where the axis does not point down by that much.
+    """
+    ray = rotation[:, 2]
+    if ray[2] > -least_down:
+        return None
+    reach = -height_m / ray[2]
+    moved = np.zeros((3, 6))
+    moved[:, :3] = np.eye(3)
+    for axis in range(3):  # a rotation about the camera's axis a turns the ray by R (e_a x e_z)
+        moved[:, 3 + axis] = reach * (rotation @ np.cross(np.eye(3)[axis], [0.0, 0.0, 1.0]))
+    onto = np.array([[1.0, 0.0, -ray[0] / ray[2]], [0.0, 1.0, -ray[1] / ray[2]]])
+    return np.asarray(onto @ moved)
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Exterior and interior orientation of a picture.

@@ -27,6 +27,8 @@ class PlacedFrame:
         stage: how far it was refined.
         sigma_m: own estimate of the ground error at the picture's nadir, one sigma per axis, metres.
         weak: True where too few observations hold it; it is placed but left out of the mosaic while others cover.
+        pose_covariance: float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's axes
+            (radians) in the adjustment, without errors common to all frames; None where it is not known.
     """
 
     frame: Frame
@@ -34,6 +36,7 @@ class PlacedFrame:
     stage: Stage
     sigma_m: float
     weak: bool = False
+    pose_covariance: NDArray[np.float32] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,10 +1,12 @@
 """Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.camera import fov_rad, ground_jacobian
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
@@ -15,17 +17,32 @@ _MEDIAN_SIGMA = 1.25
 """Sigma of the median of n Gaussian values, times sqrt(n): sqrt(pi / 2)."""
 
 
-def frame_sigmas(
+@dataclass(frozen=True, slots=True)
+class StatedErrors:
+    """Errors of N pictures as the adjustment states them.
+
+    Attributes:
+        sigma_m: float64 (N,), of the ground point at each picture's centre, `stated_sigma_factor` times the sigma of an
+            axis, metres.
+        fov_sigma_deg: one sigma of the field of view, degrees.
+        pose: float32 (N, 6, 6), covariance of position (metres) and rotation about the camera's axes (radians), without
+            the error that is common to all pictures.
+    """
+
+    sigma_m: Array
+    fov_sigma_deg: float
+    pose: NDArray[np.float32]
+
+
+def stated_errors(
     adjustment: Adjustment, c: float, heights: HeightPrior, *, ties: MapTies | None, tie_c: float, floor_m: float
-) -> tuple[Array, float]:
-    """Stated error of the ground point at each picture's centre, and sigma of the field of view.
+) -> StatedErrors:
+    """Errors of pictures and lens: the adjustment's covariance, and what it does not contain.
 
     Args:
         adjustment: after its last step. c, heights, ties, tie_c: as for Adjustment.step.
         floor_m: error common to all pictures, which the covariance does not contain; one sigma per axis.
 
-    Returns:
-        float64 (N,) metres (`stated_sigma_factor` times the sigma of an axis), and one sigma in degrees.
     """
     config = active().bundle
     n = len(adjustment.cameras)
@@ -39,7 +56,17 @@ def frame_sigmas(
     spread = float(np.sqrt(max(common[0, 0], 0.0)))
     f, width = float(lens[F]), int(lens[WIDTH])
     fov_sigma = abs(fov_rad(f * (1 + spread), width) - fov_rad(f * (1 - spread), width)) / 2
-    return config.stated_sigma_factor * sigma, float(np.degrees(fov_sigma))
+    pose = share**2 * _between(chosen, covariance, n)
+    return StatedErrors(config.stated_sigma_factor * sigma, float(np.degrees(fov_sigma)), pose.astype(np.float32))
+
+
+def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
+    """Covariances (n, 6, 6) of all pictures, interpolated between those of the chosen ones (ascending)."""
+    after = np.searchsorted(chosen, np.arange(n)).clip(1, max(len(chosen) - 1, 1))
+    if len(chosen) == 1:
+        return np.repeat(covariance, n, axis=0)
+    share = ((np.arange(n) - chosen[after - 1]) / (chosen[after] - chosen[after - 1])).clip(0.0, 1.0)[:, None, None]
+    return np.asarray((1.0 - share) * covariance[after - 1] + share * covariance[after])
 
 
 def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
@@ -134,15 +161,6 @@ def map_distortion_variance(place: Array, residual: Array, height_m: float) -> f
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
     """Variance per axis (mean of both) of the point where the picture's optical axis meets the ground at height 0."""
-    rotation, height = adjustment.cameras.rotation[i], max(float(adjustment.cameras.position[i, 2]), 1.0)
-    ray = rotation[:, 2]
-    if ray[2] > -active().bundle.oblique_axis_down:
-        return height**2
-    reach = -height / ray[2]
-    moved = np.zeros((3, 6))
-    moved[:, :3] = np.eye(3)
-    for a in range(3):  # a rotation about the camera's axis a turns the ray by R (e_a x e_z)
-        moved[:, 3 + a] = reach * (rotation @ np.cross(np.eye(3)[a], [0.0, 0.0, 1.0]))
-    onto = np.array([[1.0, 0.0, -ray[0] / ray[2]], [0.0, 1.0, -ray[1] / ray[2]]])
-    j = onto @ moved
-    return float(np.trace(j @ covariance @ j.T)) / 2
+    height = max(float(adjustment.cameras.position[i, 2]), 1.0)
+    j = ground_jacobian(adjustment.cameras.rotation[i], height, active().bundle.oblique_axis_down)
+    return height**2 if j is None else float(np.trace(j @ covariance @ j.T)) / 2

@@ -43,6 +43,7 @@ class VehicleState:
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
         sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
+        pose_covariance: float32 (N, 6, 6) of the adjusted cameras, see bundle.covariance.StatedErrors.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
 
@@ -59,6 +60,7 @@ class VehicleState:
     sigma_m: Array
     coarse_sigma_m: Array
     fov_sigma_deg: float
+    pose_covariance: NDArray[np.float32] | None = None
     timings: dict[str, float] = field(default_factory=dict)
     had_map: bool = False
     carried: bool = False
@@ -121,10 +123,18 @@ def to_solution(
     stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
     cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
+    covariance = None if coarse else state.pose_covariance
     fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
     weak = observations_per_camera(flight) < (fewest)
     placed = [
-        PlacedFrame(frame, cameras.camera(i, origin), stage, float(sigma[i]), bool(weak[i]))
+        PlacedFrame(
+            frame,
+            cameras.camera(i, origin),
+            stage,
+            float(sigma[i]),
+            bool(weak[i]),
+            None if covariance is None else covariance[i],
+        )
         for i, frame in enumerate(flight.frames)
         if i not in flight.pictures.damaged
     ]

@@ -11,8 +11,8 @@ from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
-    frame_sigmas,
     map_distortion_variance,
+    stated_errors,
     systematic_tie_offset,
 )
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
@@ -82,11 +82,9 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
     track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
-    sigma, fov_sigma = frame_sigmas(
-        adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor
-    )
-    state.fov_sigma_deg = float(np.hypot(fov_sigma, level_sigma_deg(flight, state.surface)))
-    state.sigma_m = sigma[: len(flight.frames)]
+    stated = stated_errors(adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor)
+    state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_sigma_deg(flight, state.surface)))
+    state.sigma_m, state.pose_covariance = stated.sigma_m[: len(flight.frames)], stated.pose[: len(flight.frames)]
     if not lies_on_map(state):
         state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # neighbours off the map add no accuracy
     elif not state.on_map:

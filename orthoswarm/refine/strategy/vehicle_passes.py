@@ -16,7 +16,7 @@ from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
-from orthoswarm.refine.bundle.covariance import frame_sigmas
+from orthoswarm.refine.bundle.covariance import stated_errors
 from orthoswarm.refine.bundle.height_consistency import (
     contradicted_heights,
     height_disagreement,
@@ -143,9 +143,7 @@ def registered_state(
     """The state of a vehicle that is adjusted without a map: its sigmas, and its registration where there is a map."""
     adj, c = flight.adjustment, active().bundle
     belief = surface.height_prior(adj.points)
-    coarse_sigma, fov_sigma = frame_sigmas(
-        adj, c.track_robust_c, belief, ties=None, tie_c=c.tie_robust_c, floor_m=c.sigma_floor_m
-    )
+    stated = stated_errors(adj, c.track_robust_c, belief, ties=None, tie_c=c.tie_robust_c, floor_m=c.sigma_floor_m)
     coarse = replace(
         adj.cameras,
         position=adj.cameras.position.copy(),
@@ -165,9 +163,10 @@ def registered_state(
         dense=(np.zeros((0, 3)), np.zeros(0)),
         on_map=False,
         confidence=0.0,
-        sigma_m=coarse_sigma,
-        coarse_sigma_m=coarse_sigma,
-        fov_sigma_deg=fov_sigma,
+        sigma_m=stated.sigma_m,
+        coarse_sigma_m=stated.sigma_m,
+        fov_sigma_deg=stated.fov_sigma_deg,
+        pose_covariance=stated.pose,
         coarse_surface=surface,
     )
     if basemap is not None:

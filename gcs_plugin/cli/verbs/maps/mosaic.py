@@ -50,6 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
     )  # fmt: skip
     add("--blend", choices=("none", "seam"), default="seam", help="mix the pictures over a few pixels at seams, or not")
+    add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
     add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
@@ -97,6 +98,7 @@ def run(args: argparse.Namespace) -> int:
         control=args.control,
         checkpoints=args.checkpoints,
         pixel_scale=args.pixel_scale,
+        covariance=args.covariance,
         config=read_overrides(args.config) if args.config is not None else {},
     )
 
