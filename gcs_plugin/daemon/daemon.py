@@ -17,9 +17,11 @@ from gcs_plugin.daemon.coverage.event_requests import EventRequests
 from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.coverage.picture_requests import PictureRequests
 from gcs_plugin.daemon.coverage.picture_views import PictureViews
 from gcs_plugin.daemon.coverage.planned_area import area_source
 from gcs_plugin.daemon.exports import Exports
+from gcs_plugin.daemon.fetched_pictures import make_picture_requests
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
@@ -157,11 +159,13 @@ class Daemon:
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
         self.terrain: TerrainData | None = None
+        self.picture_requests: PictureRequests | None = None
         if settings.links:
             self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
             self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
             EventRequests(self.links.fleet)
+            self.picture_requests = make_picture_requests(self, self.links)
             if settings.dem is not None:
                 self.terrain = TerrainData(settings.dem, self.links.fleet)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
@@ -201,16 +205,11 @@ class Daemon:
         self._watch_what_came_before()
         self.leg_watch.start()
         self.coverage.start()
-        if self.links is not None:
-            self.links.start()
-        if self.terrain is not None:
-            self.terrain.start()
-        if self.settings.tak:
-            self.tak.start()
-        for source in self.sources:
-            source.start()
-        for bus in self.buses:
-            bus.start()
+        with_links = (self.links, self.terrain, self.picture_requests)
+        tak = [self.tak] if self.settings.tak else []
+        for part in (*with_links, *tak, *self.sources, *self.buses):
+            if part is not None:
+                part.start()
 
     def close(self) -> None:
         """Stop; unfinished work continues at the next start."""
@@ -220,12 +219,9 @@ class Daemon:
             bus.close()
         self.leg_watch.close()
         self.tak.close()
-        if self.terrain is not None:
-            self.terrain.close()
-        if self.takeoffs is not None:
-            self.takeoffs.close()
-        if self.links is not None:
-            self.links.close()
+        for part in (self.picture_requests, self.terrain, self.takeoffs, self.links):
+            if part is not None:
+                part.close()
         self.workers.close()
         self.background.close()
         self.jobs.close()

@@ -27,6 +27,8 @@ TEMPLATE: Final = """\
 # coarse = true                   # place legs on the coarse layer as they finish, in one more process of low priority
 # lost_after_s = 120              # a vehicle that is silent for so long in its mission is refined as it is
 # tak = ["udp://239.2.3.1:6969"]  # where vehicles and finds are sent to as Cursor-on-Target: udp, tcp or tls
+# picture_folder = "/DCIM"         # where vehicles have their pictures, for those asked for over MAVLink FTP
+# picture_bytes_s = 30000         # most that these take of all links together; 0: none is asked for
 # tak_certificate = "station.pem" # for tls: certificate and key of this station
 # tak_authority = "ca.pem"        # for tls: the server's certificate authority
 
@@ -69,6 +71,8 @@ class Settings:
         silent_s: a vehicle without a new picture for so long is silent; then its legs and late pictures are placed.
         redraw_px: a joint refinement that moves pictures by less, in pixels of the layer, is not drawn.
         vehicles: the configured ones. token_file: path of the token.
+        picture_folder: folder of the pictures on the vehicles. picture_bytes_s: most bytes a second that pictures take
+            that are asked for over MAVLink FTP, 0 for none.
         tak: receivers of Cursor-on-Target events, see `tak_address`. tak_certificate: PEM file with this station's
             certificate and key for TLS. tak_authority: PEM file of the server's certificate authority.
     """
@@ -88,6 +92,8 @@ class Settings:
     redraw_px: float = 0.1
     vehicles: tuple[VehicleSettings, ...] = field(default=())
     token_file: Path | None = None
+    picture_folder: str = "/DCIM"
+    picture_bytes_s: float = 30_000.0
     tak: tuple[str, ...] = ()
     tak_certificate: Path | None = None
     tak_authority: Path | None = None
@@ -123,6 +129,8 @@ class Settings:
         for path in (self.tak_certificate, self.tak_authority):
             if path is not None and not path.is_file():
                 raise InputError(f"{path} does not exist; name the PEM file")
+        if not 0.0 <= self.picture_bytes_s <= 1e9:
+            raise InputError(f"picture_bytes_s of {self.picture_bytes_s:g} is not possible; give bytes a second, or 0")
         names = [v.id for v in self.vehicles]
         systems = [v.system for v in self.vehicles if v.system is not None]
         for what, values in (("id", names), ("system id", systems)):
@@ -137,6 +145,7 @@ class Settings:
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "dem": (str,), "fov_min_deg": (int, float),
     "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
+    "picture_folder": (str,), "picture_bytes_s": (int, float),
     "tak": (list,), "tak_certificate": (str,), "tak_authority": (str,),
 }  # fmt: skip
 

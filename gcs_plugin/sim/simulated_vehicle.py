@@ -10,10 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gcs_plugin.links.file_transfer import payload_of
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
+from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.mission_flight import Exposure, Flight, Landed, State
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
@@ -52,6 +54,7 @@ class SimVehicle:
         wipes: True for ArduPilot's simulation with -w, which loses the mission at each restart.
         tx_bytes_s: capacity of its radio. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
             are sent first.
+        files: what it serves over MAVLink FTP; None for one without.
         on_exposure: called at each picture.
     """
 
@@ -66,6 +69,7 @@ class SimVehicle:
     arms: bool = True
     wipes: bool = False
     tx_bytes_s: float = math.inf
+    files: FileServer | None = None
     on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
     flight: Flight = field(init=False)
     store: MissionStore = field(init=False)
@@ -121,6 +125,8 @@ class SimVehicle:
         self._off_until = now + silence_s
         self.reboots += 1
         self.store.rebooted()
+        if self.files is not None:
+            self.files.rebooted()
         if self.wipes:
             self.store.clear()
         flight = self.flight
@@ -151,6 +157,9 @@ class SimVehicle:
             return []
         if kind.startswith("MISSION_") and kind != "MISSION_SET_CURRENT":
             return self.store.feed(message, sender, now)
+        if kind == "FILE_TRANSFER_PROTOCOL" and self.files is not None:
+            request = payload_of(message)
+            return [] if request is None else [self.files.answer(request).message(sender.system, sender.component)]
         if kind == "MISSION_SET_CURRENT":
             self.flight.set_current(int(message.seq))
         if kind in ("COMMAND_LONG", "COMMAND_INT"):

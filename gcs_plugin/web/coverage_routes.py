@@ -41,8 +41,13 @@ class CoverageRoutes:
         return JsonAnswer(await in_thread(self._threads, self._daemon.gap_flights.plan, body), status_code=201)
 
     async def coverage(self) -> Response:
-        """Coverage of the planned area: `state`, shares, `gaps` (each with area, cause, confidence and polygon)."""
-        return JsonAnswer(self._daemon.coverage.document)
+        """Coverage of the planned area: `state`, shares, `gaps` (each with area, cause, confidence and polygon).
+
+        `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
+        """
+        requests = self._daemon.picture_requests
+        asked = [] if requests is None else requests.rows()
+        return JsonAnswer(self._daemon.coverage.document | {"requests": asked})
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""

@@ -1,6 +1,6 @@
 """The list of gaps: a press goes there; flying them plans first, and uploads only what was confirmed."""
 
-from tests.kit.page_kit import opened, standing, vehicle
+from tests.kit.page_kit import opened, send, standing, vehicle
 
 RING = [[8.560, 47.400], [8.561, 47.400], [8.561, 47.401], [8.560, 47.401], [8.560, 47.400]]
 SHARES = {"seen_share": 0.9, "poor_share": 0.04, "missed_share": 0.05, "planned_share": 0.01}
@@ -95,3 +95,30 @@ def test_a_vehicle_in_the_air_is_ticked_by_hand_and_paused_before_it_gets_anothe
             page.click("text=Upload, then check and start…")
             page.wait_for_selector("#preflight-title >> visible=true")
             assert [path.rsplit("/", 1)[-1] for path in _posts(station)][1:3] == ["pause", "upload"]
+
+
+def test_pictures_asked_from_a_vehicle_are_listed_by_number_with_what_became_of_them(browser):
+    rows = [
+        {"vehicle": "v1", "number": 7, "state": "arrived", "reason": "", "percent": 100, "image": "IMG_0007.JPG"},
+        {"vehicle": "v1", "number": 8, "state": "asked", "reason": "", "percent": 40, "image": "IMG_0008.JPG"},
+        {"vehicle": "v1", "number": 9, "state": "waiting", "reason": "", "percent": 0, "image": ""},
+        {"vehicle": "v1", "number": 10, "state": "refused", "reason": "it has no picture file with number 10",
+         "percent": 0, "image": ""},
+    ]  # fmt: skip
+    with standing(vehicle(1, armed=False)) as station:
+        station.gets["/api/coverage"] = COVERAGE | {"requests": rows}
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            summary = page.locator(".requests summary")
+            summary.wait_for()
+            assert "4 pictures asked from the vehicle, 1 arrived, 2 still to come, 1 refused" in summary.inner_text()
+            summary.click()
+            lines = page.locator(".requests details li").all_inner_texts()
+            assert lines == [
+                "Picture 7: arrived", "Picture 8: being read, 40 %", "Picture 9: waits for its turn",
+                "Picture 10: refused, it has no picture file with number 10",
+            ]  # fmt: skip
+            station.gets["/api/coverage"] = COVERAGE | {"requests": [rows[0], rows[1] | {"state": "arrived"}]}
+            send(page, {"type": "requests"})
+            page.wait_for_function("document.querySelector('.requests summary').textContent.includes('2 arrived')")
+            assert page.locator(".requests details").get_attribute("open") is not None  # it stays unfolded

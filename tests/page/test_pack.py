@@ -1,5 +1,6 @@
 """The offline pack's page, opened from a folder: no server, no internet."""
 
+import json
 import zipfile
 
 from orthoswarm.export.sheets.pack import write_pack
@@ -33,3 +34,18 @@ def test_the_packs_page_shows_map_finds_and_files_from_a_folder(browser, folder,
         page.click("#finds button")
         assert errors == [] and all(url.startswith("file:") for url in asked)
         context.close()
+
+
+def test_the_pack_says_which_pictures_are_not_refined(browser, folder, tmp_path):  # noqa: F811
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | {"unrefined": {"v2": 120}}))
+    write_pack(folder / "orthoimage.tif", tmp_path / "pack.zip")
+    with zipfile.ZipFile(tmp_path / "pack.zip") as archive:
+        archive.extractall(tmp_path / "out")
+    stac = json.loads((tmp_path / "out" / "flood-map" / "orthoimage.stac.json").read_text())
+    assert "Not refined when this was written" in stac["properties"]["description"]
+    page = browser.new_page()
+    page.goto((tmp_path / "out" / "flood-map" / "index.html").as_uri())
+    page.wait_for_function("document.getElementById('accuracy').textContent")
+    assert "pictures 120 of v2" in page.inner_text("#accuracy") and "2 of 3 legs" in page.inner_text("#accuracy")
+    page.close()

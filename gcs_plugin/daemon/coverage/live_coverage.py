@@ -388,7 +388,7 @@ def _is_unseen(ends: NDArray[np.float64], states: NDArray[np.uint8], grid: Groun
 def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
     return [
         {"vehicle": m.view.vehicle, "image": m.view.image, "after": m.after, "cause": str(m.cause),
-         "confidence": round(m.confidence, 2)}
+         "confidence": round(m.confidence, 2), "time_s": m.view.time_s}
         for m in missing
     ]  # fmt: skip
 

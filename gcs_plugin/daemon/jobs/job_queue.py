@@ -26,6 +26,8 @@ _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
 _PREEMPTED: Final = frozenset({"coarse", "together", "tones"})
+_AFTER_REFINEMENT: Final = _PREEMPTED | {"export"}
+"""An export that was asked for during a refinement holds its result."""
 _WAITING_THREADS: Final = 2
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
@@ -239,7 +241,7 @@ class Jobs:
             job = Job.of(row)
             if (job.kind in _BACKGROUND) != background or row["id"] in self._running or _lane(job) in busy:
                 continue
-            if refining and job.kind in _PREEMPTED:
+            if refining and job.kind in _AFTER_REFINEMENT:
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
             self._running[job.id] = job

@@ -1,6 +1,7 @@
 """The workspace's products: the same files as those of a batch run, made in a worker from the journal."""
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -207,7 +208,9 @@ def _report(
     for stage in task.facts.get("stages", []):
         if stage["name"] == "realtime":
             stage["items"] = len(placed)
+    unrefined = Counter(p.frame.vehicle for p in placed if p.stage != "fine")
     return {
+        "unrefined": dict(unrefined),
         "frames": {"input": len(placed) + len(rejected), "used": len(placed), "rejected": len(rejected)},
         "vehicles": vehicle_rows(solutions, placed), "legs": leg_rows(solutions), "ground_z_m": level,
         "refine": "swarm" if solutions else "none", "warnings": list(dict.fromkeys(warnings)), "epsg": task.epsg,

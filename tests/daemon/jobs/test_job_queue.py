@@ -123,6 +123,31 @@ def test_a_refinement_begins_while_others_wait_and_the_background_is_busy(journa
     jobs.close()
 
 
+def test_an_export_waits_for_a_refinement_and_so_holds_its_result(journal):
+    go, order = threading.Event(), []
+
+    def refine(job, tell):
+        assert go.wait(LIMIT_S)
+        order.append("refine")
+        return lambda db: None
+
+    def export(job, tell):
+        order.append("export")
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), {"refine": refine, "export": export}, slots=1)
+    jobs.start()
+    running = jobs.add("refine", "v1", 1)
+    until(lambda: jobs.find(running.id).state == "running")
+    asked = jobs.add("export", formats=["pack"])
+    time.sleep(0.3)
+    assert jobs.find(asked.id).state == "queued"
+    go.set()
+    until(lambda: jobs.find(asked.id).state == "done")
+    assert order == ["refine", "export"]
+    jobs.close()
+
+
 def test_a_number_that_no_job_can_have_finds_none(journal):
     jobs = Jobs(journal, Events(), {}, slots=1)
     assert [jobs.find(number) for number in (0, -1, 2**63, 2**63 - 1)] == [None] * 4

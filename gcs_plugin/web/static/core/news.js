@@ -68,6 +68,7 @@ const KINDS = {
   layer: () => soon("/api/layers"),
   job: (event) => { takeJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
   coverage: () => soon("/api/coverage"),
+  requests: () => soon("/api/coverage"),
   completion: () => soon("/api/completions", "/api/vehicles"),
   plan: () => changed("plan"),
   finds: () => changed("finds-changed"),

@@ -29,6 +29,33 @@ function missingRows(rows) {
   return [...groups];
 }
 
+// Pictures asked from the vehicles, by vehicle: how many of each state, and each by its number when unfolded.
+function requestsByVehicle(rows) {
+  const groups = new Map();
+  for (const row of rows) {
+    if (!groups.has(row.vehicle)) groups.set(row.vehicle, []);
+    groups.get(row.vehicle).push(row);
+  }
+  return [...groups];
+}
+
+function makeRequests() {
+  const row = make("li", {}, make("details", {}, make("summary", {}), make("ul", {})));
+  row.line = row.querySelector("summary");
+  row.draw = keyedList(row.querySelector("ul"), () => make("li", {}), (line, one) => {
+    const words = one.state === "waiting" && one.reason ? "held" : one.state;
+    setText(line, t(`coverage.asked.${words}`, one));
+  });
+  return row;
+}
+
+function drawRequests(row, rows) {
+  const count = (state) => rows.filter((one) => one.state === state).length;
+  const [arrived, refused] = [count("arrived"), count("refused")];
+  setText(row.line, t("coverage.asked.title", { name: nameOf(rows[0].vehicle), n: rows.length, arrived, refused, open: rows.length - arrived - refused }));
+  row.draw(rows.map((one) => [String(one.number), one]));
+}
+
 export function coveragePanel() {
   const shares = make("p", {});
   const figures = Object.fromEntries(STATES.map((key) => [key, make("b", {})]));
@@ -38,6 +65,8 @@ export function coveragePanel() {
   const list = make("ul", { class: "gaps" });
   const more = make("p", { class: "quiet" });
   const missing = make("ul", { class: "quiet" });
+  const asked = make("ul", { class: "quiet requests" });
+  const drawAsked = keyedList(asked, makeRequests, drawRequests);
   const offers = make("ul", { class: "warnings" });
   const fly = button(t("coverage.fly"), openGapFlight);
   const shown = make("input", { type: "checkbox", checked: true, onchange: () => showCoverage(shown.checked) });
@@ -50,11 +79,11 @@ export function coveragePanel() {
     setAttribute(row, "data-poor", gap.detail ? "true" : "false");
   });
   const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.n > 1 ? t("coverage.missing.first", { image: group.image }) : group.image })));
-  const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing);
+  const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing, asked);
   subscribe("coverage vehicles", "coverage", () => {
     const now = state.coverage;
     const known = now?.seen_share != null;
-    for (const part of [legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing]) setHidden(part, !known);
+    for (const part of [legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing, asked]) setHidden(part, !known);
     if (!known) { setText(shares, t("coverage.none")); return; }
     setText(shares, t(`coverage.state.${now.state}`));
     for (const key of STATES) setText(figures[key], percent(now[`${key}_share`]));
@@ -66,6 +95,7 @@ export function coveragePanel() {
     fly.disabled = !now.gaps.length;
     offers.replaceChildren(...(now.offers ?? []).map((row) => make("li", {}, t("coverage.offer", { name: nameOf(row.vehicle), legs: row.legs, length: units.distance(row.length_m) }))));
     drawMissing(missingRows(now.missing_pictures));
+    drawAsked(requestsByVehicle(now.requests ?? []));
   });
   return box;
 }

@@ -21,13 +21,17 @@ export async function refine(vehicle) {
 // Work in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
 const worth = (job) => !["coarse", "together", "tones"].includes(job.kind) || job.state === "running" || job.state === "failed";
 
+// An export waits for refinements, so that it holds their result.
+const refining = () => [...state.jobs.values()].some((job) => job.kind === "refine" && ["queued", "running"].includes(job.state));
+
 export function jobPanel() {
   const list = make("ul", { class: "jobs" });
   const nothing = make("p", { class: "quiet" }, t("jobs.none"));
   const draw = keyedList(list, () => make("li", {}, make("b", {}), make("span", {}), make("span", { class: "bar" }, make("i", {}))), (row, job) => {
     const [title, words, bar] = row.children;
     setText(title, `${t(`jobs.${job.kind}`)} ${nameOf(job.vehicle)}${job.sortie > 1 ? ` ${t("jobs.sortie", { n: job.sortie })}` : ""}`);
-    setText(words, [t(`jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", "));
+    const behind = job.kind === "export" && job.state === "queued" && refining();
+    setText(words, [t(behind ? "jobs.behind" : `jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", "));
     setStyle(bar.firstChild, "transform", `scaleX(${Math.max(0, Math.min(1, job.progress || 0))})`);
     setAttribute(row, "data-state", job.state);
   });

@@ -1,0 +1,300 @@
+"""Pictures that vehicles have taken and that have not arrived are read from them over MAVLink FTP, in the background.
+
+A picture is found by the name that its camera event gives (`file_url` of CAMERA_IMAGE_CAPTURED, mftp://), else by the
+number in its file's name: that of the event, shifted as the pictures that have arrived show. What is not found for
+certain is not read. While a command or a mission is under way with any vehicle nothing is asked for.
+"""
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import unquote, urlsplit
+
+from gcs_plugin.daemon.coverage.file_download import FileRead, FolderList
+from gcs_plugin.daemon.coverage.file_numbers import PictureNames
+from gcs_plugin.daemon.coverage.ftp_talk import FtpTalk
+from gcs_plugin.daemon.coverage.link_share import LinkShare
+from gcs_plugin.links.file_transfer import payload_of
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+
+_STEP_S, _LOOK_S = 0.02, 1.0
+_AGAIN_S: Final = 60.0
+_LIST_AGAIN_S, _LIST_AT_LEAST_S = 10.0, 600.0
+_QUIET_S: Final = 1.0
+_TELL_S: Final = 2.0
+_MOST_URLS: Final = 20_000
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class WantedPicture:
+    """A picture that has not arrived: its vehicle's id, the number of its camera event, UTC epoch seconds."""
+
+    vehicle: str
+    number: int
+    time_s: float
+
+
+@dataclass(slots=True)
+class _Request:
+    """A wanted picture. `state`: waiting, asked, arrived, refused; `path`: on the vehicle, once it is known."""
+
+    wanted: WantedPicture
+    state: str = "waiting"
+    reason: str = ""
+    path: str = ""
+    read: FileRead | None = None
+
+    def row(self) -> dict[str, Any]:
+        return {
+            "vehicle": self.wanted.vehicle, "number": self.wanted.number, "state": self.state, "reason": self.reason,
+            "image": self.path.rpartition("/")[2],
+            "percent": 100 if self.state == "arrived" else 0 if self.read is None else int(100 * self.read.share),
+        }  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Server:
+    """A vehicle's files. `not_before`: when it may be asked again, after it did not answer."""
+
+    component: int = 1
+    files: dict[str, int] | None = None
+    listed_at: float = 0.0
+    listings: int = 0
+    not_before: float = 0.0
+    urls: dict[int, str] = field(default_factory=dict)
+
+
+class PictureRequests:
+    """Asks vehicles for their pictures.
+
+    Args:
+        fleet: the vehicles. system_of: system id of a vehicle's id; raises OrthoSwarmError for one not on the links.
+        wanted: returns the pictures that have not arrived. names: returns the names of those that have, by vehicle.
+        store: stores a picture, given what was wanted, the file's name and content; raises as `Daemon.add_picture`.
+        changed: called when a request's state has changed, and every two seconds while a picture is read.
+        folder: of the pictures on the vehicles. most_bytes_s: most of all links together, bytes a second; 0: none.
+        clock: monotonic seconds, the fleet's.
+    """
+
+    def __init__(
+        self,
+        fleet: "Fleet",
+        *,
+        system_of: Callable[[str], int],
+        wanted: Callable[[], Iterable[WantedPicture]],
+        names: Callable[[str], PictureNames],
+        store: Callable[[WantedPicture, str, bytes], None],
+        changed: Callable[[], None] = lambda: None,
+        folder: str = "/DCIM",
+        most_bytes_s: float = 30_000.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._fleet, self._system_of, self._wanted, self._names = fleet, system_of, wanted, names
+        self._store, self._changed, self._folder, self._clock = store, changed, folder, clock
+        self._on = most_bytes_s > 0.0
+        self._share = LinkShare(max(1.0, most_bytes_s))
+        self._requests: dict[tuple[str, int], _Request] = {}
+        self._servers: dict[int, _Server] = {}
+        self._talk: FtpTalk | None = None
+        self._reading: _Request | None = None
+        self._stepped = self._busy_at = -_QUIET_S
+        self._told_at = 0.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="picture requests", daemon=True)
+        fleet.subscribe(self._answered, "FILE_TRANSFER_PROTOCOL")
+        fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
+
+    def start(self) -> None:
+        """Start the thread."""
+        if self._on:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop; a picture that is being read is read anew after the next start."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(5.0)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """All requests as JSON values, by vehicle and number: `state`, `reason`, `percent`, `image`."""
+        return [self._requests[key].row() for key in sorted(self._requests)]
+
+    # -- its own thread -------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._stop.wait(_STEP_S if self._talk is not None else _LOOK_S):
+            try:
+                self.work()
+                self._fleet.call(self.step).result(5.0)
+                if self._reading is not None and time.monotonic() - self._told_at > _TELL_S:
+                    self._told_at = time.monotonic()
+                    self._changed()
+            except TimeoutError:
+                continue
+            except Exception as error:  # an odd answer must not end it
+                _log.warning("asking for pictures: %s", error)
+                self._stop.wait(_LOOK_S)
+
+    def work(self) -> None:
+        """Store what was read, and choose what to read next; not in the links' thread."""
+        talk = self._talk
+        if talk is not None and not talk.over:
+            return
+        if talk is not None:
+            self._finish(talk)
+        self._look()
+        self._begin()
+
+    def _finish(self, talk: FtpTalk) -> None:
+        self._talk, request, self._reading = None, self._reading, None
+        server, job, now = self._servers[talk.system], talk.job, self._clock()
+        if talk.silent:
+            server.not_before = now + _AGAIN_S
+            if request is None:
+                self._refuse_all(talk.system, "the vehicle does not answer over MAVLink FTP; it is asked again")
+            else:
+                request.state, request.reason = (
+                    "waiting",
+                    "the vehicle has stopped answering; the rest is asked for later",
+                )
+        elif request is None and isinstance(job, FolderList):
+            server.files, server.listed_at, server.listings = job.files, now, server.listings + 1
+            if job.refused:
+                server.not_before = now + _AGAIN_S
+                self._refuse_all(talk.system, f"not to be had from the vehicle: {job.refused}")
+        elif request is not None and job.refused:
+            request.state, request.reason, request.read = "refused", job.refused, None
+        elif request is not None and isinstance(job, FileRead):
+            self._keep(request, job.content)
+        self._changed()
+
+    def _keep(self, request: _Request, content: bytes) -> None:
+        try:
+            self._store(request.wanted, request.path.rpartition("/")[2], content)
+        except InputError as error:
+            request.state, request.reason = "refused", str(error)
+        except OrthoSwarmError as error:  # the disk is full: it is read again when there is room
+            request.state, request.reason = "waiting", str(error)
+            self._servers[self._system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
+        else:
+            request.state, request.reason = "arrived", ""
+        request.read = None
+
+    def _look(self) -> None:
+        """Take over what is wanted by now; what is not wanted any more has come some other way."""
+        wanted = {(w.vehicle, w.number): w for w in self._wanted()}
+        changed = False
+        for key in wanted.keys() - self._requests.keys():
+            self._requests[key] = _Request(wanted[key])
+            changed = True
+        for key in [k for k, r in self._requests.items() if k not in wanted and r.state in ("waiting", "refused")]:
+            del self._requests[key]
+            changed = True
+        if changed:
+            self._changed()
+
+    def _begin(self) -> None:
+        """Begin to read the oldest waiting picture of a vehicle that can be asked, or first the folder with it."""
+        now = self._clock()
+        waiting = [r for r in self._requests.values() if r.state in ("waiting", "refused")]
+        for request in sorted(waiting, key=lambda r: (r.state, r.wanted.time_s)):
+            try:
+                system = self._system_of(request.wanted.vehicle)
+            except OrthoSwarmError:
+                continue
+            server = self._servers.setdefault(system, _Server())
+            if now < server.not_before or self._fleet.vehicles[system].lost:
+                continue
+            if not self._find(request, server):
+                pause_s = min(_LIST_AGAIN_S * 2.0**server.listings, _LIST_AT_LEAST_S)
+                if server.files is None or now - server.listed_at > pause_s:
+                    self._converse(FolderList(self._folder), system, server, None)
+                    return
+                continue
+            if request.state == "waiting":
+                request.read = request.read or FileRead(request.path)
+                request.state, request.reason = "asked", ""
+                self._converse(request.read, system, server, request)
+                self._changed()
+                return
+
+    def _find(self, request: _Request, server: _Server) -> bool:
+        """Set the path of a request's file, or why there is none; returns whether the path is known."""
+        number = request.wanted.number
+        if server.files is None and number not in server.urls:
+            return False
+        path, reason = server.urls.get(number, ""), ""
+        if not path and server.files is not None:
+            path, reason = self._names(request.wanted.vehicle).find(number, server.files)
+        if path:
+            if request.path != path:  # the vehicle has it by now
+                request.path, request.state, request.read = path, "waiting", None
+            return True
+        if (request.state, request.reason) != ("refused", reason):
+            request.state, request.reason = "refused", reason
+            self._changed()
+        return False
+
+    def _converse(self, job: FileRead | FolderList, system: int, server: _Server, request: _Request | None) -> None:
+        self._reading = request
+        self._talk = FtpTalk(
+            job=job, system=system, component=server.component, share=self._share, send=self._fleet.send,
+            began=self._clock(),
+        )  # fmt: skip
+
+    def _refuse_all(self, system: int, reason: str) -> None:
+        """All waiting requests to a vehicle are refused for one reason; they are tried again later."""
+        for request in self._requests.values():
+            with contextlib.suppress(OrthoSwarmError):
+                if request.state == "waiting" and self._system_of(request.wanted.vehicle) == system:
+                    request.state, request.reason, request.path = "refused", reason, ""
+        self._servers[system].files = None
+
+    # -- in the links' thread ---------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Ask for more of what is being read, unless a command or a mission is under way."""
+        now = self._clock()
+        since, self._stepped = now - self._stepped, now
+        talk = self._talk
+        if talk is None:
+            return
+        if any(self._fleet.busy(system) for system in self._fleet.vehicles):
+            self._busy_at = now
+        if now - self._busy_at < _QUIET_S:
+            talk.pause(min(since, _LOOK_S))
+            return
+        talk.step(now)
+
+    def _answered(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+        talk, answer = self._talk, payload_of(message)
+        if talk is None or answer is None or vehicle.system != talk.system:
+            return
+        if message.target_system == self._fleet.own.system:
+            talk.answer(answer, self._clock())
+
+    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+        server = self._servers.setdefault(vehicle.system, _Server())
+        server.component = int(message.get_srcComponent())
+        url = message.file_url
+        parts = urlsplit((url.decode("utf-8", "replace") if isinstance(url, bytes) else str(url)).rstrip("\0"))
+        if parts.scheme == "mftp" and parts.path and len(server.urls) < _MOST_URLS:
+            server.urls[int(message.image_index)] = unquote(parts.path)
+
+
+def wanted_pictures(missing: Iterable[Mapping[str, Any]]) -> list[WantedPicture]:
+    """Those of the coverage's missing pictures that were taken and have not arrived."""
+    return [
+        WantedPicture(row["vehicle"], int(row["image"].removeprefix("event ")), row["time_s"])
+        for row in missing
+        if row["image"].startswith("event ") and row.get("time_s") is not None
+    ]
