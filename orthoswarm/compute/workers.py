@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import chain, islice
 from multiprocessing.context import SpawnContext
 from types import TracebackType
 from typing import Generic, Protocol, TypeVar
@@ -110,7 +111,7 @@ class Serial:
 class Processes:
     """Several processes on this machine; the calling process is one of them.
 
-    The others start with the first map, see `spawn_context`.
+    The others start with the first map of several items, see `spawn_context`.
 
     Args:
         count: number of items processed at the same time, the calling process included (2 starts one more process).
@@ -128,6 +129,11 @@ class Processes:
             yield from (_alone(function, item) for item in items)
             return
         source = iter(items)
+        first = list(islice(source, 2))
+        if len(first) < 2:  # no other process need start, nor hold what this one has imported and read
+            yield from (_alone(function, item) for item in first)
+            return
+        source = chain(first, source)
         ahead = active().compute.queue_per_process * self.count
         queue: deque[Future[_Outcome[Result]]] = deque()
         try:
@@ -151,6 +157,11 @@ class Processes:
         finally:
             for future in queue:
                 future.cancel()
+
+    def fit(self, pixels: int) -> None:
+        """Work in this process alone from now on where pictures have too few pixels for others, see `alone_mpx`."""
+        if pixels <= active().compute.alone_mpx * 1e6:
+            self.count = 1
 
     def usage(self) -> Usage:
         """See Workers."""

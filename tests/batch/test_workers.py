@@ -71,6 +71,20 @@ def test_the_caller_works_too_and_the_others_are_measured():
     assert used.cpu_s > 0.05 and used.peak_rss_mb > 10
 
 
+def test_no_process_is_started_for_one_item():
+    with Processes(2) as two:
+        assert list(two.map(where, [0])) == [os.getpid()]
+
+
+def test_few_pixels_are_worked_on_in_this_process():
+    with Processes(2) as two:
+        two.fit(40 * 640 * 480)
+        assert set(two.map(where, range(8))) == {os.getpid()}
+    with Processes(2) as two:
+        two.fit(1000 * 640 * 480)
+        assert two.count == 2
+
+
 def test_items_are_taken_as_they_are_needed():
     taken = []
 

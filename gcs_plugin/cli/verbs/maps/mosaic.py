@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--blend", choices=("none", "seam"), default="seam", help="mix the pictures over a few pixels at seams, or not")
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
-    add("--workers", type=int, metavar="N", help="processes at once (default: one for each core)")
+    add("--workers", type=int, metavar="N", help="processes at once (default: one for each core, one for few photos)")
     add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
     )
@@ -65,7 +65,7 @@ def _refiners() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Make the map."""
-    from orthoswarm.compute.workers import Workers, prepare_process, workers
+    from orthoswarm.compute.workers import Processes, Workers, prepare_process, workers
 
     prepare_process()
     # Objects of tens of thousands of photos live to the end: collecting garbage among them would cost a tenth of the
@@ -113,7 +113,10 @@ def run(args: argparse.Namespace) -> int:
             sei_layouts=tuple(args.sei_layout),
             run=None if args.cluster or pool is None else pool.map,
         )
-        return telemetry.load(args.inputs, progress=progress, options=reading)
+        ingest = telemetry.load(args.inputs, progress=progress, options=reading)
+        if isinstance(pool, Processes) and args.workers is None:
+            pool.fit(sum(frame.width * frame.height for frame in ingest.frames))
+        return ingest
 
     if args.out.is_file():
         raise InputError(f"{args.out} is a file; choose a folder for --out")
