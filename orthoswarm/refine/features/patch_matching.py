@@ -38,45 +38,40 @@ def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: i
 
 
 @kernel
-def _scharr(gray, field, length):  # type: ignore[no-untyped-def]
-    """Scharr gradients (reflected at the border), float32 (rows, columns, 2), and their lengths.
+def _weighed(gray, texture, floor, out):  # type: ignore[no-untyped-def]
+    """Scharr gradients of the inner pixels weighted by their length and the median length, into out; 0 if unknown.
 
-    Returns True if the lengths on every second row and column are all known.
+    Rows are cut into slices first: an index that is a sum is tested for being negative, and its loop not vectorised.
     """
-    rows, cols = gray.shape
-    three, ten = np.float32(3.0), np.float32(10.0)
-    known = True
+    rows, cols = gray.shape[0] - 2, gray.shape[1] - 2
+    three, ten, zero, one = np.float32(3.0), np.float32(10.0), np.float32(0.0), np.float32(1.0)
+    along, across = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.float32)
+    length = np.empty((rows, cols), np.float32)
+    sample = np.empty(((rows + 1) // 2) * ((cols + 1) // 2), np.float32)
+    known = 0
     for r in range(rows):
-        above = gray[r - 1 if r > 0 else 1]
-        here = gray[r]
-        below = gray[r + 1 if r < rows - 1 else rows - 2]
+        nw, n, ne = gray[r, :cols], gray[r, 1 : cols + 1], gray[r, 2:]
+        w, e = gray[r + 1, :cols], gray[r + 1, 2:]
+        sw, s, se = gray[r + 2, :cols], gray[r + 2, 1 : cols + 1], gray[r + 2, 2:]
+        gx, gy, size = along[r], across[r], length[r]
         for c in range(cols):
-            w, e = (c - 1 if c > 0 else 1), (c + 1 if c < cols - 1 else cols - 2)
-            gx = three * (above[e] - above[w] + below[e] - below[w]) + ten * (here[e] - here[w])
-            gy = three * (below[w] - above[w] + below[e] - above[e]) + ten * (below[c] - above[c])
-            field[r, c, 0], field[r, c, 1] = gx, gy
-            length[r, c] = np.sqrt(gx * gx + gy * gy)
-            if (r | c) & 1 == 0 and np.isnan(length[r, c]):
-                known = False
-    return known
-
-
-@kernel
-def _compress(field, length, middle, texture, out):  # type: ignore[no-untyped-def]
-    """Gradients weighted by their length and the median length, without the border; 0 at unknown pixels."""
-    rows, cols = length.shape
-    for r in range(1, rows - 1):
-        for c in range(1, cols - 1):
-            size = length[r, c]
-            if np.isnan(size):
-                out[r - 1, c - 1, 0] = out[r - 1, c - 1, 1] = np.float32(0.0)
-            else:
-                if texture:
-                    share = middle / (size * size + middle * middle)
-                else:
-                    share = np.float32(1.0) / (size + middle)
-                out[r - 1, c - 1, 0] = field[r, c, 0] * share
-                out[r - 1, c - 1, 1] = field[r, c, 1] * share
+            x = three * (ne[c] - nw[c] + se[c] - sw[c]) + ten * (e[c] - w[c])
+            y = three * (sw[c] - nw[c] + se[c] - ne[c]) + ten * (s[c] - n[c])
+            gx[c], gy[c], size[c] = x, y, np.sqrt(x * x + y * y)
+        if r & 1 == 0:
+            for c in range(0, cols, 2):
+                if size[c] == size[c]:
+                    sample[known] = size[c]
+                    known += 1
+    middle = np.partition(sample[:known], known // 2)[known // 2] if known else one
+    middle = max(middle, floor)
+    for r in range(rows):
+        gx, gy, size, to = along[r], across[r], length[r], out[r]
+        for c in range(cols):
+            share = middle / (size[c] * size[c] + middle * middle) if texture else one / (size[c] + middle)
+            unknown = size[c] != size[c]
+            to[c, 0] = zero if unknown else gx[c] * share
+            to[c, 1] = zero if unknown else gy[c] * share
 
 
 @kernel
@@ -120,19 +115,8 @@ def texture_field(gray: Floats) -> Floats:
 
 
 def _weighed_gradients(gray: Floats, texture: bool) -> Floats:
-    rows, cols = gray.shape
-    field, length = np.empty((rows, cols, 2), np.float32), np.empty((rows, cols), np.float32)
-    known = _scharr(gray, field, length)
-    sample = length[::2, ::2].ravel()
-    if known:
-        half = len(sample) // 2
-        sample.partition(half)
-        middle = float(sample[half])
-    else:
-        sample = sample[np.isfinite(sample)]
-        middle = float(np.median(sample)) if len(sample) else 1.0
-    out = np.empty((rows - 2, cols - 2, 2), np.float32)
-    _compress(field, length, np.float32(max(middle, active().features.gradient_floor)), texture, out)
+    out = np.empty((gray.shape[0] - 2, gray.shape[1] - 2, 2), np.float32)
+    _weighed(gray, texture, np.float32(active().features.gradient_floor), out)
     return out
 
 

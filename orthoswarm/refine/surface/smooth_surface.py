@@ -117,7 +117,7 @@ class Surface:
         z: float64 (P,), heights; sigma: their sigma.
         base: float64 (P,), weight of a point on the surface; 0 for points that do not count.
         support: bool (N,), nodes that have data in a cell next to them.
-        curvature, slope, level: float64 (N + 4, band + 4), penalties for unit sigma, see `solve_banded`.
+        curvature, slope, level: float64 (N + 8, band + 8), penalties for unit sigma, see `solve_banded`.
     """
 
     columns: int
@@ -148,7 +148,7 @@ class Surface:
         support: NDArray[np.bool_] = np.zeros(inner * outer, np.bool_)
         for k in (0, 1, inner, inner + 1):
             support[cell[good] + k] = True
-        size = (inner * outer + 4, 2 * inner + 4)
+        size = (inner * outer + 8, 2 * inner + 8)
         curvature, slope, level = np.zeros(size), np.zeros(size), np.zeros(size)
         _penalties(inner, outer, support, curvature, slope, level)
         return cls(
@@ -296,44 +296,57 @@ def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) ->
 
 @kernel
 def solve_banded(a, width, x):  # type: ignore[no-untyped-def]
-    """Solve a symmetric positive definite banded system in place: Cholesky, four columns at a time.
+    """Solve a symmetric positive definite banded system in place: Cholesky, eight columns at a time.
 
     Own kernel, because a threaded LAPACK is slow on small bands and rounds differently with each number of
     threads.
 
     Args:
-        a: float64 (n + 4, width + 4), a[i, k] = A[i, i + k], zero beyond the band and in the last four rows;
+        a: float64 (n + 8, width + 8), a[i, k] = A[i, i + k], zero beyond the band and in the last eight rows;
             overwritten by the factor.
         width: number of diagonals above the main one.
         x: float64 (n,), right-hand side; overwritten by the solution.
     """
     n = len(x)
-    for i in range(0, n, 4):
-        for p in range(min(4, n - i)):
+    for i in range(0, n, 8):
+        for p in range(min(8, n - i)):
             column = a[i + p]
             d = 1.0 / np.sqrt(max(column[0], 1e-300))
             for k in range(width + 1):
                 column[k] *= d
-            for k in range(1, min(4 - p, n - i - p)):
-                f, t = column[k], a[i + p + k]
-                for j in range(width + 1 - k):
-                    t[j] -= f * column[k + j]
-        c0, c1, c2, c3 = a[i], a[i + 1], a[i + 2], a[i + 3]
-        for k in range(4, min(width + 4, n - i)):
-            t = a[i + k]
-            f0, f1, f2, f3 = c0[k], c1[k - 1], c2[k - 2], c3[k - 3]
-            o1, o2, o3 = k - 1, k - 2, k - 3
-            for j in range(width + 4 - k):
-                t[j] -= f0 * c0[k + j] + f1 * c1[o1 + j] + f2 * c2[o2 + j] + f3 * c3[o3 + j]
+            for k in range(1, min(8 - p, n - i - p)):
+                m = width + 1 - k
+                f, t, source = column[k], a[i + p + k, :m], column[k : k + m]
+                for j in range(m):
+                    t[j] -= f * source[j]
+        for k in range(8, min(width + 8, n - i)):
+            m = width + 8 - k  # slices, since an index that is a sum is tested for being negative, and not vectorised
+            t = a[i + k, :m]
+            c0, c1 = _tail(a, i, k, m), _tail(a, i + 1, k - 1, m)
+            c2, c3 = _tail(a, i + 2, k - 2, m), _tail(a, i + 3, k - 3, m)
+            c4, c5 = _tail(a, i + 4, k - 4, m), _tail(a, i + 5, k - 5, m)
+            c6, c7 = _tail(a, i + 6, k - 6, m), _tail(a, i + 7, k - 7, m)
+            f0, f1, f2, f3, f4, f5, f6, f7 = c0[0], c1[0], c2[0], c3[0], c4[0], c5[0], c6[0], c7[0]
+            for j in range(m):
+                first = f0 * c0[j] + f1 * c1[j] + f2 * c2[j] + f3 * c3[j]
+                t[j] -= first + f4 * c4[j] + f5 * c5[j] + f6 * c6[j] + f7 * c7[j]
     for i in range(n):
         x[i] /= a[i, 0]
-        for k in range(1, min(width, n - 1 - i) + 1):
-            x[i + k] -= a[i, k] * x[i]
+        m = min(width, n - 1 - i)
+        row, below, known = a[i, 1 : m + 1], x[i + 1 : i + 1 + m], x[i]
+        for k in range(m):
+            below[k] -= row[k] * known
     for i in range(n - 1, -1, -1):
-        total = x[i]
-        for k in range(1, min(width, n - 1 - i) + 1):
-            total -= a[i, k] * x[i + k]
+        m = min(width, n - 1 - i)
+        row, below, total = a[i, 1 : m + 1], x[i + 1 : i + 1 + m], x[i]
+        for k in range(m):
+            total -= row[k] * below[k]
         x[i] = total / a[i, 0]
+
+
+@kernel
+def _tail(a, row, first, count):  # type: ignore[no-untyped-def]
+    return a[row, first : first + count]
 
 
 @kernel

@@ -202,7 +202,7 @@ def test_the_banded_solver_solves(n, width, seed):
     rng = np.random.default_rng(seed)
     width = min(width, n - 1)
     full = np.zeros((n, n))
-    band = np.zeros((n + 4, width + 4))
+    band = np.zeros((n + 8, width + 8))
     for k in range(width + 1):
         diagonal = rng.normal(0, 1, n - k) + (3.0 * (width + 1) if k == 0 else 0.0)
         band[: n - k, k] = diagonal
