@@ -1,10 +1,12 @@
 """How long it takes the daemon to show a vehicle refined: photos are posted, the refinement is asked for, timed.
 
-    python -m benchmarks.speed.daemon_refine out/twin
+    python -m benchmarks.speed.daemon_refine out/twin [--pack]
 
-The folder is one that `orthoswarm twin make` wrote (photos/, basemap.tif). Prints a line of JSON for each vehicle: its
-pictures, seconds from the wish to its refined pixels on the map, and CPU seconds of the solution; meanwhile the next
-vehicle's pictures come in, four a second. On COMPLETE the daemon waits 0.7 s more, to see that no more pictures come.
+The folder is one that `orthoswarm twin make` wrote (photos/, basemap.tif). Prints a line of JSON for each vehicle:
+its pictures, seconds from the wish to its refined pixels on the map, and CPU seconds of the solution; meanwhile the
+next vehicle's pictures come in, four a second. On COMPLETE the daemon waits 0.7 s more, to see that no more pictures
+come. With --pack the offline pack is asked for together with the last refinement, and a line says when its ZIP was
+ready and what it is.
 """
 
 import argparse
@@ -66,11 +68,33 @@ def refined(client: httpx.Client, token: str, vehicle: str) -> dict:
     }
 
 
+def time_pack(client: httpx.Client, token: str, asked: float, workspace: Path) -> None:
+    """Ask for the pack, which waits for the refinement, and print when its ZIP was ready."""
+    headers = {"Authorization": f"Bearer {token}"}
+    job = client.post("/api/export", json={"formats": ["pack"]}, headers=headers).raise_for_status().json()
+    while True:
+        job = next(row for row in client.get("/api/jobs").json() if row["id"] == job["id"])
+        if job["state"] in ("done", "failed"):
+            break
+        time.sleep(0.1)
+    if job["state"] == "failed":
+        print(json.dumps({"pack": job["message"]}), flush=True)
+        return
+    archive = workspace / job["detail"]["files"]["pack"]
+    report = json.loads((workspace / "report.json").read_text())
+    figures = {
+        "pack_ready_s": round(archive.stat().st_mtime - asked, 1),
+        "megabytes": round(archive.stat().st_size / 1e6),
+        "unrefined": report["unrefined"],
+    }
+    print(json.dumps(figures), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("twin", type=Path)
+    parser.add_argument("--pack", action="store_true", help="time the offline pack, too")
     args = parser.parse_args()
-    sys.path.remove(str(Path(__file__).resolve().parent))  # its telemetry.py would hide the package
     import telemetry
 
     vehicles: dict[str, list[Frame]] = {}
@@ -96,7 +120,14 @@ def main() -> None:
                     flying = threading.Thread(target=slowly, args=(client, vehicles.get(other, []), stop))
                     flying.start()
                     time.sleep(5.0)  # what came before is drawn then
+                    asked = time.time()
+                    waiting = None
+                    if args.pack and not other:
+                        waiting = threading.Timer(0.2, time_pack, (client, token, asked, workspace))
+                        waiting.start()
                     print(json.dumps(refined(client, token, name)), flush=True)
+                    if waiting is not None:
+                        waiting.join()
                     stop.set()
                     flying.join()
         finally:

@@ -193,7 +193,7 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
                 assert said in words
             start = page.locator("dialog[aria-labelledby=preflight-title] .primary")
             assert start.is_disabled()
-            boxes = page.locator(".checks input")
+            boxes = page.locator(".checks input:visible")
             assert boxes.count() == 2
             boxes.nth(0).check()
             assert start.is_disabled()
@@ -201,6 +201,53 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             start.click()
             page.wait_for_selector("dialog[aria-labelledby=preflight-title]", state="hidden")
             assert station.commands("start")[0]["override"] == {"v7": ["battery", "gps"]}
+
+
+def test_a_red_item_that_becomes_well_lets_the_start_go_without_a_press(browser):
+    """ArduCopter's position filter is ready 40 s after its start; the battery stays as it is."""
+    part = {"id": "v1", "time_s": 312, "photos": 40, "sorties": 1, "flights": [{"start_s": 0}]}
+    plan = {
+        "id": "plan-1",
+        "covered_share": 1.0,
+        "makespan_s": 312,
+        "spacing_m": 20,
+        "vehicles": [part],
+        "warnings": [],
+    }
+    shared = {"area": None, "settings": {}, "plan": "plan-1", "vehicles": {"v1": "v7"}, "version": 1}
+    states = ["red", "ok", "red"]
+
+    def answer(method, path, body):
+        items = [
+            {"name": "ekf", "state": states[0], "reason": "no position yet"},
+            {"name": "battery", "state": "red", "reason": "0 % left"},
+        ]
+        return 200, {"checks": [{"vehicle": "v7", "state": "red", "height_m": 80, "time_s": 312, "items": items}]}
+
+    with standing(vehicle(7, name="Falcon")) as station:
+        station.gets |= {"/api/plan": shared, "/api/plans": [plan], "/api/plans/plan-1/map": {"features": []}}
+        station.answer = answer
+        with opened(browser, station.url) as page:
+            page.click("#tab-plan")
+            page.click("text=Check and start")
+            start = page.locator("dialog[aria-labelledby=preflight-title] .primary")
+            boxes = page.locator(".checks input:visible")
+            page.wait_for_selector(".checks input:visible >> nth=1")
+            boxes.nth(0).check()
+            boxes.nth(1).check()
+            assert start.is_enabled()
+            boxes.nth(0).uncheck()
+            boxes.nth(1).focus()
+            page.click("text=Check again")
+            boxes.nth(1).focus()
+            states.pop(0)
+            page.wait_for_function("() => !document.querySelector('.preflight .primary').disabled")
+            assert "Battery" in page.evaluate("document.activeElement.closest('li').textContent")
+            assert boxes.count() == 1 and boxes.nth(0).is_checked()
+            states.pop(0)
+            page.click("text=Check again")
+            page.wait_for_selector(".checks input:visible >> nth=1")
+            assert not boxes.nth(0).is_checked() and start.is_disabled()  # red again: it is asked again
 
 
 def test_on_a_phone_the_panel_can_be_made_taller_and_the_scale_is_free(browser):

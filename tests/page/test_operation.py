@@ -62,7 +62,8 @@ def test_from_an_area_to_the_pack(browser, tmp_path, size):
 @pytest.mark.sitl
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("address", ADDRESSES or ["no address in ORTHOSWARM_SITL"])
-def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address):
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address, size):
     """The same under a real autopilot that carries the twin's camera; see test_twin_camera."""
     if not ADDRESSES:
         pytest.skip("ORTHOSWARM_SITL names no autopilot")
@@ -80,7 +81,7 @@ def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address):
         served = opened_here.enter_context(serving(tmp_path / "flood", *arguments))
         rows = served.until("/api/vehicles", lambda rows: any(map(has_position, rows)))
         row = next(filter(has_position, rows))
-        page = opened_here.enter_context(opened(browser, f"{served.url}/#token={served.token}", DESK, fake=False))
+        page = opened_here.enter_context(opened(browser, f"{served.url}/#token={served.token}", size, fake=False))
         page.set_default_timeout(600_000)
         operate(page, tmp_path, small_area(row["lat_deg"], row["lon_deg"]), vehicles=1, altitude_m=60, fov_deg=75)
 

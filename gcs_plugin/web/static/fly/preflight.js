@@ -1,9 +1,10 @@
 // Before a start: what starts, when and how high, and the daemon's check of each vehicle. Red stops the start; each red
-// item can be allowed by itself, never all at once.
+// item can be allowed by itself, never all at once. While something is red the check is repeated: a receiver gets its
+// fix, a filter settles.
 
 import { post } from "/static/core/api.js";
 import { dialogBox } from "/static/core/dialog.js";
-import { button, make, setHidden, setText } from "/static/core/dom.js";
+import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { state } from "/static/core/store.js";
 import { daemonTime } from "/static/core/stream.js";
@@ -11,6 +12,8 @@ import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 
 const CHECK_MS = 60_000;
+const REPEAT_MS = 5_000;
+const REST = 3; // pause after a check, in multiples of its time: it reads missions from the vehicles
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
 const title = make("h2", { id: "preflight-title" });
 const facts = make("ul", { class: "starts" });
@@ -26,6 +29,8 @@ let plan = null;
 let names = {};
 let rows = null;
 let allowed = {};
+let turn = 0; // a newer check or a start makes answers to older ones void
+let timer = 0;
 
 export function openPreflight(chosen, vehicles) {
   plan = chosen;
@@ -36,19 +41,26 @@ export function openPreflight(chosen, vehicles) {
   check();
 }
 
-async function check() {
-  rows = null;
-  checks.replaceChildren();
-  setText(status, t("preflight.checking"));
-  draw();
+async function check(repeated = false) {
+  clearTimeout(timer);
+  const mine = ++turn;
+  const began = Date.now();
+  if (!repeated) {
+    rows = null;
+    setText(status, t("preflight.checking"));
+    draw();
+  }
   try {
     const answer = await post(`/api/plans/${plan.id}/preflight`, { sortie: 1, vehicles: names }, CHECK_MS);
+    if (mine !== turn) return;
     rows = Array.isArray(answer?.checks) ? answer.checks : [];
     setText(status, "");
   } catch (error) {
+    if (mine !== turn) return;
     setText(status, error.status === 404 || error.status === 405 ? t("preflight.absent") : t("preflight.failed", { why: error.message }));
   }
   draw();
+  if (stopped().length) timer = setTimeout(() => { if (dialog.box.open) check(true); }, Math.max(REPEAT_MS, REST * (Date.now() - began)));
 }
 
 const stopped = () => (rows ?? []).flatMap((row) => row.items.filter((item) => item.state === "red" && !allowed[row.vehicle]?.has(item.name)));
@@ -65,10 +77,19 @@ function drawFacts() {
 
 function draw() {
   drawFacts();
-  checks.replaceChildren(...(rows ?? []).map((row) => make("section", { dataset: { level: row.state } }, make("h3", {}, `${nameOf(row.vehicle)}: ${t(`preflight.state.${row.state}`)}`),
-    make("ul", {}, ...row.items.map((item) => line(row.vehicle, item))))));
+  drawChecks((rows ?? []).map((row) => [row.vehicle, row]));
   refresh();
 }
+
+const drawChecks = keyedList(checks, () => {
+  const section = make("section", {}, make("h3", {}), make("ul", {}));
+  section.draw = keyedList(section.lastChild, makeLine, drawLine);
+  return section;
+}, (section, row) => {
+  setAttribute(section, "data-level", row.state);
+  setText(section.firstChild, `${nameOf(row.vehicle)}: ${t(`preflight.state.${row.state}`)}`);
+  section.draw(row.items.map((item) => [item.name, { ...item, vehicle: row.vehicle }]));
+});
 
 function refresh() {
   const left = stopped();
@@ -76,11 +97,20 @@ function refresh() {
   setText(go, rows && left.length ? t("preflight.stopped", { n: left.length }) : t("preflight.start", { n: plan?.vehicles.length ?? 0 }));
 }
 
-function line(vehicle, item) {
-  const words = t(`preflight.${item.state}`);
-  const box = item.state === "red" ? make("label", { class: "check" }, make("input", { type: "checkbox", checked: allowed[vehicle]?.has(item.name) ?? false, onchange: (event) => allow(vehicle, item.name, event.target.checked) }),
-    make("span", {}, t("preflight.allow", { item: t(`preflight.item.${item.name}`), name: nameOf(vehicle) }))) : null;
-  return make("li", { dataset: { level: item.state } }, make("b", {}, words), make("span", {}, `${t(`preflight.item.${item.name}`)}: ${item.reason}`), box);
+function makeLine({ vehicle, name }) {
+  const box = make("input", { type: "checkbox", onchange: () => allow(vehicle, name, box.checked) });
+  const words = make("span", {}, t("preflight.allow", { item: t(`preflight.item.${name}`), name: nameOf(vehicle) }));
+  return make("li", {}, make("b", {}), make("span", {}), make("label", { class: "check" }, box, words));
+}
+
+function drawLine(row, item) {
+  const [word, reason, box] = row.children;
+  setAttribute(row, "data-level", item.state);
+  setText(word, t(`preflight.${item.state}`));
+  setText(reason, `${t(`preflight.item.${item.name}`)}: ${item.reason}`);
+  setHidden(box, item.state !== "red");
+  if (item.state !== "red") allowed[item.vehicle]?.delete(item.name); // red again later asks again
+  box.firstChild.checked = allowed[item.vehicle]?.has(item.name) ?? false;
 }
 
 function allow(vehicle, item, on) {
@@ -90,6 +120,8 @@ function allow(vehicle, item, on) {
 }
 
 async function start() {
+  clearTimeout(timer);
+  turn++;
   go.disabled = true;
   setText(status, t("preflight.starting"));
   try {
