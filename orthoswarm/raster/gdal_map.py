@@ -244,7 +244,7 @@ def luma(data: Bytes) -> Bytes:
 
     if len(data) == 1:
         return data
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(data.transpose(1, 2, 0)), cv2.COLOR_RGB2GRAY))[None]
+    return np.asarray(cv2.cvtColor(cv2.merge(list(data)), cv2.COLOR_RGB2GRAY))[None]
 
 
 def _crs_of(source: Any, path: Path) -> Any:
@@ -339,9 +339,10 @@ def _blank(values: NDArray[Any]) -> Mask:
     box = np.ones((side, side), np.uint8)
     wider = np.ones((side + 4, side + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
     out = np.zeros(values.shape[1:], bool)
+    lowest, highest = values.min(axis=0), values.max(axis=0)
     for value in (0, 255) if values.dtype == np.uint8 else (0,):
-        flat = (values == value).all(axis=0)
-        if flat.sum() >= side**2:
+        flat = (lowest == value) & (highest == value)
+        if np.count_nonzero(flat) >= side**2:
             core = cv2.erode(flat.astype(np.uint8), box, borderValue=1)
             out |= cv2.dilate(core, wider, borderValue=0).astype(bool)
     return out

@@ -80,8 +80,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
 
     config = active().mosaic
     record = np.zeros(1, RECORD)
-    small = cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
-    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
     blocks = (COLUMNS // BLOCK_PX, ROWS // BLOCK_PX)
     level = gray.astype(np.float32)
     mean = cv2.resize(level, blocks, interpolation=cv2.INTER_AREA)
@@ -98,12 +97,10 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
 def read_previews(path: Path, rows: NDArray[np.integer]) -> NDArray[np.void]:
     """Some records (N,) of dtype RECORD."""
     records = np.zeros(len(rows), RECORD)
-    with path.open("rb") as file:
+    with path.open("rb", buffering=0) as file:
         for i, row in enumerate(rows.tolist()):
             file.seek(row * RECORD.itemsize)
-            data = file.read(RECORD.itemsize)
-            if len(data) == RECORD.itemsize:
-                records[i] = np.frombuffer(data, RECORD)[0]
+            file.readinto(records[i : i + 1].view(np.uint8).data)
     return records
 
 

@@ -13,6 +13,8 @@ Ints = NDArray[np.int32]
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
+LEAST_DEPTH_M = 1e-3
+"""Points less than this before a camera are not visible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,7 @@ def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped
     """
     dx, dy, dz = x - position[0], y - position[1], z - position[2]
     cz = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
-    if cz < 1e-3:
+    if cz < LEAST_DEPTH_M:
         return np.nan, np.nan
     cx = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / cz
     cy = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / cz

@@ -6,8 +6,19 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
+from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 from orthoswarm.raster.subpixel_peak import vertex
-from orthoswarm.refine.bundle.block_arrays import project_point
+from orthoswarm.refine.bundle.block_arrays import (
+    CX,
+    CY,
+    HEIGHT,
+    K1,
+    K2,
+    K3,
+    LEAST_DEPTH_M,
+    WIDTH,
+    F,
+)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -20,20 +31,35 @@ def rectify(position, rotation, lens, gray, x, y, z, gsd, half, out):  # type: i
     Row 0 is north. Returns the share of its pixels that lie in the picture (uint8); the others are NaN.
     """
     rows, cols = gray.shape
-    size = 2 * half + 1
+    size, one = 2 * half + 1, np.uint64(1)
+    focal, k1, k2, k3 = lens[F], lens[K1], lens[K2], lens[K3]
+    u0, v0 = 0.5 * (lens[WIDTH] - 1.0) + lens[CX], 0.5 * (lens[HEIGHT] - 1.0) + lens[CY]
+    m, dz = rotation, z - position[2]
     inside = 0
     for r in range(size):
+        # block_arrays.project_point, its sums over a row taken out of the loop
+        dy, line = y - (r - half) * gsd - position[1], out[r]
+        row_x, row_y = m[1, 0] * dy + m[2, 0] * dz, m[1, 1] * dy + m[2, 1] * dz
+        row_depth = m[1, 2] * dy + m[2, 2] * dz
         for c in range(size):
-            u, v = project_point(position, rotation, lens, x + (c - half) * gsd, y - (r - half) * gsd, z)
+            dx = x + (c - half) * gsd - position[0]
+            depth, u, v = row_depth + m[0, 2] * dx, -1.0, -1.0
+            if depth >= LEAST_DEPTH_M:
+                near = 1.0 / depth
+                px, py = (row_x + m[0, 0] * dx) * near, (row_y + m[0, 1] * dx) * near
+                r2 = px * px + py * py
+                if 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) >= LEAST_RADIAL_SLOPE:
+                    scale = focal * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+                    u, v = scale * px + u0, scale * py + v0
             if u >= 0.0 and v >= 0.0 and u < cols - 1.0 and v < rows - 1.0:
-                ui, vi = int(u), int(v)
+                ui, vi = np.uint64(u), np.uint64(v)  # unsigned indices are not tested for being negative
                 fu, fv = np.float32(u - ui), np.float32(v - vi)
-                low = gray[vi, ui] * (1 - fu) + gray[vi, ui + 1] * fu
-                high = gray[vi + 1, ui] * (1 - fu) + gray[vi + 1, ui + 1] * fu
-                out[r, c] = low * (1 - fv) + high * fv
+                low = gray[vi, ui] * (1 - fu) + gray[vi, ui + one] * fu
+                high = gray[vi + one, ui] * (1 - fu) + gray[vi + one, ui + one] * fu
+                line[c] = low * (1 - fv) + high * fv
                 inside += 1
             else:
-                out[r, c] = np.nan
+                line[c] = np.nan
     return inside / (size * size)
 
 
