@@ -7,16 +7,25 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.twin.recorded_noise import Noise
 from orthoswarm.twin.true_flight import FlightPlan, Motion
 
+_HARD = Noise(
+    heading_bias_deg=3.0, tilt_bias_deg=1.0, angle_deg=0.07, outlier_share=0.02, lag_s=(0.1, 0.5), height_m=0.15,
+    height_offset_m=1.0,
+)  # fmt: skip
 NOISES: dict[str, Noise] = {
     "none": Noise(position_m=0.0, drift_per_photo_m=0.0),
     "paper": Noise(),
-    "hard": Noise(
-        heading_bias_deg=3.0, tilt_bias_deg=1.0, angle_deg=0.07, outlier_share=0.02, lag_s=(0.1, 0.5), height_m=0.15,
-        height_offset_m=1.0,
-    ),
+    "hard": _HARD,
     "drift": Noise(position_m=0.4, drift_per_photo_m=0.0, follows_plan=True, height_m=0.1),
-}  # fmt: skip
-"""No noise; the paper's; harder than the paper's; drift of a receiver that the autopilot follows."""
+    "wind": _HARD,
+    "curves": _HARD,
+}
+"""No noise; the paper's; harder than the paper's; drift of a receiver that the autopilot follows; the hard one in
+12 m/s of wind (crab angles, uneven speed); the hard one along arcs of 50 m radius."""
+_MOTIONS: dict[str, dict[str, float]] = {
+    "drift": {"drift_m": 18.0},
+    "wind": {"wind_m_s": 12.0, "track_m": 0.8, "attitude_deg": 2.4},
+    "curves": {"curve_radius_m": 50.0},
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,5 +108,5 @@ def spec(preset: str, *, seed: int = 1, noise: str = "paper", **changes: Any) ->
     if noise not in NOISES:
         raise InputError(f"there is no noise '{noise}'; choose one of: {', '.join(NOISES)}")
     base = PRESETS[preset]
-    motion = replace(base.motion, drift_m=18.0) if noise == "drift" else base.motion
+    motion = replace(base.motion, **_MOTIONS.get(noise, {}))
     return replace(base, **{"seed": seed, "noise_name": noise, "noise": NOISES[noise], "motion": motion, **changes})

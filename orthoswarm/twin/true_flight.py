@@ -129,12 +129,41 @@ def _path(corners: Array, count: int, spacing: float) -> tuple[Array, Array]:
     return corners[k] + step[k] * t[:, None], heading
 
 
-def _slew(heading: Array, seconds: float, rate_rad_s: float) -> Array:
-    """Headings that follow the path's with a limited turning rate."""
+def _curved(corners: Array, radius: float) -> Array:
+    """The legs of a path as arcs to the left and right in turn, of 60 degrees each; turns between legs stay straight.
+
+    An arc's chord is as long as its radius, so that it leaves the leg by 0.13 radii.
+    """
+    points = []
+    for start, end in zip(corners[::2], corners[1::2], strict=True):
+        length = float(np.hypot(*(end - start)))
+        ahead = (end - start) / length
+        side = np.array([ahead[1], -ahead[0]])
+        along = np.linspace(0.0, length, max(2, int(length)))
+        arc, x = np.divmod(along, radius)
+        off = np.sqrt(radius**2 - (x - 0.5 * radius) ** 2) - np.cos(np.pi / 6) * radius
+        points.append(start + along[:, None] * ahead + (np.where(arc % 2 == 0, off, -off))[:, None] * side)
+    return np.concatenate(points)
+
+
+def _ground_speed(heading: Array, motion: "Motion", wind_from_rad: float, calm_m_s: float) -> tuple[Array, Array]:
+    """Ground speed (N,) and crab angle (N,) along courses; without wind the plan's speed and 0.
+
+    The vehicle flies `air_speed_m_s` through the air and points its nose into the wind so far that it keeps its course.
+    """
+    if not motion.wind_m_s:
+        return np.full(len(heading), calm_m_s), np.zeros(len(heading))
+    against = wind_from_rad - heading
+    crab = np.arcsin(motion.wind_m_s / motion.air_speed_m_s * np.sin(against))
+    return motion.air_speed_m_s * np.cos(crab) - motion.wind_m_s * np.cos(against), crab
+
+
+def _slew(heading: Array, seconds: Array, rate_rad_s: float) -> Array:
+    """Headings that follow the path's with a limited turning rate; `seconds` (N,): since the picture before."""
     out = heading.copy()
     for i in range(1, len(out)):
         turn = wrap_rad(float(heading[i] - out[i - 1]))
-        out[i] = out[i - 1] + np.clip(turn, -rate_rad_s * seconds, rate_rad_s * seconds)
+        out[i] = out[i - 1] + np.clip(turn, -rate_rad_s * seconds[i], rate_rad_s * seconds[i])
     return out
 
 
@@ -148,6 +177,9 @@ class Motion:
         height_m: one sigma of the height.
         drift_m: drift of the receiver, which the autopilot follows, so that the true path leaves the plan.
         mount_yaw_deg: range of the camera's fixed yaw offset; mount_pitch_deg: of its pitch offset.
+        wind_m_s: wind, from a direction drawn for the set; the nose turns into it by the crab angle.
+        air_speed_m_s: speed through the air, used in wind only.
+        curve_radius_m: legs are arcs of this radius, to the left and right in turn; 0: straight.
     """
 
     track_m: float = 0.4
@@ -157,6 +189,9 @@ class Motion:
     drift_m: float = 0.0
     mount_yaw_deg: float = 30.0
     mount_pitch_deg: float = 5.0
+    wind_m_s: float = 0.0
+    air_speed_m_s: float = 15.0
+    curve_radius_m: float = 0.0
 
 
 def fly(
@@ -173,7 +208,7 @@ def fly(
 
     Args:
         plan: the swarm's flight plan.
-        motion: deviations from it.
+        motion: deviations from it, the wind and the curvature of legs.
         center: grid coordinates of the area's centre.
         vehicle: its number.
         seed: of the set; each vehicle draws its own numbers from it.
@@ -182,8 +217,15 @@ def fly(
     """
     rng = np.random.default_rng([seed, 41, vehicle])
     n = plan.photos
-    seconds = plan.spacing_m / plan.speed_m_s
-    local, heading = _path(plan.corners(vehicle), n, plan.spacing_m)
+    corners = plan.corners(vehicle)
+    way = _curved(corners, motion.curve_radius_m) if motion.curve_radius_m else corners
+    local, heading = _path(way, n, plan.spacing_m)
+    wind_from = float(np.random.default_rng([seed, 47]).uniform(0.0, 2.0 * np.pi))
+    speed, crab = _ground_speed(heading + plan.heading_rad, motion, wind_from, plan.speed_m_s)
+    seconds = plan.spacing_m / speed
+    since_start: Array = np.concatenate([[0.0], np.cumsum(seconds[:-1])])
+    if not motion.wind_m_s:  # the same numbers as those of older sets, to the last bit
+        since_start = seconds[0] * np.arange(n, dtype=np.float64)
     planned = np.c_[plan.to_grid(local, center), np.full(n, plan.height_m)]
     fov = float(rng.choice(FOVS_DEG))
     mount = np.radians([rng.uniform(-1, 1) * motion.mount_yaw_deg, rng.uniform(-1, 1) * motion.mount_pitch_deg])
@@ -194,17 +236,18 @@ def fly(
         if motion.drift_m:
             position[:, axis] += _receiver_drift(rng, n, motion.drift_m)
     position[:, 2] += smooth_noise(rng, n, 12.0, motion.height_m)
-    velocity = np.gradient(position[:, :2], seconds, axis=0)
+    velocity = np.gradient(position[:, :2], since_start if motion.wind_m_s else seconds[0], axis=0)
 
     calm, jitter = np.radians(motion.attitude_deg), np.radians(motion.jitter_deg)
-    body = np.stack([_slew(heading + plan.heading_rad, seconds, np.radians(35.0)), np.zeros(n), np.zeros(n)], -1)
+    nose = _slew(heading + plan.heading_rad + crab, seconds, np.radians(35.0))
+    body = np.stack([nose, np.zeros(n), np.zeros(n)], -1)
     for axis in range(3):
         body[:, axis] += smooth_noise(rng, n, 3.0, calm) + rng.normal(0, jitter, n)
     body[:, 1] -= np.radians(1.0)  # nose down at cruise
     # the gimbal lets 80 % of the airframe's tilt through
     angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
-    time: Array = start_s + 7.0 * vehicle + seconds * np.arange(n, dtype=np.float64)
+    time: Array = start_s + 7.0 * vehicle + since_start
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
     return Flight(
         vehicle=name,

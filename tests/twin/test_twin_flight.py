@@ -119,3 +119,39 @@ def test_smooth_noise_has_the_stated_size_and_length():
     assert curve.std() == pytest.approx(2.0, rel=0.1)
     assert np.corrcoef(curve[:-5], curve[5:])[0, 1] > 0.8
     assert abs(np.corrcoef(curve[:-60], curve[60:])[0, 1]) < 0.2
+
+
+def test_in_wind_vehicles_point_their_nose_into_it_and_keep_their_course():
+    """12 m/s at 15 m/s through the air: up to 53 degrees of crab, 3 to 27 m/s over ground."""
+    calm, windy = spec("debris", seed=7), spec("debris", seed=7, noise="wind")
+    assert windy.motion.wind_m_s == 12.0
+    courses, noses, speeds = [], [], []
+    for heading in (0.0, 0.8, 1.6, 2.4):
+        plan = replace(calm.plan, heading_rad=heading)
+        flight = fly(plan, replace(windy.motion, attitude_deg=0.0, jitter_deg=0.0), CENTER, vehicle=0, seed=7)
+        straight = slice(5, 60)
+        way, seconds = np.diff(flight.planned[straight, :2], axis=0), np.diff(flight.time_s[straight])
+        courses.append(np.arctan2(way[:, 0], way[:, 1]))
+        noses.append(flight.body[straight, 0][1:])
+        speeds.append(np.hypot(*way.T) / seconds)
+    course, nose, speed = (np.concatenate(v) for v in (courses, noses, speeds))
+    over_ground = speed[:, None] * np.stack([np.sin(course), np.cos(course)], -1)
+    through_air = 15.0 * np.stack([np.sin(nose), np.cos(nose)], -1)
+    wind = over_ground - through_air
+    assert np.hypot(*wind.T) == pytest.approx(12.0, abs=0.05)
+    assert np.ptp(wind, axis=0).max() < 0.1  # one wind for all courses
+    assert np.ptp(speed) > 5.0
+
+
+def test_curved_legs_have_a_radius_of_fifty_metres_and_stay_near_the_leg():
+    flight = fly(FlightPlan(spacing_m=2.0, photos=1400), spec("debris", noise="curves").motion, CENTER, vehicle=0, seed=1)
+    path = flight.planned[:200, :2]
+    turns = np.diff(np.unwrap(np.arctan2(*np.diff(path, axis=0).T)))
+    assert 2.0 / np.abs(turns).mean() == pytest.approx(50.0, rel=0.05)
+    assert {int(v) for v in np.sign(turns[np.abs(turns) > 0.01])} == {-1, 1}
+    assert np.ptp(path[:, 0]) == pytest.approx(2 * 50.0 * (1.0 - np.cos(np.pi / 6)), abs=0.3)
+
+
+def test_kinds_without_wind_and_curves_fly_as_they_did():
+    flight = fly(PLAN, Motion(), CENTER, vehicle=1, seed=3)
+    assert np.array_equal(flight.time_s, 1_750_000_007.0 + PLAN.spacing_m / PLAN.speed_m_s * np.arange(PLAN.photos))

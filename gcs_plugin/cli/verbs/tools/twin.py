@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("preset", metavar="PRESET", help="tiny (40 photos), debris, water, haze, clear (1,017 each), full (32,544)")
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the set; an interrupted run goes on there")
     add("--seed", type=int, default=1, help="which city, flight and noise (default 1)")
-    add("--noise", default="paper", metavar="KIND", help="none, paper, hard or drift (default paper)")
+    add("--noise", default="paper", metavar="KIND", help="none, paper, hard, drift, wind or curves (default paper)")
     add("--disaster", choices=("none", "debris", "water", "haze", "all"), help="instead of the preset's")
     add("--lens", metavar="K1,K2", help="radial distortion of all lenses, in units of f (write --lens=-0.05,0.01)")
     add("--relief", type=float, default=0.0, metavar="M", help="smooth ground relief of +-M metres")
