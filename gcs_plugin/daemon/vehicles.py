@@ -417,7 +417,7 @@ class VehicleLinks:
                     self._events.publish("traffic", rows=self.traffic.rows())
                 self._give_up_silent()
             except Exception as error:  # an unexpected state of one vehicle must not end the watch
-                _log.warning("watching vehicles: %s", error)
+                _log.warning("watching vehicles: %s", str(error) or type(error).__name__)
 
     def _publish_rows(self, *, complete: bool) -> None:
         """Publish the differences of each vehicle's row since the last time, or complete rows.

@@ -144,7 +144,9 @@ def test_in_wind_vehicles_point_their_nose_into_it_and_keep_their_course():
 
 
 def test_curved_legs_have_a_radius_of_fifty_metres_and_stay_near_the_leg():
-    flight = fly(FlightPlan(spacing_m=2.0, photos=1400), spec("debris", noise="curves").motion, CENTER, vehicle=0, seed=1)
+    flight = fly(
+        FlightPlan(spacing_m=2.0, photos=1400), spec("debris", noise="curves").motion, CENTER, vehicle=0, seed=1
+    )
     path = flight.planned[:200, :2]
     turns = np.diff(np.unwrap(np.arctan2(*np.diff(path, axis=0).T)))
     assert 2.0 / np.abs(turns).mean() == pytest.approx(50.0, rel=0.05)
