@@ -1,7 +1,7 @@
 """Placed frames and what belongs to them: the refiner's result and the renderer's input."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -36,6 +36,7 @@ class PlacedFrame:
     stage: Stage
     sigma_m: float
     weak: bool = False
+    _: KW_ONLY
     pose_covariance: NDArray[np.float32] | None = field(default=None, compare=False)
 
 

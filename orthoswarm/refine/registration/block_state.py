@@ -133,7 +133,7 @@ def to_solution(
             stage,
             float(sigma[i]),
             bool(weak[i]),
-            None if covariance is None else covariance[i],
+            pose_covariance=None if covariance is None else covariance[i],
         )
         for i, frame in enumerate(flight.frames)
         if i not in flight.pictures.damaged
