@@ -4,7 +4,7 @@
     ├── OrthoSwarmError                nothing could be made of valid input (exit code 1)
     │   ├── InputError                 an argument or an input file is wrong (exit code 2)
     │   │   └── UnreadableMapError     the basemap cannot be read here      raster.map_check
-    │   ├── AdjustmentError            photos of a vehicle are not connected by tie points
+    │   ├── AdjustmentError            photos of a vehicle cannot be adjusted
     │   ├── PictureError               a picture cannot be decoded          raster.picture_file
     │   ├── StorageError               a file cannot be written; the same may succeed later
     │   │   └── DiskFullError          there is no room on the disk
@@ -34,7 +34,7 @@ class InputError(OrthoSwarmError):
 
 
 class AdjustmentError(OrthoSwarmError):
-    """Photos of a vehicle are not connected by tie points: its normal equations are singular."""
+    """Photos of a vehicle cannot be adjusted: no tie points connect them, or few observations fit the result."""
 
 
 class StorageError(OrthoSwarmError):

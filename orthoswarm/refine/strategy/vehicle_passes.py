@@ -184,6 +184,9 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
 
     Args:
         flight: its adjustment is changed. surface: what is known of the ground before, None for level ground.
+
+    Raises:
+        AdjustmentError: it does not fit its observations, so it has converged to something else than the truth.
     """
     surface = surface or GroundModel()
     begun = flight.adjustment.copy()
@@ -195,7 +198,11 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
         sigma[:, 0] = flight.calibration.focal_sigma
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
         found = _relative(flight, surface)
-    return _without_wrong_heights(flight, found)
+    found = _without_wrong_heights(flight, found)
+    inliers = float((flight.adjustment.obs_weight > active().bundle.inlier_weight).mean())
+    if inliers < active().strategy.solved_inliers:
+        raise AdjustmentError(f"only {inliers:.0%} of the observations fit the adjustment")
+    return found
 
 
 def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:

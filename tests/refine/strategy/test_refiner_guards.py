@@ -8,6 +8,7 @@ import pytest
 from gcs_plugin.daemon.jobs import kernel_warmup
 from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle import height_consistency
@@ -121,6 +122,17 @@ def test_a_height_far_from_the_one_that_was_predicted_is_another_minimum(made_up
         adjust_without_map(flight)
         assert flight.calibration.trusted_height is believed
         assert (fov_deg(flight) == pytest.approx(70.0, abs=0.5)) is believed
+
+
+def test_an_adjustment_that_does_not_fit_its_observations_is_no_solution(made_up):
+    frames, _ = made_up
+    adjust_without_map(opened(frames))
+    flight = opened(frames)
+    rng = np.random.default_rng(1)
+    wrong = rng.random(len(flight.adjustment.tracks.point)) < 0.6
+    flight.adjustment.tracks.uv[wrong] += rng.uniform(-40.0, 40.0, (int(wrong.sum()), 2))
+    with pytest.raises(AdjustmentError, match="of the observations fit"):
+        adjust_without_map(flight)
 
 
 def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeypatch):
