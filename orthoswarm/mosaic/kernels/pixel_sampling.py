@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
-from orthoswarm.mosaic.kernels.render_arrays import height_at
+from orthoswarm.mosaic.kernels.render_arrays import STEP
 
 UNIT = 128
 """Sum of the weights, and number of steps of a fraction of a pixel."""
@@ -79,7 +79,8 @@ def _scaled(level, field, x, y):  # type: ignore[no-untyped-def]
 def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, picture, factor, field, weights):  # type: ignore[no-untyped-def]
     """Colour a tile's pixels of one label from a picture by bicubic interpolation; gives their number.
 
-    The projection is lattice.project, its sums over a row taken out of the loop; what the picture does not show stays.
+    The projection is render_arrays.project and the height its height_at, their sums over a row taken out of the loop.
+    What the picture does not show stays.
 
     Args:
         rgba: uint8 (T, T, 4), changed in place.
@@ -113,15 +114,23 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
     per_px, tall = 2.0 / width, (height - 1.0) / width
     m = rotation
     count = 0
+    nodes = np.empty(lattice.shape[1])  # heights along a row, at the lattice's columns
+    first, last = window[2] // STEP, min((window[3] - 1) // STEP + 2, lattice.shape[1])
     for r in range(window[0], window[1]):
+        labels, colors = label[r], rgba[r]
+        if not flat_ground:
+            node, fy = r // STEP, (r % STEP + 0.5) / STEP
+            for k in range(first, last):
+                nodes[k] = lattice[node, k] * (1.0 - fy) + lattice[node + 1, k] * fy
         dx, dy = 0.5 * gsd - position[0], (r + 0.5) * gsd - position[1]
         row_x, row_y = m[0, 0] * dx + m[0, 1] * dy, m[1, 0] * dx + m[1, 1] * dy
         row_d = m[2, 0] * dx + m[2, 1] * dy
-        for c in range(window[2], window[3]):
-            if label[r, c] != mark:
+        for c in range(np.uint32(window[2]), np.uint32(window[3])):  # unsigned: not tested for being negative
+            if labels[c] != mark:
                 continue
             if not flat_ground:
-                z = height_at(lattice, r, c)
+                at, fx = np.uint64(c // STEP), (c % STEP + 0.5) / STEP
+                z = nodes[at] * (1.0 - fx) + nodes[at + np.uint64(1)] * fx
             x, dz = c * gsd, z - position[2]
             near = 1.0 / (row_d + m[2, 0] * x + m[2, 2] * dz)
             px, py = (row_x + m[0, 0] * x + m[0, 2] * dz) * near, (row_y + m[1, 0] * x + m[1, 2] * dz) * near
@@ -152,7 +161,6 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
                 red = _scaled(red, field[0], x, y)
                 green = _scaled(green, field[1], x, y)
                 blue = _scaled(blue, field[2], x, y)
-            rgba[r, c, 0], rgba[r, c, 1], rgba[r, c, 2] = red, green, blue
-            rgba[r, c, 3] = 255
+            colors[c, 0], colors[c, 1], colors[c, 2], colors[c, 3] = red, green, blue, 255
             count += 1
     return count
