@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import time
 import zipfile
 
 import pytest
@@ -18,6 +19,7 @@ from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess,
 
 playwright = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+REFINED = "async () => (await (await fetch('/api/completions')).json()).filter((row) => 'version' in row).length"
 WORDS = "[...document.querySelectorAll('.tile .word')].map((e) => e.textContent)"
 
 
@@ -34,6 +36,14 @@ def until(page, count, condition):
         )
     except playwright.TimeoutError:
         pytest.fail(f"not {condition}: {page.evaluate(WORDS)}, {page.locator('.outcomes li').all_inner_texts()}")
+
+
+def poll_until(page, done, limit_s=600.0):
+    """Wait until something holds that the page does not show."""
+    end = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < end
+        page.wait_for_timeout(500)
 
 
 def ended_done(page, count):
@@ -138,6 +148,7 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg):
     page.screenshot(path=folder / "6-find.png")
     accessible(page)
     page.click(".find-pictures button[aria-label=Close]")
+    poll_until(page, lambda: page.evaluate(REFINED) == vehicles)
     page.click("#panel-map form button:text-is('Export')")
     link = page.locator(".files a:has-text('map.zip')")
     link.wait_for(timeout=240_000)
@@ -148,5 +159,6 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg):
     with zipfile.ZipFile(folder / "pack.zip") as archive:
         names = archive.namelist()
         page_html = archive.read("flood-map/index.html").decode()
+    assert "Not refined" not in page_html
     assert "flood-map/orthoimage.tif" in names and "flood-map/orthoimage.kmz" in names
     assert re.search(r'"finds": \[\{"name": "Collapsed roof"', page_html)

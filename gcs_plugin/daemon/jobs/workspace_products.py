@@ -81,6 +81,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
     report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
+    report["unrefined"] = _unrefined(placed, refined)
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
@@ -175,6 +176,13 @@ def _placements(
     return placed, [Rejection(f.image, why, f.vehicle, f.time_s) for f, why in left_out]
 
 
+def _unrefined(placed: list[PlacedFrame], refined: list[Solution]) -> dict[str, int]:
+    """Vehicle -> number of its pictures that no refinement has used, also none without a map."""
+    frames = (_writable(p.frame) for solution in refined for p in solution.placed)
+    used = {(frame.vehicle, frame.image) for frame in frames}
+    return dict(Counter(p.frame.vehicle for p in placed if (p.frame.vehicle, p.frame.image) not in used))
+
+
 def placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:
     """The latest placement of each frame, and the level of the ground below them, metres."""
     return _stated(_placements(task, _recorded(task), solutions)[0], solutions)
@@ -208,9 +216,7 @@ def _report(
     for stage in task.facts.get("stages", []):
         if stage["name"] == "realtime":
             stage["items"] = len(placed)
-    unrefined = Counter(p.frame.vehicle for p in placed if p.stage != "fine")
     return {
-        "unrefined": dict(unrefined),
         "frames": {"input": len(placed) + len(rejected), "used": len(placed), "rejected": len(rejected)},
         "vehicles": vehicle_rows(solutions, placed), "legs": leg_rows(solutions), "ground_z_m": level,
         "refine": "swarm" if solutions else "none", "warnings": list(dict.fromkeys(warnings)), "epsg": task.epsg,

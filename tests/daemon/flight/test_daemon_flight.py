@@ -86,6 +86,7 @@ def products_are_written(served, workspace):
         assert answer.status_code == 200
         assert len(answer.content) > 1000
     report = json.loads((workspace / "report.json").read_text())
+    assert report["unrefined"] == {}
     assert report["frames"]["used"] > 10
     assert [row["vehicle"] for row in report["completions"]] == ["v1", "v2"]
     assert any("no basemap" in text for text in report["warnings"])
