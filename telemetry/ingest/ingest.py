@@ -117,7 +117,7 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
             else:
                 where = found.scope(path)
                 tables.append((where, kind, table))
-                source = SourceInfo(path=found.name(path), kind=kind)
+                source = SourceInfo(path=found.name(path), kind=kind, counts=Counter(poses=len(table)))
                 source.findings += _table_findings(path, where, table, found)
                 result.sources.append(source)
     return sorted(tables, key=lambda entry: len(entry[0].parts))

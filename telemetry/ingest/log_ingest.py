@@ -235,7 +235,7 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     count = f"{len(pairing.pairs)} of {plural(len(photos), 'photo')}"
     text = f"{count} were paired with camera events of {log.path.name} {how}"
     if pairing.offset_s is not None:
-        text += f"; the camera's clock is {pairing.offset_s:+.1f} s off (rest {pairing.residual_s:.2f} s)"
+        text += f"; the camera's clock is {round(pairing.offset_s, 1) + 0.0:+.1f} s off (median residual {pairing.residual_s:.2f} s)"
     if pairing.by_pictures:
         text += "; where times do not tell, the pictures' own motion did"
     found = [Finding("paired", text, note=True)]

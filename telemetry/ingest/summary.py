@@ -129,7 +129,8 @@ def _ranges(**columns: Iterable[float | None]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name, values in columns.items():
         known = [v for v in values if v is not None]
-        result[name] = [round(min(known), 2), round(max(known), 2)] if known else None
+        # Adding zero makes -0.0 a plain 0.0.
+        result[name] = [round(min(known), 2) + 0.0, round(max(known), 2) + 0.0] if known else None
     return result
 
 
@@ -178,7 +179,10 @@ def _bare(found: Survey, path: Path, kind: str, findings: list[Finding]) -> dict
 def one_line(source: dict[str, Any]) -> str:
     """A source in a few words."""
     counts = [plural(count, noun) for name, noun in _NOUNS.items() if (count := source["counts"].get(name, 0))]
-    return f"{source['path']} ({source['kind']}): {', '.join(counts) or 'nothing to map'}"
+    flown = any(vehicle["length_m"] for vehicle in source["vehicles"])
+    return f"{source['path']} ({source['kind']}): {', '.join(counts) or ('a track' if flown else 'nothing to map')}"
 
 
-_NOUNS = {"frames": "picture", "sei": "SEI message", "klv": "KLV packet", "camera_events": "camera event"}
+_NOUNS = {
+    "frames": "picture", "sei": "SEI message", "klv": "KLV packet", "camera_events": "camera event", "poses": "pose",
+}  # fmt: skip

@@ -102,7 +102,7 @@ def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str)
         findings.append(
             Finding(
                 "height-missing",
-                f"{plural(missing, 'photo')} of {len(photos)} have no height above ground; "
+                f"{missing} of {plural(len(photos), 'photo')} without a height above ground; "
                 "it is estimated from the distance flown",
                 vehicle,
             )

@@ -161,7 +161,8 @@ def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         photo.height_m, photo.height_is_ground = ground, True
         photo.origin["height"] = "XMP AboveGroundAltitude"
         return
-    relative = xmp.number(found, *_RELATIVE_ALTITUDES)
+    others = sorted(name for name in found if name.endswith(":RelativeAltitude"))  # makers that follow DJI's names
+    relative = xmp.number(found, *_RELATIVE_ALTITUDES, *others)
     if relative is not None and abs(relative) < _MAX_HEIGHT_M:
         photo.height_m = relative
         photo.origin["height"] = "XMP RelativeAltitude"

@@ -135,15 +135,17 @@ _ENCODER_SETTINGS = frozenset(
         bytes.fromhex("2ca2de09b51747dbbb55a4fe7fc2fc4e"),  # x265
     }
 )
+_ENCODER_TEXTS = (b"x264", b"x265")  # some builds write their settings without a UUID
 
 
 def unknown(messages: Iterable[tuple[int, bytes]]) -> list[tuple[str, int]]:
     """UUID and payload size of each private message without a decoder; an encoder's settings are not counted."""
     found = []
     for kind, payload in messages:
-        if kind == USER_DATA_UNREGISTERED and len(payload) >= 16 and payload[:16] not in _ENCODER_SETTINGS:
+        if kind == USER_DATA_UNREGISTERED and len(payload) >= 16:
             decoder, _ = _find(kind, payload)
-            if decoder is None:
+            settings = payload[:16] in _ENCODER_SETTINGS or payload.startswith(_ENCODER_TEXTS)
+            if decoder is None and not settings:
                 found.append((payload[:16].hex(), len(payload) - 16))
     return found
 

@@ -1,50 +1,51 @@
-"""Two recordings of one sequence of exposures, matched by their times.
+"""Matches photos with camera events, two recordings of one sequence of exposures, by their times.
 
-A camera and an autopilot record the same exposures, each with its own clock and each missing some. Both are matched as
-sequences (a pair hidden Markov model with the states match, photo without event, event without photo; Durbin et al.,
-"Biological Sequence Analysis", chapter 4) under the clock offsets and drifts that their correlation proposes. The
-forward-backward algorithm, summed over all clocks, gives the probability of every pairing: a pairing that the times
-leave
-open comes out as undecided, not as the nearest event.
-
-Exposures are modelled as a Poisson process with the usual interval, so a match of residual u weighs f(u) times the
-interval,
-where f is a uniform density as wide as the camera's clock resolution (one second for EXIF without sub-seconds)
-convolved with a Gaussian of the trigger's jitter. Exposures that are missing at an end weigh less than those missing in
-between: logs begin before the first photo.
+A camera and an autopilot record the same exposures, each with its own clock and each missing some. They are matched as
+sequences (`sequence_model`) under every clock offset and drift that their correlation leaves possible. The probability
+of each pairing is summed over all of these clocks, so that a photo whose times allow several events comes out as
+undecided, not as the nearest event.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
-from orthoswarm.model.robust import mad_sigma
 from telemetry.ingest.pairing.alignment import SequenceMatch
-from telemetry.ingest.pairing.motion_chains import Chains, PictureMotion, chains_of, variants
+from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
+from telemetry.ingest.pairing.sequence_model import (
+    FIRST_JITTER_S,
+    MOST_DRIFT,
+    ClockGrid,
+    SequenceModel,
+    clock_grid,
+    forward,
+    posterior,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Clock = tuple[float, float]
+"""Offset in seconds and drift."""
 
-MOST_DRIFT = 1.2e-3
-"""Seconds a second: quartz clocks of cameras stay below 1e-4, a tenfold margin for poor ones."""
 _SAME_EXPOSURE_S = 0.12
-_MISSING_AT_END = 0.5
 _NEGLIGIBLE = 16.0
 """Natural logarithm of the odds beyond which a hypothesis is left out."""
-_CLOCK_DOUBT = 1e-3
-"""Probability of other clocks (by more than half an interval) above which each photo's is not believed."""
+_MARGIN = 0.9
+"""Of the shortest interval seen: none is expected below."""
 _COARSE_S = 0.5
 """Resolution of a clock from which on pictures tell more than times do."""
 _LEAST_AGREEMENT = 0.9
 _LEAST_MATCHED = 0.6
 """Share of photos or events with a partner; a clock that leaves more alone is not the right one."""
 _CANDIDATES = 24
-_FIRST_JITTER_S = 0.08
-_JITTERS_S = (0.02, 0.04, 0.08, 0.16)
-_MISSING = (0.01, 0.03, 0.1, 0.35)
+_MOST_WINDOWS = 64
+_WINDOW_DRIFT_S = 0.16
+"""Half width in drift of a window of clocks, as the shift of the first and last exposure."""
+_JITTERS_S = (0.02, 0.03, 0.045, 0.07, 0.1, 0.16)
+_MISSING = (0.03, 0.06, 0.12, 0.2, 0.35)
+"""Odds that are tried; not less than 0.03, since a flight without any loss does not show that there can be none."""
 _MOST_BINS = 1 << 19
 _MOST_DRIFTS = 81
 
@@ -66,37 +67,37 @@ def match_sequences(photos: Array, events: Array, motion: PictureMotion | None =
     e = events[single] - middle
     resolution = _resolution(photos)
     p = photos - photos[0] + 0.5 * resolution
-    problem = _Problem(p=p, e=e, resolution_s=resolution, interval_s=float(np.median(np.diff(e))))
-    problem, candidates = _plausible(problem)
-    if not candidates:
+    usual = float(np.median(np.diff(e)))
+    least = _least_interval(p, e, resolution)
+    model = SequenceModel(p=p, e=e, resolution_s=resolution, interval_s=usual, least_s=least)
+    model, windows = _plausible(model)
+    if not windows:
         return None
-    result = _alignment(problem, candidates, single)
+    result = _alignment(model, windows, single)
     if motion is not None and resolution >= _COARSE_S and (~_decided(result)).any():
-        chained = _chained(problem, result, motion)
-        again = None if chained is None else _alignment(chained, candidates, single)
+        chained = _chained(model, result, motion)
+        again = None if chained is None else _alignment(chained, windows, single)
         result = again if again is not None and _decides_more(again, result) else result
     return replace(result, offset_s=result.offset_s + float(photos[0]) - middle)
 
 
-def _alignment(problem: "_Problem", candidates: list[tuple[float, float]], single: Indices) -> SequenceMatch:
-    """Probabilities for events that there are; the offset is that of the problem's own origins."""
-    first, probability, offset, drift, clock_doubt = _probabilities(problem, candidates)
+def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> SequenceMatch:
+    """The match, with probabilities of existing events only; its offset is between the model's own origins."""
+    first, probability, offset, drift = _probabilities(model, windows)
     inside = np.clip(first, 0, len(single))
     shifted = np.zeros_like(probability)
     for i, (lo, at) in enumerate(zip(first.tolist(), inside.tolist(), strict=True)):
         keep = max(0, min(probability.shape[1] - (at - lo), len(single) - at))
         shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
-    if clock_doubt < _CLOCK_DOUBT:
-        shifted = _without_coincidences(problem, inside, shifted, offset, drift)
-    asked = problem.chains is not None
+    asked = model.chains is not None
     return SequenceMatch(
         events=single,
         first=inside,
         probability=shifted,
         offset_s=offset,
         drift=drift,
-        resolution_s=problem.resolution_s,
-        jitter_s=problem.jitter_s,
+        resolution_s=model.resolution_s,
+        jitter_s=model.jitter_s,
         by_pictures=asked,
     )
 
@@ -108,14 +109,14 @@ def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
-    """Whether more photos are decided than before, and as many have an event: else log and pictures disagree."""
+    """Whether more photos are decided now and hardly fewer have an event; else log and pictures disagree."""
     more = _decided(now).sum() > _decided(before).sum()
     least = _LEAST_MATCHED * min(len(now.probability), len(now.events))
     return bool(more and now.probability.sum() > max(_LEAST_AGREEMENT * before.probability.sum(), least))
 
 
-def _chained(problem: "_Problem", match: SequenceMatch, motion: PictureMotion) -> "_Problem | None":
-    """The problem with what the pictures of the undecided photos show; None where they show nothing."""
+def _chained(model: SequenceModel, match: SequenceMatch, motion: PictureMotion) -> SequenceModel | None:
+    """The model with what the pictures of the undecided photos show; None where they show nothing."""
     offset, drift = match.offset_s, match.drift
     unsure = ~_decided(match)
     steps = np.full(len(unsure) - 1, np.nan)
@@ -125,38 +126,15 @@ def _chained(problem: "_Problem", match: SequenceMatch, motion: PictureMotion) -
         steps[start:end] = motion.shifts_px(range(start, end + 1))
     path = motion.path_m[match.events]
     chains = chains_of(
-        steps, problem.p, problem.e, path_m=path, resolution_s=problem.resolution_s, offset=offset, drift=drift
+        steps, model.p, model.e, path_m=path, resolution_s=model.resolution_s, offset=offset, drift=drift
     )
     if chains is None:
         return None
-    clock = _Grid(np.array([offset]), np.array([drift]), (offset, drift), problem.resolution_s)
+    clock = ClockGrid(np.array([offset]), np.array([drift]), (offset, drift), model.resolution_s)
     # With chains far fewer photos and events have to be missing to explain the times than without.
-    scored = [replace(problem, chains=variant, missing=0.03) for variant in variants(chains)]
-    best = max(scored, key=lambda trial: float(_forward(trial, clock).evidence[0]))
-    scored = [replace(best, missing=missing) for missing in _MISSING]
-    return max(scored, key=lambda trial: float(_forward(trial, clock).evidence[0]) - _normalisation(trial))
-
-
-def _without_coincidences(
-    problem: "_Problem", first: Indices, probability: Array, offset: float, drift: float
-) -> Array:
-    """Probabilities under the condition that exposures are never closer than the camera's least interval.
-
-    The Poisson process allows a photo without event and an event without photo at the same time. Where every exposure
-    that
-    the photo's time allows lies closer to its likeliest event than the least interval, the two are the same exposure,
-    and only events compete.
-    """
-    least = float(np.quantile(np.diff(problem.e), 0.02))
-    rows = np.arange(len(problem.p))
-    best = np.argmax(probability, axis=1)
-    expected = offset + (1.0 + drift) * problem.e[np.clip(first + best, 0, len(problem.e) - 1)]
-    # With pictures legs are placed one by one, under a clock of whole seconds that is known to half a second only.
-    clock_s = 0.5 * problem.resolution_s if problem.chains is not None else 0.0
-    farthest = np.abs(problem.p - expected) + 0.6 * problem.resolution_s + 3.0 * problem.jitter_s + clock_s
-    total = probability.sum(axis=1)
-    alone = (farthest < least) & (probability[rows, best] > 1e-4)
-    return np.where(alone[:, None], probability / np.maximum(total, 1e-300)[:, None], probability)
+    scored = [replace(model, chains=variant, no_event=0.03, no_photo=0.03) for variant in variants(chains)]
+    best = max(scored, key=lambda trial: float(forward(trial, clock).evidence[0]))
+    return _with_odds(best, clock)
 
 
 def _single_events(events: Array) -> Indices:
@@ -164,6 +142,15 @@ def _single_events(events: Array) -> Indices:
     steps = np.diff(events)
     usual = float(np.median(steps[steps > 0.01])) if (steps > 0.01).any() else 1.0
     return np.flatnonzero(np.concatenate([[True], steps > min(_SAME_EXPOSURE_S, 0.35 * usual)]))
+
+
+def _least_interval(photos: Array, events: Array, resolution: float) -> float:
+    """Time between exposures in seconds that hardly any two of them go below."""
+    least = float(np.quantile(np.diff(events), 0.02))
+    if resolution < 0.05:
+        return _MARGIN * min(least, float(np.quantile(np.diff(photos), 0.02)))
+    together = int(np.unique(np.round(photos / resolution), return_counts=True)[1].max())
+    return _MARGIN * (min(least, resolution / (together - 1)) if together > 1 else least)
 
 
 def _resolution(times: Array) -> float:
@@ -174,105 +161,16 @@ def _resolution(times: Array) -> float:
     return 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Problem:
-    """Times of photos and events, each relative to its own origin, and the model's parameters.
-
-    Attributes:
-        p: (N,) middle of each photo's interval. e: (M,) from the middle of the events.
-        resolution_s: width of a photo's interval. interval_s: time between exposures that matches are weighed with.
-        jitter_s: one sigma. missing: odds of one exposure missing from one of the recordings.
-        chains: what the pictures show, None where they were not asked.
-    """
-
-    p: Array
-    e: Array
-    resolution_s: float
-    interval_s: float
-    jitter_s: float = _FIRST_JITTER_S
-    missing: float = 0.1
-    chains: Chains | None = None
-
-    @property
-    def hypotheses(self) -> int:
-        """Hypotheses C about each chain of photos."""
-        return 1 if self.chains is None else len(self.chains.scales)
-
-    def weights(self, i: int, first: int, width: int, offset: Array, drift: Array) -> Array:
-        """(H C, width) weight of photo i being the event `first` and those after it, by clock and hypothesis."""
-        at = np.arange(first, first + width)
-        inside = (at >= 0) & (at < len(self.e))
-        e = self.e[np.clip(at, 0, len(self.e) - 1)]
-        u = self.p[i] - offset[:, None] - (1.0 + drift[:, None]) * e
-        q, sigma = self.resolution_s, self.jitter_s
-        if q >= 0.05:
-            density = (ndtr((u + 0.5 * q) / sigma) - ndtr((u - 0.5 * q) / sigma)) / q
-        else:
-            density = np.exp(-0.5 * (u / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi))
-        weights = np.asarray(np.where(inside, self.interval_s * density, 0.0))
-        if self.chains is None:
-            return weights
-        factors = self.chains.factors(i, first, width, offset, drift)
-        return np.asarray((weights[:, None, :] * factors).reshape(-1, width))
-
-    def alone(self, i: int, offset: Array, drift: Array) -> Array:
-        """(H C, 1) weight of photo i having no event."""
-        if self.chains is None:
-            return np.full((len(offset), 1), self.missing)
-        return self.missing * self.chains.alone(i, offset, drift).reshape(-1, 1)
-
-    def regular(self) -> "_Problem":
-        """The same problem for exposures at intervals as even as these.
-
-        At even intervals a clock that is off by whole intervals aligns photos with events, too, so that a coincidence
-        counts only by the variation of the intervals, not by a full interval.
-        """
-        steps = np.diff(self.e)
-        spread = mad_sigma(steps - np.median(steps))
-        widest = max(self.resolution_s, float(np.sqrt(2.0 * np.pi)) * max(self.jitter_s, spread))
-        return replace(self, interval_s=min(self.interval_s, widest))
-
-
-@dataclass(frozen=True, slots=True)
-class _Grid:
-    """Clocks around a given one: offsets (H,) in seconds and drifts (H,); half widths bound the band of events."""
-
-    offset: Array
-    drift: Array
-    centre: tuple[float, float]
-    reach_s: float
-
-    def band(self, problem: _Problem) -> tuple[Indices, int]:
-        """First event of each photo's band, and the width of all bands."""
-        expected = self.centre[0] + (1.0 + self.centre[1]) * problem.e
-        reach = self.reach_s + 0.5 * problem.resolution_s + 4.5 * problem.jitter_s
-        first = np.searchsorted(expected, problem.p - reach)
-        last = np.searchsorted(expected, problem.p + reach)
-        return first, max(1, int((last - first).max()))
-
-
-def _grid(problem: _Problem, offset: float, drift: float, reach_s: float, drift_reach_s: float) -> _Grid:
-    """A grid as fine as the jitter: offsets within reach_s, drifts that move the ends by up to drift_reach_s."""
-    step = 0.8 * max(problem.jitter_s, 0.04 * problem.resolution_s)
-    half = max(0.5 * float(np.ptp(problem.e)), 1e-3)
-    offsets = offset + step * np.arange(-np.ceil(reach_s / step), np.ceil(reach_s / step) + 1)
-    count = np.ceil(drift_reach_s / (2.0 * step))
-    drifts = drift + 2.0 * step / half * np.arange(-count, count + 1)
-    drifts = np.unique(np.clip(drifts, -MOST_DRIFT, MOST_DRIFT))
-    both = np.meshgrid(offsets, drifts, indexing="ij")
-    return _Grid(both[0].ravel(), both[1].ravel(), (offset, drift), reach_s + drift_reach_s + 2.0 * step)
-
-
-def _correlation_peaks(problem: _Problem) -> Iterator[tuple[float, float]]:
+def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
     """Offsets and drifts under which most photos fall on events, the best first."""
-    p, e = problem.p, problem.e
+    p, e = model.p, model.e
     span = float(np.ptp(p) + np.ptp(e)) * (1.0 + MOST_DRIFT) + 4.0
-    bin_s = max(0.25 if problem.resolution_s >= 0.5 else 0.1, span / _MOST_BINS)
+    bin_s = max(0.25 if model.resolution_s >= 0.5 else 0.1, span / _MOST_BINS)
     size = 1 << int(np.ceil(np.log2(span / bin_s + 16)))
     half = max(0.5 * float(np.ptp(e)), 1e-3)
     count = min(int(np.ceil(MOST_DRIFT * half / bin_s)), _MOST_DRIFTS // 2)
     drifts = np.linspace(-MOST_DRIFT, MOST_DRIFT, 2 * count + 1) if count else np.zeros(1)
-    photos = np.fft.rfft(_train(p - p[0], bin_s, size, problem.resolution_s))
+    photos = np.fft.rfft(_train(p - p[0], bin_s, size, model.resolution_s))
     best, drift_at = np.full(size, -np.inf), np.zeros(size)
     for drift in drifts:
         own = (1.0 + drift) * (e - e[0])
@@ -280,7 +178,7 @@ def _correlation_peaks(problem: _Problem) -> Iterator[tuple[float, float]]:
         # The lag is between the first event and the first photo; offsets count from the middle of the events.
         better = together > best
         best[better], drift_at[better] = together[better], drift
-    apart = max(1, round(_reach_s(problem) / bin_s))
+    apart = max(1, round(_reach_s(model) / bin_s))
     for _ in range(_CANDIDATES):
         lag = int(np.argmax(best))
         if not np.isfinite(best[lag]) or best[lag] < 0.25:
@@ -291,9 +189,9 @@ def _correlation_peaks(problem: _Problem) -> Iterator[tuple[float, float]]:
         best[np.arange(lag - apart, lag + apart + 1) % size] = -np.inf
 
 
-def _reach_s(problem: _Problem) -> float:
+def _reach_s(model: SequenceModel) -> float:
     """How far around a peak of the correlation clocks are tried."""
-    return 0.8 if problem.resolution_s >= 0.5 else 0.25
+    return 0.8 if model.resolution_s >= 0.5 else 0.25
 
 
 def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
@@ -308,122 +206,79 @@ def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
     return train
 
 
-def _plausible(problem: _Problem) -> tuple[_Problem, list[tuple[float, float]]]:
-    """The model's parameters for the best clock, and the clocks that are still possible."""
-    tried: list[tuple[float, float, float]] = []
-    bin_s = 0.25 if problem.resolution_s >= 0.5 else 0.1
-    for offset, drift in _correlation_peaks(problem):
-        grid = _grid(problem, offset, drift, _reach_s(problem), bin_s)
-        evidence = _forward(problem, grid).evidence
-        at = int(np.argmax(evidence))
-        tried.append((float(evidence[at]), float(grid.offset[at]), float(grid.drift[at])))
-    tried.sort(reverse=True)
-    if not tried or not np.isfinite(tried[0][0]):
-        return problem, []
-    problem = _fitted(problem, tried[0][1], tried[0][2]).regular()
+def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
+    """The model's parameters for the best clock, and centres of windows that hold all clocks still possible."""
+    bin_s = 0.25 if model.resolution_s >= 0.5 else 0.1
+    grids = [clock_grid(model, *peak, _reach_s(model), bin_s) for peak in _correlation_peaks(model)]
+    if not grids:
+        return model, []
+    evidence = np.concatenate([forward(model, grid).evidence for grid in grids])
+    clocks = np.stack([np.concatenate([grid.offset for grid in grids]), np.concatenate([grid.drift for grid in grids])])
+    best = int(np.argmax(evidence))
+    if not np.isfinite(evidence[best]):
+        return model, []
     # The first parameters are guesses: exclude only what they make impossible.
-    return problem, [(o, d) for value, o, d in tried if value > tried[0][0] - 3.0 * _NEGLIGIBLE]
+    possible = evidence > evidence[best] - 3.0 * _NEGLIGIBLE
+    order = np.argsort(-evidence, kind="stable")
+    clocks = clocks[:, order[possible[order]]]
+    model = _fitted(model, *clocks[:, 0].tolist()).regular()
+    windows: list[Clock] = []
+    while clocks.shape[1] and len(windows) < _MOST_WINDOWS:
+        windows.append((float(clocks[0, 0]), float(clocks[1, 0])))
+        clocks = clocks[:, ~_inside(model, windows[-1], clocks[0], clocks[1], share=0.75)]
+    return model, windows
 
 
-def _fitted(problem: _Problem, offset: float, drift: float) -> _Problem:
-    """Jitter and share of missing exposures with the most evidence."""
-    best: tuple[float, _Problem] | None = None
+def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
+    """A fine grid of clocks around one."""
+    return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
+
+
+def _inside(
+    model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0
+) -> NDArray[np.bool_]:
+    """Which clocks lie in a share of the window around one."""
+    half = max(0.5 * float(np.ptp(model.e)), 1e-3)
+    reach = share * (2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model))
+    apart = half * np.abs(drift - centre[1])
+    return np.asarray((np.abs(offset - centre[0]) <= reach) & (apart <= share * _WINDOW_DRIFT_S))
+
+
+def _fitted(model: SequenceModel, offset: float, drift: float) -> SequenceModel:
+    """Jitter and shares of missing exposures with the most evidence."""
+    trials = []
     for jitter in _JITTERS_S:
-        trial = replace(problem, jitter_s=jitter)
-        for missing in _MISSING:
-            trial = replace(trial, missing=missing)
-            grid = _grid(trial, offset, drift, 2.0 * _FIRST_JITTER_S, 2.0 * _FIRST_JITTER_S)
-            evidence = float(_forward(trial, grid).evidence.max())
-            evidence -= _normalisation(trial)
-            if best is None or evidence > best[0]:
-                best = evidence, trial
-    assert best is not None
-    return best[1]
+        trial = replace(model, jitter_s=jitter)
+        grid = clock_grid(trial, offset, drift, 2.0 * FIRST_JITTER_S, 2.0 * FIRST_JITTER_S)
+        trials += [(replace(trial, no_event=odds, no_photo=odds), grid) for odds in _MISSING[::2]]
+    return _with_odds(*max(trials, key=lambda trial: _normalised(*trial)))
 
 
-def _normalisation(problem: _Problem) -> float:
-    """Normalisation of the model's weights, to compare evidence for different shares of missing exposures."""
-    return (len(problem.p) + len(problem.e)) * float(np.log1p(problem.missing))
+def _with_odds(model: SequenceModel, grid: ClockGrid) -> SequenceModel:
+    """The odds of missing events and missing photos with the most evidence, one after the other."""
+    for name in ("no_event", "no_photo", "no_event"):
+        trials = [replace(model, **{name: odds}) for odds in _MISSING]
+        model = max(trials, key=lambda trial: _normalised(trial, grid))
+    return model
 
 
-_Found = tuple[Indices, Array, float, float, float]
+def _normalised(model: SequenceModel, grid: ClockGrid) -> float:
+    """Logarithm of the evidence for the best clock, comparable between different odds of missing exposures."""
+    weights = len(model.p) * np.log1p(model.no_event) + len(model.e) * np.log1p(model.no_photo)
+    return float(forward(model, grid).evidence.max() - weights)
 
 
-@dataclass(slots=True)
-class _Forward:
-    """Sums over all alignments that end with a match.
-
-    Attributes:
-        evidence: (H,) logarithm of the sum over all alignments.
-        rows: (N, H C, B) each divided by the exponential of scales (N, H C); empty unless asked for.
-    """
-
-    evidence: Array
-    rows: Array
-    scales: Array
-
-
-def _forward(problem: _Problem, grid: _Grid, *, backward: bool = False, keep: bool = False) -> _Forward:
-    """The forward algorithm over the photos, or from the last one back.
-
-    With m the weight of a match, s that of a missing exposure and t that of one missing at an end,
-
-        F[i, j] = m[i, j] (t^(i + j) + G[i - 1, j - 1]),    G[i, j] = sum over i' <= i, j' <= j of F s^(i - i' + j - j')
-    """
-    first, width = grid.band(problem)
-    count, total, clocks = len(problem.p), len(problem.e), len(grid.offset) * problem.hypotheses
-    s, log_t = problem.missing, float(np.log(_MISSING_AT_END))
-    columns = np.arange(width + 1)
-    decay = np.tril(s ** np.maximum(columns[1:, None] - columns[None, 1:], 0).astype(np.float64)).T
-    sums, scale = np.zeros((clocks, width + 1)), np.zeros(clocks)
-    evidence = np.full(clocks, -np.inf)
-    rows = np.zeros((count, clocks, width)) if keep else np.zeros((0, 0, 0))
-    scales = np.zeros((count, clocks)) if keep else np.zeros((0, 0))
-    before: int | None = None
-    for step in range(count):
-        i = count - 1 - step if backward else step
-        weight = problem.weights(i, int(first[i]), width, grid.offset, grid.drift)
-        lo = int(first[i])
-        chains = problem.chains
-        if chains is not None and step and (chains.ends(i) if backward else chains.starts(i)):
-            sums, scale = _over_hypotheses(sums, scale, problem.hypotheses)
-        if backward:
-            weight, lo = weight[:, ::-1], total - lo - width
-        if before is not None and lo != before:
-            at = columns + (lo - before)
-            sums = sums[:, np.minimum(at, width)] * s ** np.maximum(at - width, 0)
-        before = lo
-        leads = np.exp(np.clip(log_t * (step + np.maximum(lo + columns[:-1], 0)) - scale[:, None], -700.0, 700.0))
-        found = weight * (leads + sums[:, :-1])
-        sums = problem.alone(i, grid.offset, grid.drift) * sums
-        sums[:, 1:] += found @ decay
-        after = log_t * (count - 1 - step + np.maximum(total - 1 - lo - columns[:-1], 0))
-        top = after.max()
-        with np.errstate(divide="ignore"):
-            evidence = np.logaddexp(evidence, np.log(found @ np.exp(after - top)) + top + scale)
-        if keep:
-            rows[i], scales[i] = (found[:, ::-1] if backward else found), scale
-        largest = np.maximum(sums.max(axis=1), leads[:, 0])
-        sums /= largest[:, None]
-        scale += np.log(largest)
-    evidence = np.logaddexp.reduce(evidence.reshape(-1, problem.hypotheses), axis=1) - np.log(problem.hypotheses)
-    return _Forward(evidence, rows, scales)
-
-
-def _over_hypotheses(sums: Array, scale: Array, count: int) -> tuple[Array, Array]:
-    """Sums and their scales where a chain of photos ends: the mean over its hypotheses stands for all of the next."""
-    top = scale.reshape(-1, count).max(axis=1, keepdims=True)
-    shares = np.exp(scale.reshape(-1, count) - top) / count
-    mean = np.einsum("hc,hcb->hb", shares, sums.reshape(len(top), count, -1))
-    return np.repeat(mean, count, axis=0), np.repeat(top.ravel(), count)
-
-
-def _probabilities(problem: _Problem, candidates: list[tuple[float, float]]) -> _Found:
-    """First event and probabilities of each photo's band; the most likely offset and drift, and their doubt."""
+def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices, Array, float, float]:
+    """(N,) first event and (N, B) probabilities of each photo's events; the most likely offset and drift."""
     scored = []
-    for offset, drift in candidates:
-        grid = _grid(problem, offset, drift, 2.0 * _FIRST_JITTER_S + 0.3 * _reach_s(problem), 0.16)
-        scored.append((grid, _forward(problem, grid).evidence))
+    for number, centre in enumerate(windows):
+        grid = _window(model, centre)
+        fresh = np.ones(len(grid.offset), dtype=bool)
+        for other in windows[:number]:
+            fresh &= ~_inside(model, other, grid.offset, grid.drift)
+        if fresh.any():
+            grid = replace(grid, offset=grid.offset[fresh], drift=grid.drift[fresh])
+            scored.append((grid, forward(model, grid).evidence))
     most = max(float(evidence.max()) for _, evidence in scored)
     total = np.logaddexp.reduce(np.concatenate([evidence for _, evidence in scored]))
     parts: list[tuple[Indices, Array]] = []
@@ -431,35 +286,13 @@ def _probabilities(problem: _Problem, candidates: list[tuple[float, float]]) -> 
         chosen = np.flatnonzero(evidence > most - _NEGLIGIBLE)
         if len(chosen):
             some = replace(grid, offset=grid.offset[chosen], drift=grid.drift[chosen])
-            parts.append((some.band(problem)[0], _posterior(problem, some, float(total))))
+            parts.append((some.band(model)[0], posterior(model, some, float(total))))
     best, values = max(scored, key=lambda row: float(row[1].max()))
     at = int(np.argmax(values))
     first = np.min([lo for lo, _ in parts], axis=0)
     width = max(int((lo + part.shape[1] - first).max()) for lo, part in parts)
-    joined = np.zeros((len(problem.p), width))
+    joined = np.zeros((len(model.p), width))
     for lo, part in parts:
         for i, shift in enumerate((lo - first).tolist()):
             joined[i, shift : shift + part.shape[1]] += part[i]
-    offset, drift, doubt = float(best.offset[at]), float(best.drift[at]), 0.0
-    half, usual = 0.5 * float(np.ptp(problem.e)), float(np.median(np.diff(problem.e)))
-    for grid, evidence in scored:
-        moved = np.abs(grid.offset - offset) + half * np.abs(grid.drift - drift)
-        doubt += float(np.exp(evidence - total)[moved > 0.6 * usual].sum())
-    return first, joined, offset, drift, doubt
-
-
-def _posterior(problem: _Problem, grid: _Grid, total: float) -> Array:
-    """(N, B) probability of each photo and event, summed over the clocks of a grid."""
-    first, width = grid.band(problem)
-    result = np.zeros((len(problem.p), width))
-    most = max(1, 4_000_000 // max(1, len(problem.p) * width * problem.hypotheses))
-    for start in range(0, len(grid.offset), most):
-        part = replace(grid, offset=grid.offset[start : start + most], drift=grid.drift[start : start + most])
-        ahead, back = _forward(problem, part, keep=True), _forward(problem, part, backward=True, keep=True)
-        for i in range(len(problem.p)):
-            weight = problem.weights(i, int(first[i]), width, part.offset, part.drift)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                both = np.log(ahead.rows[i]) + np.log(back.rows[i]) - np.log(weight)
-                both += (ahead.scales[i] + back.scales[i] - total - np.log(problem.hypotheses))[:, None]
-                result[i] += np.where(weight > 0.0, np.exp(np.minimum(both, 0.0)), 0.0).sum(axis=0)
-    return result
+    return first, joined, float(best.offset[at]), float(best.drift[at])

@@ -15,7 +15,7 @@ can = pytest.importorskip("can")
 pytest.importorskip("dronecan")
 
 from telemetry.live.dronecan_bus import CanSource, open_bus  # noqa: E402
-from tests.kit.can_node import CanNode, attitude, camera_down, fix, fix2  # noqa: E402
+from tests.kit.can_node import GROUP, CanNode, attitude, camera_down, fix, fix2  # noqa: E402
 
 T0 = 1_700_000_000.0
 
@@ -76,8 +76,8 @@ def test_fixes_come_over_udp_multicast_between_foreign_packets():
     number = 0
     source, stop, node = CanSource(poses, clock=lambda: T0 + number / 10), threading.Event(), CanNode()
     try:  # packets stay on this machine
-        out = can.Bus(interface="udp_multicast", channel="239.74.163.2", hop_limit=0)
-        thread = threading.Thread(target=source.run, args=("udp_multicast:239.74.163.2", stop))
+        out = can.Bus(interface="udp_multicast", channel=GROUP, hop_limit=0)
+        thread = threading.Thread(target=source.run, args=(f"udp_multicast:{GROUP}", stop))
         thread.start()
     except (OSError, can.CanError) as error:
         pytest.skip(f"no multicast here: {error}")
@@ -86,7 +86,7 @@ def test_fixes_come_over_udp_multicast_between_foreign_packets():
         node.send(out, fix_at(number))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-            stranger.sendto(b"no CAN frame", ("239.74.163.2", 43113))
+            stranger.sendto(b"no CAN frame", (GROUP, 43113))
         time.sleep(0.02)
         number += 1
     stop.set()

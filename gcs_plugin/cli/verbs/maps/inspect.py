@@ -76,7 +76,7 @@ def _tell(document: dict[str, Any]) -> None:
             for v in source["vehicles"]:
                 if v.get("fields"):
                     console.print(
-                        f"  {escape(v['id'])}: " + "; ".join(f"{k} from {escape(s)}" for k, s in v["fields"].items()),
+                        f"  {escape(v['id'])}: " + "; ".join(f"{_field(k)} from {escape(s)}" for k, s in v["fields"].items()),
                         style="dim",
                     )
         for finding in source["findings"]:
@@ -92,11 +92,16 @@ def _tell(document: dict[str, Any]) -> None:
         console.print(f"[yellow]![/yellow] {escape(finding['message'])}")
 
 
+def _field(name: str) -> str:
+    return "field of view" if name == "fov_hint" else name.replace("_", " ")
+
+
 def _range(pair: list[float] | None, unit: str) -> str:
     if pair is None:
         return "?"
     low, high = pair
-    return f"{low:.0f}{unit}" if high - low < 0.5 else f"{low:.0f} to {high:.0f}{unit}"
+    low, high = round(low) + 0, round(high) + 0
+    return f"{low}{unit}" if low == high else f"{low} to {high}{unit}"
 
 
 Row = tuple[float, float, float | None]
