@@ -1,6 +1,6 @@
 """Mutated files through every reader: python -m benchmarks.robustness.reader_fuzz [--inputs N] [--only READER].
 
-Each reader runs in a process of its own with limits of memory and of processor seconds that hold inside C code, too:
+Each reader runs in a process of its own with limits of memory, processor seconds and time that hold inside C code, too:
 a reader that exceeds them ends its process and counts as a failure. Prints, for each reader, inputs, exceptions other
 than the reader's own, and microseconds an input. Exit code 1 if there was any failure.
 """
@@ -22,6 +22,8 @@ from telemetry.samples.unreadable import Unreadable
 _MEMORY = 3 << 30
 _SECONDS_AN_INPUT = 0.05
 _LEAST_SECONDS = 600
+_WAITING = 20
+"""Seconds of time for each second of processor time: a reader that waits for itself uses none."""
 Reader = Callable[[bytes, Path], Any]
 
 
@@ -133,7 +135,7 @@ def _feed(name: str, inputs: int, seed: int, result: Any) -> None:
     """Feed one reader within limits; sends inputs done, failures, one failure as text and seconds."""
     from tests.telemetry.formats.test_reader_fuzz import mutated
 
-    seconds = max(_LEAST_SECONDS, int(inputs * _SECONDS_AN_INPUT))
+    seconds = _seconds(inputs)
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     seeds, read = _seeds()[name]
@@ -152,6 +154,10 @@ def _feed(name: str, inputs: int, seed: int, result: Any) -> None:
     result.send((inputs, failures, example, time.process_time() - start))
 
 
+def _seconds(inputs: int) -> int:
+    return max(_LEAST_SECONDS, int(inputs * _SECONDS_AN_INPUT))
+
+
 def main() -> int:
     """Feed every reader."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -167,6 +173,8 @@ def main() -> int:
         process.start()
         there.close()
         try:
+            if not here.poll(_WAITING * _seconds(args.inputs)):
+                process.kill()
             inputs, failures, example, seconds = here.recv()
             print(f"{name:12} {inputs:7,} {failures:11} {1e6 * seconds / inputs:13.0f}   {example}", flush=True)
         except EOFError:

@@ -149,7 +149,7 @@ def _least_interval(photos: Array, events: Array, resolution: float) -> float:
     least = float(np.quantile(np.diff(events), 0.02))
     if resolution < 0.05:
         return _MARGIN * min(least, float(np.quantile(np.diff(photos), 0.02)))
-    together = int(np.unique(np.round(photos / resolution), return_counts=True)[1].max())
+    together = int(np.unique(np.floor(photos / resolution), return_counts=True)[1].max())
     return _MARGIN * (min(least, resolution / (together - 1)) if together > 1 else least)
 
 

@@ -62,13 +62,17 @@ def exposures(
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Photos whose exposure has an event too; those paired without a mark, and how many of these wrongly."""
+    """Photos whose exposure has an event too; those paired without a mark, and how many of these wrongly.
+
+    `photos` are the indices of those without a mark.
+    """
 
     both: int
     decided: int
     wrong_unmarked: int
     marked: int
     wrong_marked: int
+    photos: frozenset[int]
 
 
 def scored(flown: Exposures, motion: PictureMotion | None = None) -> Score:
@@ -78,7 +82,7 @@ def scored(flown: Exposures, motion: PictureMotion | None = None) -> Score:
     marked = [(i, j) for i, j in found.pairs if i in found.doubtful]
     both = len(np.intersect1d(flown.of_photo, flown.of_event))
     wrong, uncertain = (sum(flown.of_photo[i] != flown.of_event[j] for i, j in some) for some in (decided, marked))
-    return Score(both, len(decided), int(wrong), len(marked), int(uncertain))
+    return Score(both, len(decided), int(wrong), len(marked), int(uncertain), frozenset(i for i, _ in decided))
 
 
 def ground_of(path: Path) -> NDArray[np.uint8]:

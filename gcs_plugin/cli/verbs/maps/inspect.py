@@ -76,7 +76,8 @@ def _tell(document: dict[str, Any]) -> None:
             for v in source["vehicles"]:
                 if v.get("fields"):
                     console.print(
-                        f"  {escape(v['id'])}: " + "; ".join(f"{_field(k)} from {escape(s)}" for k, s in v["fields"].items()),
+                        f"  {escape(v['id'])}: "
+                        + "; ".join(f"{_field(k)} from {escape(s)}" for k, s in v["fields"].items()),
                         style="dim",
                     )
         for finding in source["findings"]:
