@@ -235,7 +235,8 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     count = f"{len(pairing.pairs)} of {plural(len(photos), 'photo')}"
     text = f"{count} were paired with camera events of {log.path.name} {how}"
     if pairing.offset_s is not None:
-        text += f"; the camera's clock is {round(pairing.offset_s, 1) + 0.0:+.1f} s off (median residual {pairing.residual_s:.2f} s)"
+        offset_s = round(pairing.offset_s, 1) + 0.0  # no "-0.0"
+        text += f"; the camera's clock is {offset_s:+.1f} s off (median residual {pairing.residual_s:.2f} s)"
     if pairing.by_pictures:
         text += "; where times do not tell, the pictures' own motion did"
     found = [Finding("paired", text, note=True)]

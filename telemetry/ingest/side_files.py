@@ -51,7 +51,10 @@ def read_control_points(path: Path) -> ControlPoints | None:
 
 def control_point_findings(path: Path, points: ControlPoints, widths: Collection[int]) -> list[Finding]:
     """Findings on control points, given the widths of the pictures near them."""
-    text = f"{path.name} holds {points.points} ground control points in {points.rows} pictures; mosaic uses them where the file is given with --control"
+    text = (
+        f"{path.name} holds {points.points} ground control points in {points.rows} pictures; mosaic uses them where "
+        "the file is given with --control"
+    )
     found = [Finding("control-points", text, note=True)]
     width = max(widths, default=0)
     if width and points.widest > 1.05 * width:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import dronecan
 from dronecan.transport import Transfer
 
-
 # One for each process: tests that run at the same time do not hear each other.
 GROUP = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
 

@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-CERTAIN = 0.999
-"""Probability from which on a pairing counts as decided."""
-CERTAIN_BY_PICTURES = 1.0 - 1e-4
-"""The same where pictures were asked: whole legs depend on which few exposures are missing, and losses are no dice."""
+CERTAIN = 1.0 - 1e-4
+"""Probability from which on a pairing counts as decided: the model's odds of losses are estimates."""
 _LEAST_PROBABILITY = 0.02
 
 
@@ -36,11 +34,6 @@ class SequenceMatch:
     resolution_s: float
     jitter_s: float
     by_pictures: bool = False
-
-    @property
-    def certain(self) -> float:
-        """Probability from which on a pairing counts as decided."""
-        return CERTAIN_BY_PICTURES if self.by_pictures else CERTAIN
 
     def pairs(self) -> list[tuple[int, int, float]]:
         """The alignment with the most expected matches: photo, event (both increasing) and probability.

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.pairing.alignment import SequenceMatch
+from telemetry.ingest.pairing.alignment import CERTAIN, SequenceMatch
 from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
 from telemetry.ingest.pairing.sequence_model import (
     FIRST_JITTER_S,
@@ -105,7 +105,7 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
     """(N,) whether a photo's event is certain, or that it has none."""
     likeliest = match.probability.max(axis=1, initial=0.0)
-    return np.asarray((likeliest >= match.certain) | (match.probability.sum(axis=1) <= 1.0 - match.certain))
+    return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:

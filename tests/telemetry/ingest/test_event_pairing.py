@@ -48,7 +48,7 @@ def test_photos_find_their_events_under_any_clock(seed, count, offset, dropped, 
     assert all(kept[i] == j for i, j in certain)
     if not found.ambiguous:
         assert found.offset_s == pytest.approx(offset, abs=0.6)
-    if not whole:
+    if not whole and len(kept) >= 12:  # a handful may fit elsewhere, too, if as many were lost
         assert len(certain) >= 0.95 * len(kept)
 
 
