@@ -6,7 +6,7 @@ of each pairing is summed over all of these clocks, so that a photo whose times 
 undecided, not as the nearest event.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -256,10 +256,13 @@ def _fitted(model: SequenceModel, offset: float, drift: float) -> SequenceModel:
 
 def _with_odds(model: SequenceModel, grid: ClockGrid) -> SequenceModel:
     """The odds of missing events and missing photos with the most evidence, one after the other."""
-    for name in ("no_event", "no_photo", "no_event"):
-        trials = [replace(model, **{name: odds}) for odds in _MISSING]
-        model = max(trials, key=lambda trial: _normalised(trial, grid))
-    return model
+
+    def best(trials: Iterable[SequenceModel]) -> SequenceModel:
+        return max(trials, key=lambda trial: _normalised(trial, grid))
+
+    model = best(replace(model, no_event=odds) for odds in _MISSING)
+    model = best(replace(model, no_photo=odds) for odds in _MISSING)
+    return best(replace(model, no_event=odds) for odds in _MISSING)
 
 
 def _normalised(model: SequenceModel, grid: ClockGrid) -> float:

@@ -89,7 +89,7 @@ class SequenceModel:
         room = np.maximum(room, _FALSE_TIME)
         if self.chains is None:
             return np.asarray(room)
-        return np.minimum(room[:, None], self.chains.alone(i, offset, drift)).ravel()
+        return np.asarray(np.minimum(room[:, None], self.chains.alone(i, offset, drift)).ravel())
 
     def _near(self, i: int, reach_s: float, offset: Array, drift: Array) -> slice:
         """Events within reach of a photo under any of the clocks."""
