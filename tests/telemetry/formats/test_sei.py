@@ -263,3 +263,10 @@ def test_extradata_tells_the_length_prefix():
     assert StreamFormat.of("hevc", b"\x01" + b"\0" * 20 + b"\xff" + b"\0") == StreamFormat("hevc", 4)
     assert StreamFormat.of("hevc", None) == StreamFormat("hevc", 0)
     assert StreamFormat.of("mpeg2video", b"") is None
+
+
+@pytest.mark.parametrize("start", [bytes.fromhex("2ca2de09b51747dbbb55a4fe7fc2fc4e"), b""], ids=["UUID", "no UUID"])
+def test_the_settings_of_an_encoder_are_no_message_of_a_maker(start):
+    settings_text = start + b"x265 (build 192) - 3.5+1: H.265/HEVC codec, options: bitdepth=8"
+    assert sei.unknown([(5, settings_text)]) == []
+    assert sei.unknown([(5, bytes(16) + b"12")]) == [("00" * 16, 2)]

@@ -56,6 +56,12 @@ def gps_exif(
     return tags.tobytes()
 
 
+def test_the_height_of_makers_that_follow_djis_names_is_read(tmp_path):
+    packet = b'<x:xmpmeta><a teal:GimbalPitchDegree="-70" teal:RelativeAltitude="60"/></x:xmpmeta>'
+    photo = read_photo(jpeg(tmp_path / "a.jpg", xmp_packet=packet, exif_bytes=gps_exif(make="Teal")))
+    assert (photo.height_m, photo.origin["height"]) == (60.0, "XMP RelativeAltitude")
+
+
 def test_the_lens_of_a_skydio_is_read(tmp_path):
     packet = (
         b'<x:xmpmeta><drone-skydio:CalibratedFocalLength drone-skydio:X="3046.6" drone-skydio:Y="3046.6"/>'
