@@ -165,7 +165,10 @@ class Daemon:
             self.takeoffs = Takeoffs(self.links, self.plans, self._say)
             self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
             EventRequests(self.links.fleet)
-            self.picture_requests = make_picture_requests(self, self.links)
+            self.picture_requests = make_picture_requests(
+                self.links, settings, journal=self.journal, poses=self.poses, events=self.events,
+                missing=lambda: self.coverage.document["missing_pictures"], add_picture=self.add_picture,
+            )  # fmt: skip
             if settings.dem is not None:
                 self.terrain = TerrainData(settings.dem, self.links.fleet)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)

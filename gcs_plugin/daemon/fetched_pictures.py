@@ -1,35 +1,51 @@
 """Pictures read from vehicles become pictures of the workspace, with the pose of their camera event."""
 
 import json
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.daemon.coverage.file_numbers import PictureNames
 from gcs_plugin.daemon.coverage.picture_requests import PictureRequests, WantedPicture, wanted_pictures
 from gcs_plugin.daemon.intake.pose_relay import linked_pose
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.model.errors import InputError
+from telemetry.live.live_poses import Poses
 
 if TYPE_CHECKING:
-    from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.vehicles import VehicleLinks
 
 _EVENT: str = "camera event"
 
 
-def make_picture_requests(daemon: "Daemon", links: "VehicleLinks") -> PictureRequests:
-    """The daemon's requests for pictures, to be started."""
-    journal = daemon.journal
+def make_picture_requests(
+    links: "VehicleLinks",
+    settings: Settings,
+    *,
+    journal: Journal,
+    poses: Poses,
+    events: Events,
+    missing: Callable[[], list[dict[str, Any]]],
+    add_picture: Callable[[PostedPose, bytes], object],
+) -> PictureRequests:
+    """The daemon's requests for pictures, to be started.
+
+    Args:
+        poses: of the links, by vehicle and time. missing: returns the pictures that are known to exist but have not
+            arrived. add_picture: takes a picture into the workspace.
+    """
 
     def store(wanted: WantedPicture, name: str, data: bytes) -> None:
-        linked = linked_pose(wanted.vehicle, name, wanted.time_s, daemon.poses.at(wanted.vehicle, wanted.time_s))
-        daemon.add_picture(linked or _event_pose(journal, wanted, name), data)
+        linked = linked_pose(wanted.vehicle, name, wanted.time_s, poses.at(wanted.vehicle, wanted.time_s))
+        add_picture(linked or _event_pose(journal, wanted, name), data)
 
     return PictureRequests(
         links.fleet, system_of=links.system_of, store=store, names=lambda vehicle: _names(journal, vehicle),
-        wanted=lambda: wanted_pictures(daemon.coverage.document["missing_pictures"]),
-        changed=lambda: daemon.events.publish("requests"),
-        folder=daemon.settings.picture_folder, most_bytes_s=daemon.settings.picture_bytes_s,
+        wanted=lambda: wanted_pictures(missing()),
+        changed=lambda: events.publish("requests"),
+        folder=settings.picture_folder, most_bytes_s=settings.picture_bytes_s,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, file_crc32
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class FileServer:
     """Answers requests.
 

@@ -61,7 +61,7 @@ class _Request:
         }  # fmt: skip
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Server:
     """A vehicle's files. `not_before`: when it may be asked again, after it did not answer."""
 

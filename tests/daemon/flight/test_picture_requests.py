@@ -25,7 +25,7 @@ class Ground:
 
     def __init__(self, files=None, *, wanted=(3,), names=None, up=NO_FAULTS, down=NO_FAULTS, most=30_000.0, px4=True):
         kind = Autopilot.PX4 if px4 else Autopilot.ARDUPILOT
-        self.server = None if files is None else FileServer(dict(files))
+        self.server = None if files is None else FileServer(files=dict(files))
         self.vehicle = SimVehicle(system=1, autopilot=kind, files=self.server)
         self.world = World([self.vehicle], up, down)
         self.wanted = {number: WantedPicture("v1", number, START_S + number) for number in wanted}
