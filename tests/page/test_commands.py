@@ -195,6 +195,11 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             assert start.is_disabled()
             boxes = page.locator(".checks input:visible")
             assert boxes.count() == 2
+            colour = "(e) => getComputedStyle(e).color"
+            well, bad = (
+                page.locator(f".checks li[data-level={level}] > b").first.evaluate(colour) for level in ("ok", "red")
+            )
+            assert well != bad  # OK is not red because another item is
             boxes.nth(0).check()
             assert start.is_disabled()
             boxes.nth(1).check()

@@ -1,6 +1,7 @@
 """The list of gaps: a press goes there; flying them plans first, and uploads only what was confirmed."""
 
 from tests.kit.page_kit import opened, send, standing, vehicle
+from tests.page.test_operation import accessible
 
 RING = [[8.560, 47.400], [8.561, 47.400], [8.561, 47.401], [8.560, 47.401], [8.560, 47.400]]
 SHARES = {"seen_share": 0.9, "poor_share": 0.04, "missed_share": 0.05, "planned_share": 0.01}
@@ -118,6 +119,7 @@ def test_pictures_asked_from_a_vehicle_are_listed_by_number_with_what_became_of_
                 "Picture 7: arrived", "Picture 8: being read, 40 %", "Picture 9: waits for its turn",
                 "Picture 10: refused, it has no picture file with number 10",
             ]  # fmt: skip
+            accessible(page)
             station.gets["/api/coverage"] = COVERAGE | {"requests": [rows[0], rows[1] | {"state": "arrived"}]}
             send(page, {"type": "requests"})
             page.wait_for_function("document.querySelector('.requests summary').textContent.includes('2 arrived')")
