@@ -97,9 +97,9 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     if not inputs:
         raise InputError("no input was given; name a folder of photos or a video")
     absolute = [Path(os.path.abspath(path)) for path in inputs]
-    for given, path in zip(inputs, absolute, strict=True):
+    for original, path in zip(inputs, absolute, strict=True):
         if not path.exists():
-            raise InputError(f"{given} does not exist; check the path")
+            raise InputError(f"{original} does not exist; check the path")
     tops = [path if path.is_dir() else path.parent for path in absolute]
     root = Path(os.path.commonpath(tops))
     outside = {os.path.abspath(path) for path in exclude}
@@ -192,13 +192,13 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
 
 
 def _name_vehicles(folders: list[Folder], root: Path) -> None:
-    taken: set[str] = set()
+    names: set[str] = set()
     for folder in sorted(folders, key=lambda f: len(f.path.parts), reverse=True):
         relative = _text(os.path.relpath(folder.path, root))
         name = (_text(root.name) or "vehicle") if relative == "." else relative
-        while name in taken:
+        while name in names:
             name += "_top"
-        taken.add(name)
+        names.add(name)
         folder.vehicle = name
 
 

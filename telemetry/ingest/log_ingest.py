@@ -170,7 +170,10 @@ def add_logs(
     _use_events(photos, pairing, entry, vehicle, findings)
     rivals = [other for rival, _, _, other in tried[1:] if rival > fit - _NAME_BONUS and not other.used]
     if rivals and not named:
-        text = f"the photos fit {rivals[0].log.path.name} as well as {entry.log.path.name}, which was taken"
+        text = (
+            f"the photos fit {rivals[0].log.path.name} as well as {entry.log.path.name}, which is used; name only the "
+            "log of these photos"
+        )
         findings.append(Finding("log-ambiguous", text, vehicle))
 
 
@@ -238,7 +241,7 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
         offset_s = round(pairing.offset_s, 1) + 0.0  # no "-0.0"
         text += f"; the camera's clock is {offset_s:+.1f} s off (median residual {pairing.residual_s:.2f} s)"
     if pairing.by_pictures:
-        text += "; where times do not tell, the pictures' own motion did"
+        text += "; where the times leave several events, the pictures' motion decided"
     found = [Finding("paired", text, note=True)]
     if len(used_events) < len(log.events):
         first = next((j for j in range(len(log.events)) if j in used_events), 0)
@@ -255,11 +258,11 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     elif pairing.doubtful:
         text = (
             f"{plural(len(pairing.doubtful), 'photo')} may belong to neighbouring camera events of {log.path.name} "
-            "(neither their times nor the pictures tell); their positions count as that uncertain"
+            "(neither times nor pictures decide); the sigma of their positions is the distance of these events"
         )
         found.append(Finding("pairing-doubtful", text))
     if not log.has_gimbal:
-        text = f"{log.path.name} reports no gimbal: the camera is taken as fixed under the airframe"
+        text = f"{log.path.name} reports no gimbal: the camera counts as fixed under the airframe"
         found.append(Finding("fixed-camera", text, note=True))
     return found
 
@@ -320,7 +323,7 @@ def _use_timeline(
             entry.used = True
             text = (
                 f"{plural(count, 'photo')} got poses from the track of {entry.log.path.name} by time; the camera's "
-                f"clock was taken to be {offset:+.1f} s off"
+                f"clock is {offset:+.1f} s off"
             )
             findings.append(Finding("posed-by-time", text, vehicle, note=sum(placed) > 4))
             return

@@ -98,7 +98,7 @@ def _take(
         result.rejected.append(Rejection(name, NO_POSITION, vehicle, lacks_position=True))
         return
     try:
-        taken = extract(
+        extraction = extract(
             path,
             name,
             options.cache or cache_folder(result.root),
@@ -114,9 +114,9 @@ def _take(
     except Exception as error:
         result.rejected.append(Rejection(name, str(reason_of(error)), vehicle))
         return
-    source.findings += taken.findings
-    for who, photos in taken.photos.items():
-        source.frames += frames_of(photos, who, lambda jpeg: f"{name}#{taken.names[jpeg]:06d}", source.findings)
+    source.findings += extraction.findings
+    for who, photos in extraction.photos.items():
+        source.frames += frames_of(photos, who, lambda jpeg: f"{name}#{extraction.names[jpeg]:06d}", source.findings)
         source.shown[who] = len(photos)
 
 

@@ -90,7 +90,7 @@ class _Sources:
     def __init__(self, names: tuple[str, ...], keep_s: float) -> None:
         self._names, self._keep_s = names, keep_s
         self._series = {MAVLINK: _Series(names, keep_s)}  # first, so that it is used where others are no better
-        self.told = False
+        self.filled = False
 
     def add(self, source: str, sample: Sample, sigma: float) -> None:
         """Add a sample's values."""
@@ -98,7 +98,7 @@ class _Sources:
         if series is None:
             series = self._series[source] = _Series(self._names, self._keep_s)
         series.add(sample.time_s or 0.0, (*(getattr(sample, name) for name in self._names), sigma))
-        self.told = True
+        self.filled = True
 
     def __len__(self) -> int:
         return sum(len(series.times) for series in self._series.values())
@@ -232,7 +232,7 @@ class LivePoses:
     @property
     def has_gimbal(self) -> bool:
         """Whether any message contained the camera's own attitude."""
-        return self._mavlink.has_gimbal or self._camera.told
+        return self._mavlink.has_gimbal or self._camera.filled
 
     def _utc(self, boot_s: float, arrival_s: float | None) -> float:
         """UTC of a time since boot: by the vehicle's clock, else by the quickest arrival so far."""

@@ -107,7 +107,7 @@ class _Lost(Exception):
     """The link broke."""
 
 
-def _options(url: str, timeout_s: float, given: Mapping[str, str] | None) -> dict[str, str]:
+def _options(url: str, timeout_s: float, changes: Mapping[str, str] | None) -> dict[str, str]:
     # Not "nobuffer": it discards what was read while probing, including the first key picture.
     options = {"flags": "low_delay", "analyzeduration": "1000000", "probesize": "1000000"}
     if "://" in url:  # PyAV's own timeout is off while streams are probed
@@ -116,7 +116,7 @@ def _options(url: str, timeout_s: float, given: Mapping[str, str] | None) -> dic
         options["rtsp_transport"] = "tcp"
     elif url.startswith("udp"):
         options |= {"fifo_size": "1000000", "overrun_nonfatal": "1"}
-    return options | dict(given or {})
+    return options | dict(changes or {})
 
 
 def _read(
@@ -132,7 +132,7 @@ def _read(
     form = bitstream.StreamFormat.of(context.name, context.extradata)
     damage = LiveDamage()
     wanted = [stream, *(s for s in container.streams if s.type == "data")]
-    beside: deque[Sample] = deque(maxlen=_KEPT_SAMPLES)
+    klv_samples: deque[Sample] = deque(maxlen=_KEPT_SAMPLES)
     source = container.demux(*wanted)
     now_s = 0.0
     with parked(context):
@@ -146,7 +146,7 @@ def _read(
                 else:
                     seconds = now_s
                 if not is_video:
-                    beside.extend(
+                    klv_samples.extend(
                         replace(p.sample, time_s=seconds)
                         for p in klv.packets(bytes(packet))
                         if p.sample is not None and p.sample.has_position
@@ -168,7 +168,14 @@ def _read(
                 index, reading = frame.opaque if isinstance(frame.opaque, tuple) else (None, None)
                 lost = damage.is_damaged(index, bool(frame.is_corrupt))
                 yield from _offer(
-                    frame, reading, lost, beside=beside, picker=picker, number=next(numbers), now_s=now_s, clock=clock
+                    frame,
+                    reading,
+                    lost,
+                    klv_samples=klv_samples,
+                    picker=picker,
+                    number=next(numbers),
+                    now_s=now_s,
+                    clock=clock,
                 )
 
 
@@ -177,7 +184,7 @@ def _offer(
     reading: sei.Reading | None,
     lost: bool,
     *,
-    beside: deque[Sample],
+    klv_samples: deque[Sample],
     picker: Picker | None,
     number: int,
     now_s: float,
@@ -185,14 +192,17 @@ def _offer(
 ) -> Iterator[LivePicture]:
     seconds = float(frame.time) if frame.time is not None else now_s
     sample, origin = (reading.sample, " + ".join(reading.decoders)) if reading is not None else (None, "")
-    if beside and (sample is None or not sample.has_position):
-        held = _beside(beside, seconds)
-        if held is not None:
-            held = replace(held, time_s=None if sample is None else sample.time_s)
-            sample, origin = (held if sample is None else held.merge(sample)), " + ".join(filter(None, ("KLV", origin)))
+    if klv_samples and (sample is None or not sample.has_position):
+        from_klv = _klv_at(klv_samples, seconds)
+        if from_klv is not None:
+            from_klv = replace(from_klv, time_s=None if sample is None else sample.time_s)
+            sample, origin = (
+                (from_klv if sample is None else from_klv.merge(sample)),
+                " + ".join(filter(None, ("KLV", origin))),
+            )
     candidate = Candidate(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
-    taken = [candidate] if picker is None else picker.push(candidate)
-    for one in taken:
+    chosen = [candidate] if picker is None else picker.push(candidate)
+    for one in chosen:
         stated = None if one.sample is None else one.sample.time_s
         yield LivePicture(
             number=one.number,
@@ -204,7 +214,7 @@ def _offer(
         )
 
 
-def _beside(samples: deque[Sample], seconds: float) -> Sample | None:
+def _klv_at(samples: deque[Sample], seconds: float) -> Sample | None:
     """KLV at a time of the stream: interpolated between two packets, or the last one."""
     last = max(samples, key=lambda s: s.time_s or 0.0)
     if last.time_s is None or seconds > last.time_s + _HELD_S:

@@ -114,7 +114,7 @@ class Poses:
 
     @property
     def has_positions(self) -> bool:
-        """Whether any source of this video knows positions."""
+        """Whether any source of this video has positions."""
         return (
             any(sample.has_position for _, samples in self._interpolated for sample in samples)
             or any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
@@ -123,7 +123,7 @@ class Poses:
 
     @property
     def has_angles(self) -> bool:
-        """Whether any source of this video knows a camera's yaw."""
+        """Whether any source of this video has a camera's yaw."""
         return (
             any(sample.yaw_deg is not None for _, samples in self._interpolated for sample in samples)
             or any(note.sample is not None and note.sample.yaw_deg is not None for note in self._scan.pictures)

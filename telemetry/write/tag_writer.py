@@ -39,13 +39,13 @@ def _segment(body: bytes) -> bytes:
 
 def _without_tags(jpeg: bytes) -> bytes:
     """The bytes after the start marker, without APP1 segments."""
-    at, kept = 2, []
+    at, segments = 2, []
     while at + 4 <= len(jpeg) and jpeg[at] == 0xFF and jpeg[at + 1] not in (0xDA, 0xD9):
         end = at + 2 + struct.unpack_from(">H", jpeg, at + 2)[0]
         if jpeg[at + 1] != 0xE1:
-            kept.append(jpeg[at:end])
+            segments.append(jpeg[at:end])
         at = end
-    return b"".join([*kept, jpeg[at:]])
+    return b"".join([*segments, jpeg[at:]])
 
 
 def xmp_of(frame: Frame) -> bytes:

@@ -125,19 +125,19 @@ def _best(poses: list[tuple[str, NodePose]]) -> list[Sample]:
     def sigma(key: str) -> float:
         return float(np.median([_UNSTATED if pose.sigma is None else pose.sigma for pose in nodes[key]]))
 
-    taken: list[Sample] = []
+    best: list[Sample] = []
     times = np.zeros(0)
     for key in sorted(nodes, key=sigma):
         fresh: list[Sample] = []
         for pose in nodes[key]:
             time_s = pose.sample.time_s or 0.0
             at = int(np.searchsorted(times, time_s))
-            told = any(abs(times[i] - time_s) < _SILENT_S for i in (at - 1, at) if 0 <= i < len(times))
-            if not told and (not fresh or not 0.0 <= time_s - (fresh[-1].time_s or 0.0) < LEAST_STEP_S):
+            reported = any(abs(times[i] - time_s) < _SILENT_S for i in (at - 1, at) if 0 <= i < len(times))
+            if not reported and (not fresh or not 0.0 <= time_s - (fresh[-1].time_s or 0.0) < LEAST_STEP_S):
                 fresh.append(pose.sample)
-        taken += fresh
-        times = np.sort([sample.time_s or 0.0 for sample in taken])
-    return taken
+        best += fresh
+        times = np.sort([sample.time_s or 0.0 for sample in best])
+    return best
 
 
 def _findings(path: Path, reading: _Reading, buses: dict[str, DronecanPoses], undated: int) -> list[Finding]:
@@ -146,7 +146,7 @@ def _findings(path: Path, reading: _Reading, buses: dict[str, DronecanPoses], un
         text = f"{plural(reading.damaged, 'place')} of {path.name} are damaged and were skipped"
         found.append(Finding("can-damaged", text))
     if undated:
-        text = f"{plural(undated, 'message')} of {path.name} have no date: no receiver on the bus told UTC"
+        text = f"{plural(undated, 'message')} of {path.name} have no date: no receiver on the bus stated UTC"
         found.append(Finding("can-undated", text))
     for bus in buses.values():
         for node, lost in sorted(bus.lost.items()):

@@ -59,8 +59,8 @@ def _positions(text: str) -> list[CameraEvent]:
             is_utc = is_utc or "UTC" in line.split()[0:2]
             continue
         words = line.replace(",", " ").split()
-        taken = parse_time(" ".join(words[:2]))
-        if taken is None or len(words) < 9:
+        exposed = parse_time(" ".join(words[:2]))
+        if exposed is None or len(words) < 9:
             continue
         try:
             lat, lon, height, quality, _, north, east = (float(word) for word in words[2:9])
@@ -68,7 +68,7 @@ def _positions(text: str) -> list[CameraEvent]:
             continue
         sigma = max(north, east) if quality in (_FIXED, _FLOAT) and max(north, east) > 0.0 else None
         sample = Sample(lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma)
-        events += _event(taken[0] - (0.0 if is_utc else LEAP_S), len(events) + 1, sample)
+        events += _event(exposed[0] - (0.0 if is_utc else LEAP_S), len(events) + 1, sample)
     return events
 
 

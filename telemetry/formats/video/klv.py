@@ -48,8 +48,8 @@ def packets(data: bytes) -> Iterator[Packet]:
             yield Packet(kind, None, "the packet is cut off")
             at = data.find(_PREFIX, at + 4)
             continue
-        whole = data[at : start + length]
-        yield _read_0601(whole, start - at) if kind == "ST 0601" else _read_0104(whole, start - at)
+        packet_bytes = data[at : start + length]
+        yield _read_0601(packet_bytes, start - at) if kind == "ST 0601" else _read_0104(packet_bytes, start - at)
         at = data.find(_PREFIX, start + length)
 
 
@@ -124,21 +124,21 @@ _NUMBERS: dict[int, tuple[str, int, bool, float, float]] = {
 _TEXTS = {3: "mission", 4: "tail_number", 10: "platform"}
 
 
-def _read_0601(whole: bytes, start: int) -> Packet:
+def _read_0601(packet_bytes: bytes, start: int) -> Packet:
     packet = Packet("ST 0601", None)
     values = packet.values
-    at, size, seen_checksum = start, len(whole), False
+    at, size, seen_checksum = start, len(packet_bytes), False
     while at < size:
-        tag, at = _ber_oid(whole, at)
-        length, at = ber_length(whole, at)
+        tag, at = _ber_oid(packet_bytes, at)
+        length, at = ber_length(packet_bytes, at)
         if length is None or at + length > size:
             packet.error = "an item is longer than its packet"
             return packet
-        raw = whole[at : at + length]
+        raw = packet_bytes[at : at + length]
         at += length
         if tag == 1:
             seen_checksum = True
-            if length != 2 or checksum(whole[: at - 2]) != int.from_bytes(raw, "big"):
+            if length != 2 or checksum(packet_bytes[: at - 2]) != int.from_bytes(raw, "big"):
                 packet.error = "the checksum is wrong"
                 return packet
         elif tag in _NUMBERS:
@@ -183,20 +183,20 @@ _UNIVERSAL = {
 _UNIVERSAL_TEXTS = frozenset({"platform", "mission"})
 
 
-def _read_0104(whole: bytes, start: int) -> Packet:
+def _read_0104(packet_bytes: bytes, start: int) -> Packet:
     packet = Packet("EG 0104", None)
     values = packet.values
-    at, size = start, len(whole)
+    at, size = start, len(packet_bytes)
     while at + 17 <= size:
-        if whole[at : at + 4] != _PREFIX:
+        if packet_bytes[at : at + 4] != _PREFIX:
             packet.error = "an item has no key"
             return packet
-        name = _UNIVERSAL.get(whole[at + 8 : at + 16])
-        length, at = ber_length(whole, at + 16)
+        name = _UNIVERSAL.get(packet_bytes[at + 8 : at + 16])
+        length, at = ber_length(packet_bytes, at + 16)
         if length is None or at + length > size:
             packet.error = "an item is longer than its packet"
             return packet
-        raw = whole[at : at + length]
+        raw = packet_bytes[at : at + length]
         at += length
         if name in _UNIVERSAL_TEXTS:
             values[name] = raw[:64].decode("utf-8", "replace").strip("\0 ")

@@ -1,7 +1,7 @@
 """Chains of photos whose pictures show how far the vehicle went from one to the next.
 
-A clock of whole seconds does not tell which of several exposures in a second a photo is; the ground's motion from
-picture to picture does. In a chain the way of each photo is known up to a common shift (when in its second the first
+Whole seconds do not show which of several exposures in a second a photo is; the ground's motion from picture to
+picture does. In a chain the way of each photo is known up to a common shift (when in its second the first
 one was taken) and a scale (metres a pixel, from height and lens). Both are hypotheses that the matching sums over.
 """
 
@@ -45,7 +45,7 @@ class PictureMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
-    """Photos by chain; a photo without a measured step is a chain of its own and says nothing.
+    """Photos by chain; a photo without a measured step is a chain of its own without any evidence.
 
     Attributes:
         number: (N,) of each photo's chain. along_px: (N,) way from the middle of its chain.
@@ -91,8 +91,8 @@ class Chains:
         expected, speed = found
         there = self.path_m[np.clip(np.arange(first, first + width), 0, len(self.path_m) - 1)]
         apart = (there[None, None, :] - expected[:, :, None]) / self.sigma_m
-        broad = np.maximum(speed * self.resolution_s, np.sqrt(2.0 * np.pi) * self.sigma_m)[:, None, None]
-        near = np.exp(-0.5 * apart**2) * broad / (np.sqrt(2.0 * np.pi) * self.sigma_m)
+        width_m = np.maximum(speed * self.resolution_s, np.sqrt(2.0 * np.pi) * self.sigma_m)[:, None, None]
+        near = np.exp(-0.5 * apart**2) * width_m / (np.sqrt(2.0 * np.pi) * self.sigma_m)
         return np.asarray(_FALSE_MATCH + (1.0 - _FALSE_MATCH) * near)
 
     def alone(self, photo: int, offset: Array, drift: Array) -> Array:
@@ -108,7 +108,7 @@ class Chains:
         return np.where(nearest < _SAME_EXPOSURE * self.step_m, _FALSE_MATCH, 1.0)
 
     def _expected(self, photo: int, offset: Array, drift: Array) -> tuple[Array, Array] | None:
-        """(H, C) way of a photo in metres, and (H,) speed; None where its chain says nothing."""
+        """(H, C) way of a photo in metres, and (H,) speed; None if its chain has one photo only."""
         members = np.flatnonzero(self.number == self.number[photo])
         if len(members) < 2:
             return None

@@ -1,4 +1,4 @@
-"""The way flown by photos and by a log, for photos whose times do not tell which camera event they belong to."""
+"""The way flown by photos and by a log, for photos whose times leave several camera events."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ _MOST_TILT_DEG = 60.0
 def picture_motion(
     photos: Sequence[PhotoTags], log: FlightLog, timeline: Timeline, workers: int
 ) -> PictureMotion | None:
-    """How far the photos show that the vehicle went, and how far the log says; None where the log has no positions."""
+    """Distances flown by the photos and by the log's positions; None if the log has none."""
     poses = [event.sample.merge(timeline.at(event.time_s or 0.0)) for event in log.events]
     if len(poses) < 2 or not all(pose.has_position for pose in poses):
         return None
