@@ -45,12 +45,16 @@ class WantedPicture:
 
 @dataclass(slots=True)
 class _Request:
-    """A wanted picture. `state`: waiting, asked, arrived, refused; `path`: on the vehicle, once it is known."""
+    """A wanted picture. `state`: waiting, asked, arrived, refused; `path`: on the vehicle, once it is known.
+
+    `listing`: the number of the vehicle's listing in which it was not found.
+    """
 
     wanted: WantedPicture
     state: str = "waiting"
     reason: str = ""
     path: str = ""
+    listing: int = -1
     read: FileRead | None = None
 
     def row(self) -> dict[str, Any]:
@@ -126,7 +130,7 @@ class PictureRequests:
 
     def rows(self) -> list[dict[str, Any]]:
         """All requests as JSON values, by vehicle and number: `state`, `reason`, `percent`, `image`."""
-        return [self._requests[key].row() for key in sorted(self._requests)]
+        return [request.row() for _, request in sorted(self._requests.items(), key=lambda item: item[0])]
 
     # -- its own thread -------------------------------------------------------------------------------------------
 
@@ -204,7 +208,7 @@ class PictureRequests:
 
     def _begin(self) -> None:
         """Begin to read the oldest waiting picture of a vehicle that can be asked, or first the folder with it."""
-        now = self._clock()
+        now, known = self._clock(), dict[str, PictureNames]()
         waiting = [r for r in self._requests.values() if r.state in ("waiting", "refused")]
         for request in sorted(waiting, key=lambda r: (r.state, r.wanted.time_s)):
             try:
@@ -214,8 +218,8 @@ class PictureRequests:
             server = self._servers.setdefault(system, _Server())
             if now < server.not_before or self._fleet.vehicles[system].lost:
                 continue
-            if not self._find(request, server):
-                pause_s = min(_LIST_AGAIN_S * 2.0**server.listings, _LIST_AT_LEAST_S)
+            if not self._find(request, server, known):
+                pause_s = min(_LIST_AGAIN_S * 2.0 ** min(server.listings, 9), _LIST_AT_LEAST_S)
                 if server.files is None or now - server.listed_at > pause_s:
                     self._converse(FolderList(self._folder), system, server, None)
                     return
@@ -227,18 +231,24 @@ class PictureRequests:
                 self._changed()
                 return
 
-    def _find(self, request: _Request, server: _Server) -> bool:
-        """Set the path of a request's file, or why there is none; returns whether the path is known."""
-        number = request.wanted.number
-        if server.files is None and number not in server.urls:
-            return False
+    def _find(self, request: _Request, server: _Server, known: dict[str, PictureNames]) -> bool:
+        """Set the path of a request's file, or why there is none; returns whether the path is known.
+
+        `known`: names of the pictures that have arrived, by vehicle, as far as they were needed.
+        """
+        number, vehicle = request.wanted.number, request.wanted.vehicle
         path, reason = server.urls.get(number, ""), ""
-        if not path and server.files is not None:
-            path, reason = self._names(request.wanted.vehicle).find(number, server.files)
+        if not path:
+            if server.files is None or request.listing == server.listings:
+                return False
+            if vehicle not in known:
+                known[vehicle] = self._names(vehicle)
+            path, reason = known[vehicle].find(number, server.files)
         if path:
             if request.path != path:  # the vehicle has it by now
                 request.path, request.state, request.read = path, "waiting", None
             return True
+        request.listing = server.listings
         if (request.state, request.reason) != ("refused", reason):
             request.state, request.reason = "refused", reason
             self._changed()
