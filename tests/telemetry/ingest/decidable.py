@@ -64,11 +64,15 @@ def _most_pairs_without_the_true(
     p: Array, expected: Array, true: NDArray[np.int64], reach: float, least: float, count: int
 ) -> Array:
     """(N,) most pairs of any alignment in which a photo has another event than the true one, or none."""
+    result = np.zeros(len(p))
+    reached = np.array([np.searchsorted(e, p + reach, "right") > np.searchsorted(e, p - reach) for e in expected])
+    expected = expected[reached.sum(axis=1) > count - LEAST_FEWER]  # no other clock can have as many pairs
+    if not len(expected):
+        return result
     near = np.abs(p[None, :, None] - expected[:, None, :]) <= reach
     alone = np.where(_has_room(p, expected, reach, least), 0, -_NO_ROOM).astype(np.int16)
     total = _prefixes(near, alone)[-1].max(axis=1)
     chosen = np.flatnonzero(total > count - LEAST_FEWER)
-    result = np.zeros(len(p))
     if not len(chosen):
         return result
     near, alone = near[chosen], alone[chosen]

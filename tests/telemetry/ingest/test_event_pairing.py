@@ -37,7 +37,7 @@ def uneven(count: int, seed: int) -> np.ndarray:
     missing_first=st.integers(0, 3),
     whole=st.booleans(),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_photos_find_their_events_under_any_clock(seed, count, offset, dropped, missing_first, whole):
     events = uneven(count, seed)
     kept = [i for i in range(count) if i >= missing_first and i not in dropped]
@@ -54,15 +54,15 @@ def test_photos_find_their_events_under_any_clock(seed, count, offset, dropped, 
 
 # Interval in seconds, whole seconds, share missing.
 GRID = [
-    (0.3, False, 0.3), (0.7, False, 0.3), (1.0, False, 0.3), (5.0, False, 0.3), (2.0, True, 0.0), (2.0, True, 0.1),
-    (5.0, True, 0.0), (5.0, True, 0.3), (1.0, True, 0.0), (1.0, True, 0.1), (0.7, True, 0.0), (0.3, True, 0.1),
+    (0.3, False, 0.3), (1.0, False, 0.3), (5.0, False, 0.3), (2.0, True, 0.1), (5.0, True, 0.3), (1.0, True, 0.1),
+    (0.7, True, 0.0), (0.3, True, 0.1),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("interval", "whole", "missing"), GRID)
 def test_no_photo_is_given_a_wrong_event_without_a_mark(interval, whole, missing):
     placed, decidable = 0, 0
-    for seed in range(3):
+    for seed in range(2):
         flown = exposures(np.random.default_rng(seed), interval, whole=whole, missing=missing)
         found = by_time(flown.photos, flown.events)
         decided = [(i, j) for i, j in found.pairs if i not in found.doubtful]
