@@ -58,7 +58,7 @@ def _tell(document: dict[str, Any]) -> None:
     """Print the document as tables."""
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from telemetry.ingest.summary import one_line
 
@@ -66,20 +66,26 @@ def _tell(document: dict[str, Any]) -> None:
     for source in document["sources"]:
         console.print(f"\n[bold]{escape(one_line(source))}[/bold]")
         if source["vehicles"]:
-            table = Table("vehicle", "pictures", "legs", "length", "start", "end", "height", "pitch", box=None)
+            table = Table(
+                "vehicle",
+                "pictures",
+                "legs",
+                "length",
+                Column("start, UTC", no_wrap=True),
+                "end",
+                "height",
+                "pitch",
+                box=None,
+            )
             for v in source["vehicles"]:
                 table.add_row(
                     escape(v["id"]), str(v["frames"]), str(v["legs"]), f"{v['length_m']:.0f} m",
-                    v["start"] or "?", v["end"] or "?", _range(v.get("height_m"), "m"), _range(v.get("pitch_deg"), "°"),
+                    *_span(v["start"], v["end"]), _range(v.get("height_m"), "m"), _range(v.get("pitch_deg"), "°"),
                 )  # fmt: skip
             console.print(table)
             for v in source["vehicles"]:
                 if v.get("fields"):
-                    console.print(
-                        f"  {escape(v['id'])}: "
-                        + "; ".join(f"{_field(k)} from {escape(s)}" for k, s in v["fields"].items()),
-                        style="dim",
-                    )
+                    console.print(f"  {escape(v['id'])}: {escape(_origins(v['fields']))}", style="dim")
         for finding in source["findings"]:
             mark = "[yellow]![/yellow]" if finding["severity"] == "warning" else "[dim]i[/dim]"
             console.print(f"  {mark} [bold]{finding['code']}[/bold] {escape(finding['message'])}")
@@ -93,8 +99,18 @@ def _tell(document: dict[str, Any]) -> None:
         console.print(f"[yellow]![/yellow] {escape(finding['message'])}")
 
 
-def _field(name: str) -> str:
-    return "field of view" if name == "fov_hint" else name.replace("_", " ")
+def _span(start: str | None, end: str | None) -> tuple[str, str]:
+    """First and last time in seconds; the last one without the date where that is the first one's."""
+    first, last = (time[:19].replace("T", " ") if time else "?" for time in (start, end))
+    return first, last[11:] if start and last[:10] == first[:10] else last
+
+
+def _origins(fields: dict[str, str]) -> str:
+    """Which fields come from which source, those of one source together."""
+    names: dict[str, list[str]] = {}
+    for name, source in fields.items():
+        names.setdefault(source, []).append("field of view" if name == "fov_hint" else name.replace("_", " "))
+    return "; ".join(f"{', '.join(some)} from {source}" for source, some in names.items())
 
 
 def _range(pair: list[float] | None, unit: str) -> str:
