@@ -269,7 +269,7 @@ def extract(
             Finding(
                 "video-damaged",
                 f"{plural(result.damaged, 'picture')} of {path.name} are damaged by losses; those of them that are "
-                "taken count for their positions only and are drawn where no other picture sees",
+                "selected count for their positions only and are drawn where no other picture sees",
             )
         )
     result.findings += poses.findings
