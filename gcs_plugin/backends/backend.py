@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.fleet.commands import Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
@@ -111,7 +113,9 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Follow missions until each has ended, for at most so many seconds.
+        """Follow missions until each has ended and no vehicle flies home any more, for at most so many seconds.
+
+        PX4 ends a mission when its RTL begins, up to a minute before it has landed.
 
         Returns:
             True if all have ended.
@@ -123,6 +127,11 @@ class Backend(abc.ABC):
 
 
 ENDED = ("complete", "aborted")
+
+
+def coming_home(vehicle: Vehicle) -> bool:
+    """Whether a vehicle flies home or lands."""
+    return flight_state(vehicle).word in (Word.RETURNING, Word.LANDING)
 
 
 def command_all(

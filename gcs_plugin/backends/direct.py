@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, command_all
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
@@ -131,7 +131,7 @@ class DirectBackend(Backend):
         self.fleet.poll(seconds)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Poll and report events until all missions have ended."""
+        """Poll and report events until all missions have ended and nobody flies home."""
         self._download_unknown(systems)
         end, reported = time.monotonic() + seconds, 0
         while True:
@@ -141,7 +141,8 @@ class DirectBackend(Backend):
             reported = len(self.events)
             ended = {event.system for event in self.events if event.kind in ENDED}
             followed = set(systems) or set(self.fleet.vehicles)
-            if followed and followed <= ended:
+            vehicles = [v for s, v in self.fleet.vehicles.items() if s in followed]
+            if followed and followed <= ended and not any(map(coming_home, vehicles)):
                 return True
             if time.monotonic() >= end:
                 return False

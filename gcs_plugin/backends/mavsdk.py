@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, command_all
+from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.message_rates import Rates, Streams
@@ -181,7 +181,7 @@ class MavsdkBackend(Backend):
         return command_all(delays, begin, self.pump, say, airspace)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Report events until all missions have ended."""
+        """Report events until all missions have ended and nobody flies home."""
         for system in systems or list(self._crafts):
             detector = self._craft(system).vehicle.detector
             if not detector.knows and (mission := self._read(system)) is not None:
@@ -193,7 +193,9 @@ class MavsdkBackend(Backend):
                     report(event)
             reported = len(self.events)
             followed = set(systems) or set(self._crafts)
-            if followed and followed <= {event.system for event in self.events if event.kind in ENDED}:
+            ended = {event.system for event in self.events if event.kind in ENDED}
+            crafts = [craft for s, craft in self._crafts.items() if s in followed]
+            if followed and followed <= ended and not any(coming_home(craft.vehicle) for craft in crafts):
                 return True
             if time.monotonic() >= end:
                 return False

@@ -80,6 +80,17 @@ def test_a_plan_is_uploaded_flown_and_watched_to_its_completion(swarm, folder, c
     assert all(v["photos"] > 10 for v in flown["vehicles"])
 
 
+def test_a_px4_is_watched_until_it_has_come_home(folder, capsys):
+    """Its mission is complete when the way home begins, tens of metres up."""
+    port = free_port()
+    link = f"udpin:127.0.0.1:{port}"
+    with SimSwarm(make_swarm(1, autopilots=(PX4,), home=HOME), f"udpout:127.0.0.1:{port}", speed=40.0):
+        assert fleet(capsys, "upload", folder / "v1.plan", "--link", link)[0] == 0
+        code, flown = fleet(capsys, "start", "--watch", "--seconds", 60, "--link", link, "--json")
+    assert code == 0 and flown["ended"]
+    assert [v["flight"]["state"] for v in flown["vehicles"]] == ["complete"]
+
+
 def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plans(swarm, folder, capsys):
     assert fleet(capsys, "upload", folder, "--link", swarm)[0] == 0
     other = folder / "other.waypoints"
