@@ -43,7 +43,7 @@ class WantedPicture:
     time_s: float
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Request:
     """A wanted picture. `state`: waiting, asked, arrived, refused; `path`: on the vehicle, once it is known.
 
@@ -198,7 +198,7 @@ class PictureRequests:
         wanted = {(w.vehicle, w.number): w for w in self._wanted()}
         changed = False
         for key in wanted.keys() - self._requests.keys():
-            self._requests[key] = _Request(wanted[key])
+            self._requests[key] = _Request(wanted=wanted[key])
             changed = True
         for key in [k for k, r in self._requests.items() if k not in wanted and r.state in ("waiting", "refused")]:
             del self._requests[key]
