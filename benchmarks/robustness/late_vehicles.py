@@ -1,18 +1,21 @@
-"""How near vehicles come that are as late as real autopilots, in plans with several allowances for it.
+"""How near vehicles come that fly as real autopilots do, in plans by several models of their times.
 
     python -m benchmarks.robustness.late_vehicles
 
-Vehicles fall behind a plan as ArduCopter and PX4 did in flight (docs/vehicles.md), each by a share of 0.8 to 1.2 of it.
-A pair has met if it was less than 10 m apart with less than 4.5 m between the heights, away from a common start.
+Vehicles take the times of their autopilots (orthoswarm/config/autopilot.py), and what was left beyond these in flight
+(docs/vehicles.md). A pair has met if it was less than 10 m apart with less than 4.5 m between the heights, away from a
+common start.
 """
 
 import argparse
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config.autopilot import ArduPilotConfig
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import Plan
 from orthoswarm.planning.area.area import Area
@@ -20,35 +23,49 @@ from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
-from orthoswarm.planning.sorties.flight_time import Motion
+from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
 Array = NDArray[np.float64]
 
-LATE_S = {"ArduCopter": (4.5, 9.0, 9.0, 18.0), "PX4": (8.0, 15.0, 24.0, 25.0)}
-"""Seconds behind the plan after the takeoff, the first line, the last line and the way home."""
+LEFT_S = {
+    "ardupilot": ((-0.3, 0.3), (-0.7, 0.8), (-1.0, 2.4), (-1.0, 2.4), (-1.0, 2.1)),
+    "px4": ((-3.7, 3.5), (-3.3, 3.5), (-6.0, 12.0), (-6.2, 12.0), (-6.2, 11.7)),
+}
+"""Range of the seconds beyond those times: after the takeoff, the first line, the last line, the way home, landing."""
 CORNER = np.array([600_000.0, 5_300_000.0])
 STEP_S, GROUND_M, PAD_M = 0.25, 2.0, 15.0
 
 
-def flown_late(plan: Plan, late_s: list[Array]) -> list[Array]:
+def constant_speed() -> Motion:
+    """A vehicle that loses time in turns alone, as plans assumed once."""
+    times = ArduPilotConfig(takeoff_s=0.0, set_off_s=0.0, height_change_s=0.0, home_wait_s=0.0, landing_m_s=1.5)
+    return Motion(autopilot=times)
+
+
+def left_over(names: Sequence[str], rng: np.random.Generator) -> list[Array]:
+    """Seconds beyond its autopilot's times for each vehicle, drawn from LEFT_S."""
+    return [np.array([rng.uniform(*span) for span in LEFT_S[name]]) for name in names]
+
+
+def flown_tracks(plan: Plan, names: Sequence[str], left_s: list[Array]) -> list[Array]:
     """Where each vehicle is every STEP_S after the swarm's start: (n, 3) metres; on the ground nan.
 
     Args:
-        plan: its first sorties are flown. late_s: per vehicle, see LATE_S.
+        plan: its first sorties are flown. names: the vehicles' autopilots. left_s: per vehicle, see LEFT_S.
     """
-    motion, grid = Motion(), LocalGrid(32632)
-    moments = np.arange(0.0, plan.makespan_s + 60.0, STEP_S)
+    grid = LocalGrid(32632)
+    moments = np.arange(0.0, 1.5 * plan.makespan_s + 120.0, STEP_S)
     tracks = []
-    for vehicle, late in zip(plan.vehicles, late_s, strict=True):
+    for vehicle, name, left in zip(plan.vehicles, names, left_s, strict=True):
         sortie = vehicle.sorties[0]
         places = [(sortie.home_lat_deg, sortie.home_lon_deg), *((w.lat_deg, w.lon_deg) for w in sortie.waypoints)]
         east_north = grid.to_grid(*np.array(places).T) - CORNER
         path = np.column_stack([east_north[[0, 0, *range(1, len(places))]], np.zeros(len(places) + 1)])
         path[1:, 2] = [sortie.takeoff_height_m, *(w.height_m for w in sortie.waypoints)]
         path = np.vstack([path, [*path[0, :2], 0.0]])
-        times = motion.times(path)
-        behind = np.interp(times, times[[0, 1, 3, -3, -2, -1]], [0.0, *late, late[-1]])
-        at = sortie.start_s + times + behind
+        times = Motion(autopilot=autopilot_config(name)).times(path)
+        behind = np.interp(times, times[[0, 1, 3, -3, -2, -1]], [0.0, *left])
+        at = np.maximum.accumulate(sortie.start_s + times + behind)
         track = np.stack([np.interp(moments, at, path[:, axis], np.nan, np.nan) for axis in range(3)], 1)
         track[~(track[:, 2] > GROUND_M)] = np.nan
         tracks.append(track)
@@ -80,30 +97,46 @@ def main() -> None:
     corner = np.array([[0, 0], [args.side, 0], [args.side, args.side], [0, args.side]]) + CORNER
     area = Area(grid, shapely.Polygon(corner), shapely.MultiPolygon())
     start = grid.to_geographic(CORNER + np.array([-20.0, 0.5 * args.side]))
-    print("| vehicles | start | fleet | allowed s | makespan s | pairs | met | nearest m |")
+    print("| vehicles | start | fleet | plan by | makespan s | pairs | met | nearest m |")
     print("|---|---|---|---|---|---|---|---|")
     for vehicles in (3, 8, 16, 32):
-        for name, starts in (("own", []), ("one", [(float(start[0]), float(start[1]))])):
-            for slack_s in (3.0, 10.0, 20.0):
-                options = Options(starts=starts, separation=Separation(slack_s=slack_s))
-                plan = plan_area(area, vehicles, 60.0, footprint(60.0, np.radians(75.0)), options=options)
-                homes = [(v.sorties[0].home_lat_deg, v.sorties[0].home_lon_deg) for v in plan.vehicles]
-                places = grid.to_grid(*np.array(homes).T) - CORNER
-                for fleet in ("ArduCopter", "mixed"):
+        for where, starts in (("own", []), ("one", [(float(start[0]), float(start[1]))])):
+            for fleet, kinds in (("ArduCopter", ["ardupilot"]), ("PX4", ["px4"]), ("mixed", ["ardupilot", "px4"])):
+                names = [kinds[k % len(kinds)] for k in range(vehicles)]
+                for model, options in plans_of(kinds, starts):
+                    plan = plan_area(area, vehicles, 60.0, footprint(60.0, np.radians(75.0)), options=options)
+                    homes = [(v.sorties[0].home_lat_deg, v.sorties[0].home_lon_deg) for v in plan.vehicles]
+                    places = grid.to_grid(*np.array(homes).T) - CORNER
                     count, nearest = 0, np.inf
                     for seed in range(args.seeds):
-                        rng = np.random.default_rng(seed)
-                        kinds = rng.choice(list(LATE_S), vehicles) if fleet == "mixed" else [fleet] * vehicles
-                        late = [np.array(LATE_S[str(kind)]) * rng.uniform(0.8, 1.2) for kind in kinds]
-                        found, least = met(flown_late(plan, late), places)
+                        left = left_over(names, np.random.default_rng(seed))
+                        found, least = met(flown_tracks(plan, names, left), places)
                         count, nearest = count + found, min(nearest, least)
                     pairs = vehicles * (vehicles - 1) // 2 * args.seeds
                     shown = "" if np.isinf(nearest) else f"{nearest:.1f}"
                     print(
-                        f"| {vehicles} | {name} | {fleet} | {slack_s:g} | {plan.makespan_s:.0f} | {pairs} | {count} | "
+                        f"| {vehicles} | {where} | {fleet} | {model} | {plan.makespan_s:.0f} | {pairs} | {count} | "
                         f"{shown} |",
                         flush=True,
                     )
+
+
+def plans_of(kinds: Sequence[str], starts: list[tuple[float, float]]) -> list[tuple[str, Options]]:
+    """Plans to compare: their name, and the options of the flights."""
+    times = [autopilot_config(kind) for kind in kinds]
+    slack_s = max(t.schedule_slack_s for t in times)
+    slowest = Motion(autopilot=min(times, key=lambda t: t.acceleration_m_s2))
+    return [
+        *(
+            (f"constant speed, {allowed:g} s", Options(motion=constant_speed(), starts=starts, separation=apart))
+            for allowed in (3.0, 20.0)
+            for apart in [Separation(slack_s=allowed)]
+        ),
+        (
+            f"autopilots' times, {slack_s:g} s",
+            Options(motion=slowest, autopilots=times, starts=starts, separation=Separation(slack_s=slack_s)),
+        ),
+    ]
 
 
 if __name__ == "__main__":

@@ -101,7 +101,9 @@ class Daemon:
         self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
         self.refused = RefusedPictures(self.events.publish)
         self.console = ConsoleState(self.journal, self.events.publish)
-        self.plans = Plans(folder / "plans", settings.dem)
+        self.plans = Plans(
+            folder / "plans", settings.dem, lambda: {} if self.links is None else self.links.autopilots()
+        )
         fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,

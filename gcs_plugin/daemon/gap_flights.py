@@ -77,6 +77,7 @@ class GapFlights:
             "endurances_min": [chosen[vehicle] for vehicle in ordered],
             "starts": [(known[v]["lat_deg"], known[v]["lon_deg"]) for v in ordered],
             "fly_not_arrived": body.get("fly_not_arrived") is True,
+            "autopilots": self._plans.autopilots_of(ordered),
         }  # fmt: skip
         made = self._plans.make_gaps(self._coverage.gaps, self._coverage.no_fly, values)
         names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))

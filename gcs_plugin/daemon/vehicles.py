@@ -150,6 +150,10 @@ class VehicleLinks:
         known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
         raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
 
+    def autopilots(self) -> dict[str, str]:
+        """The autopilot of each vehicle that was heard, by id."""
+        return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
+
     def rows(self) -> list[dict[str, Any]]:
         """All vehicles on the links as JSON values; `takeoff` of each is None where none waits or failed."""
 

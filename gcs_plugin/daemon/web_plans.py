@@ -5,7 +5,7 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,7 @@ _NUMBERS: Final = (
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6
 _NO_FLY_FILE: Final = "no-fly.geojson"
-_CHOICES: Final = {"method": METHODS, "autopilot": tuple(MOST_ITEMS), "end": ENDS, "relief": RELIEFS}
+_CHOICES: Final = {"method": METHODS, "end": ENDS, "relief": RELIEFS}
 
 
 GeographicBounds = tuple[float, float, float, float]
@@ -35,10 +35,13 @@ class Plans:
 
     Args:
         folder: of all plans. dem: height model that they follow, None for level ground.
+        autopilots: of the vehicles on the links, by id; a plan is made for these unless its request names others.
     """
 
-    def __init__(self, folder: Path, dem: Path | None = None) -> None:
-        self.folder, self.dem = folder, dem
+    def __init__(
+        self, folder: Path, dem: Path | None = None, autopilots: Callable[[], Mapping[str, str]] = dict
+    ) -> None:
+        self.folder, self.dem, self._autopilots = folder, dem, autopilots
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,6 +53,8 @@ class Plans:
             InputError: the area or a value is invalid.
         """
         values = _values(body)
+        if "autopilot" not in body:
+            values["autopilots"] = self.autopilots_of([f"v{k}" for k in range(1, values["vehicles"] + 1)])
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
@@ -58,6 +63,11 @@ class Plans:
             raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
         has_zones = zones is not None and bool(zones.get("coordinates") or zones.get("features"))
         return self._make("area.geojson", area, zones if has_zones else None, values)
+
+    def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
+        """The autopilots of vehicles; ArduPilot for those that were not heard."""
+        known = self._autopilots()
+        return [known.get(vehicle, "ardupilot") for vehicle in vehicles]
 
     def make_gaps(
         self, gaps: Mapping[str, Any], no_fly: Mapping[str, Any] | None, values: Mapping[str, Any]
@@ -198,12 +208,25 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(body[key], str) or body[key] not in choices:
                 raise InputError(f"{key} is none of {', '.join(choices)}; choose one")
             values[key] = body[key]
+    values["autopilots"] = _autopilots(body.get("autopilot", "ardupilot"))
     if "terrain_items" in body:
         values["terrain_items"] = body["terrain_items"] is True
     starts = body.get("starts", [])
     if not isinstance(starts, list) or not all(_is_position(start) for start in starts):
         raise InputError("starts is not a list of [latitude, longitude]; send one")
     return values | {"starts": [(float(lat), float(lon)) for lat, lon in starts]}
+
+
+def _autopilots(value: Any) -> list[str]:
+    """One autopilot for all vehicles, or a list that they are given in turn.
+
+    Raises:
+        InputError: there is no such autopilot.
+    """
+    names = value if isinstance(value, list) else [value]
+    if not names or not all(isinstance(name, str) and name in MOST_ITEMS for name in names):
+        raise InputError(f"autopilot is none of {', '.join(MOST_ITEMS)} and no list of these; choose one")
+    return names
 
 
 def _is_position(start: Any) -> bool:
@@ -233,8 +256,8 @@ def plan_into(request: PlanRequest) -> dict[str, Any]:
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
     plan, area = make_plan(request)
-    figures = report(plan, request.autopilot, request.fov_min_deg)
-    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilot))
+    figures = report(plan, request.autopilots, request.fov_min_deg)
+    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
     write_folder(request.area.parent, files)

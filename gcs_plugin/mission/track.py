@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, LOITER_TIME, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
 from orthoswarm.config import active
+from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
 
 if TYPE_CHECKING:
@@ -86,9 +87,16 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points)
-    times = Motion(speed_m_s=speed).times(points) + np.cumsum(waits)
+    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission))
+    times = motion.times(points) + np.cumsum(waits)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
+
+
+def _autopilot_of(mission: "Mission") -> AutopilotConfig:
+    from orthoswarm.planning.sorties.flight_time import autopilot_config
+
+    return autopilot_config(mission.autopilot.value)
 
 
 def flight_seconds(mission: "Mission") -> float:
@@ -135,7 +143,7 @@ class Airspace:
     tracks: dict[int, Track]
     distance_m: float = 10.0
     height_m: float = 5.0
-    slack_s: float = field(default_factory=lambda: active().planning.schedule_slack_s)
+    slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = 5.0
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, init=False, repr=False)
 
@@ -143,7 +151,9 @@ class Airspace:
     def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
         """Of missions by system id."""
         origin = next((home for mission in missions.values() if (home := _home_of(mission))), (0.0, 0.0))
-        return cls({s: track_of(mission, origin) for s, mission in missions.items()}, distance_m, height_m)
+        tracks = {s: track_of(mission, origin) for s, mission in missions.items()}
+        slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
+        return cls(tracks, distance_m, height_m, slack_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.

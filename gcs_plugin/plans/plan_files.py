@@ -22,10 +22,11 @@ def sortie_name(vehicle: VehiclePlan, index: int) -> str:
     return vehicle.id if len(vehicle.sorties) == 1 else f"{vehicle.id}-sortie{index + 1}"
 
 
-def mission_files(plan: Plan, autopilot: Autopilot) -> dict[str, str]:
-    """Texts of all `.plan` and `.waypoints` files by name."""
+def mission_files(plan: Plan, autopilots: Sequence[Autopilot]) -> dict[str, str]:
+    """Texts of all `.plan` and `.waypoints` files by name, in the dialects that the vehicles are given in turn."""
     texts = {}
     for vehicle in plan.vehicles:
+        autopilot = _autopilot(vehicle, autopilots)
         for index, sortie in enumerate(vehicle.sorties):
             name = sortie_name(vehicle, index)
             home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
@@ -35,7 +36,11 @@ def mission_files(plan: Plan, autopilot: Autopilot) -> dict[str, str]:
     return texts
 
 
-def report(plan: Plan, autopilot: Autopilot, fov_min_deg: float) -> dict[str, Any]:
+def _autopilot(vehicle: VehiclePlan, autopilots: Sequence[Autopilot]) -> Autopilot:
+    return autopilots[(vehicle.number - 1) % len(autopilots)]
+
+
+def report(plan: Plan, autopilots: Sequence[Autopilot], fov_min_deg: float) -> dict[str, Any]:
     """The plan's figures as JSON: per vehicle and altogether."""
     return {
         "fov_min_deg": fov_min_deg,
@@ -51,11 +56,11 @@ def report(plan: Plan, autopilot: Autopilot, fov_min_deg: float) -> dict[str, An
         "footprint_m": [round(side, 3) for side in plan.footprint_m],
         "area_m2": None if plan.area_m2 is None else round(plan.area_m2, 1),
         "epsg": plan.epsg,
-        "autopilot": autopilot,
+        "autopilot": autopilots[0] if len(set(autopilots)) == 1 else "mixed",
         "end": plan.end,
         "separation": plan.separation,
         "over_ground": None if plan.over_ground is None else _over_ground(plan.over_ground),
-        "vehicles": [_vehicle(vehicle) for vehicle in plan.vehicles],
+        "vehicles": [_vehicle(vehicle, _autopilot(vehicle, autopilots)) for vehicle in plan.vehicles],
         "gaps": [{"lat_deg": g.lat_deg, "lon_deg": g.lon_deg, "area_m2": g.area_m2} for g in plan.gaps],
         "warnings": list(plan.warnings),
     }
@@ -75,7 +80,7 @@ def _over_ground(over: OverGround) -> dict[str, Any]:
     }
 
 
-def _vehicle(vehicle: VehiclePlan) -> dict[str, Any]:
+def _vehicle(vehicle: VehiclePlan, autopilot: Autopilot) -> dict[str, Any]:
     flights = [
         {
             "files": [sortie_name(vehicle, index) + suffix for suffix in MISSION_SUFFIXES],
@@ -92,6 +97,7 @@ def _vehicle(vehicle: VehiclePlan) -> dict[str, Any]:
     ]
     return {
         "id": vehicle.id,
+        "autopilot": autopilot,
         "length_m": round(vehicle.length_m, 1),
         "turns": vehicle.turns,
         "time_s": round(vehicle.time_s, 1),

@@ -25,7 +25,7 @@ from orthoswarm.planning.relief_plan import Relief, plan_over_relief
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
-from orthoswarm.planning.sorties.flight_time import Motion
+from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
 MOST_ITEMS: Final[dict[Autopilot, int]] = {"ardupilot": 650, "px4": 1900}
 """Mission items that an autopilot stores (ArduPilot: measured; PX4: its dataman's table)."""
@@ -47,7 +47,8 @@ class PlanRequest:
         area: file of a polygon to cover, or of a line to follow. no_fly: files of further no-fly zones.
         vehicles: how many. altitude_m: height of the lines above takeoff, with a `dem` above the ground.
         fov_min_deg: theta-hat, the smallest horizontal field of view in the swarm.
-        method: how lines are laid. autopilot: whose dialect. end: what follows the last line.
+        method: how lines are laid. end: what follows the last line.
+        autopilots: whose dialect and times of flight; several are given to the vehicles in turn.
         starts: takeoff points (latitude, longitude) in degrees; none: where each vehicle's first line begins.
         speed_m_s: ground speed, None for the default. run_in_m: straight flight before a leg's first picture.
         endurance_min: longest flight, None without a limit. endurances_min: of each vehicle, where they differ.
@@ -72,7 +73,7 @@ class PlanRequest:
     fov_min_deg: float
     no_fly: Sequence[Path] = ()
     method: Method = "bcd"
-    autopilot: Autopilot = "ardupilot"
+    autopilots: Sequence[Autopilot] = ("ardupilot",)
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     speed_m_s: float | None = None
@@ -103,7 +104,10 @@ class PlanRequest:
             raise InputError(f"a wind of {self.wind_m_s:g} m/s from {self.wind_from_deg:g} degrees is none; give both")
         to = math.radians(self.wind_from_deg + 180.0)
         wind = (self.wind_m_s * math.sin(to), self.wind_m_s * math.cos(to)) if self.wind_m_s else (0.0, 0.0)
-        return Motion(wind_m_s=wind) if self.speed_m_s is None else Motion(self.speed_m_s, wind_m_s=wind)
+        autopilot = min(map(autopilot_config, self.autopilots), key=lambda times: times.acceleration_m_s2)
+        if self.speed_m_s is None:
+            return Motion(wind_m_s=wind, autopilot=autopilot)
+        return Motion(self.speed_m_s, wind_m_s=wind, autopilot=autopilot)
 
     def flight_options(self) -> Options:
         """How the flights are to be.
@@ -120,15 +124,20 @@ class PlanRequest:
         layers = int(min(_MOST_LAYERS, (ceiling - self.altitude_m) / step + 1e-9)) if step > 0 else 0
         return Options(
             motion=self._motion(),
+            autopilots=[autopilot_config(name) for name in self.autopilots],
             end=self.end,
             starts=list(self.starts),
             endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
             endurances_s=[60.0 * minutes for minutes in self.endurances_min],
             clearance_m=self.clearance_m,
             separation=Separation(
-                distance_m=self.separation_m, height_m=step, layers=layers, swap_s=60.0 * self.swap_min
+                distance_m=self.separation_m,
+                height_m=step,
+                layers=layers,
+                swap_s=60.0 * self.swap_min,
+                slack_s=max(autopilot_config(name).schedule_slack_s for name in self.autopilots),
             ),
-            most_items=MOST_ITEMS[self.autopilot],
+            most_items=min(MOST_ITEMS[name] for name in self.autopilots),
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
         )
@@ -214,7 +223,8 @@ def _over_ground(
     tolerance_m = request.height_tolerance_m
     if tolerance_m is None:
         tolerance_m = _TOLERANCE * request.altitude_m
-    by_vehicle = request.terrain_items and request.autopilot in WITH_TERRAIN
+    without = sorted(set(request.autopilots) - WITH_TERRAIN)
+    by_vehicle = request.terrain_items and not without
     plan = plan_over_relief(
         make,
         lambda above_m: _footprint(request, above_m),
@@ -226,7 +236,7 @@ def _over_ground(
     )
     notes = relief_notes(plan, ground)
     if request.terrain_items and not by_vehicle:
-        notes.append(f"{request.autopilot} has no items with heights above the ground: heights count from takeoff")
+        notes.append(f"{without[0]} has no items with heights above the ground: heights count from takeoff")
     return replace(plan, warnings=(*plan.warnings, *notes))
 
 

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.config.autopilot import ArduPilotConfig, Px4Config
 from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.coverage import CoverageConfig
@@ -51,6 +52,8 @@ class Config:
     raster: RasterConfig = field(default_factory=RasterConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
+    ardupilot: ArduPilotConfig = field(default_factory=ArduPilotConfig)
+    px4: Px4Config = field(default_factory=Px4Config)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)

@@ -93,9 +93,6 @@ class PlanningConfig:
     """Possible cuts in a share (chosen for its time)."""
 
     # Deconfliction
-    schedule_slack_s: float = 20.0
-    """How much later than planned one vehicle may be than another while they stay separated, seconds: ArduCopter falls
-    5 to 18 s behind a plan, PX4 7 to 25 s (measured in flights of 1 to 32 vehicles, docs/vehicles.md)."""
     step_s: float = 0.5
     """Time step in which flights are compared, seconds (chosen for its time)."""
     on_ground_m: float = 2.0

@@ -347,7 +347,7 @@ def _plan(
     area_m2, share, gaps = covered
     foot, level_m = over.foot, over.heights.above_m if over.heights.follows else over.heights.at(np.zeros(2), 0.0)
     made = tuple(
-        VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion) for s in row))
+        VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion_of(number - 1)) for s in row))
         for number, row in enumerate(slots, start=1)
     )
     return Plan(

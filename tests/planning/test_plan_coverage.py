@@ -8,7 +8,7 @@ import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.robustness.late_vehicles import CORNER, LATE_S, flown_late, met
+from benchmarks.robustness.late_vehicles import CORNER, flown_tracks, left_over, met, plans_of
 from gcs_plugin.plans.plan_files import mission_files
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -32,7 +32,7 @@ def start_at(x, y):
 
 
 def flown(plan, autopilot="ardupilot"):
-    texts = mission_files(plan, autopilot)
+    texts = mission_files(plan, [autopilot])
     return {name: fly(text) for name, text in texts.items() if name.endswith(".waypoints")}
 
 
@@ -210,7 +210,7 @@ def test_a_mission_never_holds_more_items_than_the_autopilot():
     options = Options(most_items=60)
     plan = plan_area(make_area([on_globe(shell)]), 1, 10.0, foot, method="columns", options=options)
     assert len(plan.vehicles[0].sorties) > 1 and any("60 items" in w for w in plan.warnings)
-    for text in mission_files(plan, "ardupilot").values():
+    for text in mission_files(plan, ["ardupilot"]).values():
         if text.startswith("QGC"):
             assert len(text.splitlines()) - 1 <= 60
     assert covered(plan, shell, [], foot) >= 0.999
@@ -372,17 +372,22 @@ def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep
     assert max(sortie.time_s for vehicle in plan.vehicles for sortie in vehicle.sorties) <= 660.0
 
 
-def test_vehicles_as_late_as_real_autopilots_do_not_meet():
+@pytest.mark.parametrize("kinds", [["ardupilot"], ["ardupilot", "px4"]])
+def test_vehicles_that_fly_as_real_autopilots_do_not_meet(kinds):
     grid = LocalGrid(32632)
     start = tuple(grid.to_geographic(CORNER + np.array([-20.0, 300.0])).tolist())
     corners = [(0, 0), (600, 0), (600, 600), (0, 600)]
     area = Area(grid, shapely.Polygon([CORNER + np.array(c) for c in corners]), shapely.MultiPolygon())
+    names = [kinds[k % len(kinds)] for k in range(16)]
 
     def meetings(options):
         plan = plan_area(area, 16, 60.0, footprint(60.0, np.radians(75.0)), options=options)
-        late = [np.array(LATE_S["PX4" if k % 2 else "ArduCopter"]) for k in range(16)]
         homes = [(v.sorties[0].home_lat_deg, v.sorties[0].home_lon_deg) for v in plan.vehicles]
-        return met(flown_late(plan, late), grid.to_grid(*np.array(homes).T) - CORNER)[0]
+        places = grid.to_grid(*np.array(homes).T) - CORNER
+        left = [left_over(names, np.random.default_rng(seed)) for seed in range(3)]
+        return sum(met(flown_tracks(plan, names, seconds), places)[0] for seconds in left)
 
-    assert meetings(Options(starts=[start], separation=Separation(slack_s=3.0))) > 0  # so the flights do cross
-    assert meetings(Options(starts=[start])) == 0
+    plans = plans_of(kinds, [start])
+    if len(kinds) > 1:  # else all are late together
+        assert meetings(plans[0][1]) > 0  # so the flights do cross
+    assert meetings(plans[-1][1]) == 0

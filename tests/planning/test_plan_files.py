@@ -135,7 +135,7 @@ def concave():
 @pytest.mark.parametrize("end", ["rtl", "land", "hover"])
 def test_plan_files_fit_the_schema(autopilot, end):
     plan = small_plan(end)
-    document = json.loads(mission_files(plan, autopilot)["v1.plan"])
+    document = json.loads(mission_files(plan, [autopilot])["v1.plan"])
     jsonschema.validate(document, PLAN)
     mission = document["mission"]
     assert mission["firmwareType"] == {"ardupilot": 3, "px4": 12}[autopilot]
@@ -159,7 +159,7 @@ def test_the_trigger_follows_a_legs_first_waypoint_and_stops_at_its_last():
 
 
 def test_waypoint_files_begin_with_home_and_have_twelve_columns():
-    lines = mission_files(small_plan(), "ardupilot")["v1.waypoints"].splitlines()
+    lines = mission_files(small_plan(), ["ardupilot"])["v1.waypoints"].splitlines()
     assert lines[0] == "QGC WPL 110"
     rows = [line.split("\t") for line in lines[1:]]
     assert {len(r) for r in rows} == {12}
@@ -290,7 +290,7 @@ def test_the_geojson_holds_area_zones_legs_and_ways(concave):
 
 def test_the_report_has_the_promised_keys_and_adds_up(concave):
     _, plan = concave
-    figures = json.loads(json.dumps(report(plan, "px4", 60.0), allow_nan=False))
+    figures = json.loads(json.dumps(report(plan, ["px4"], 60.0), allow_nan=False))
     assert {"covered_share", "makespan_s", "vehicles"} <= figures.keys()
     for vehicle in figures["vehicles"]:
         assert {"id", "length_m", "turns", "time_s", "sorties", "photos"} <= vehicle.keys()
@@ -303,7 +303,7 @@ def test_the_report_has_the_promised_keys_and_adds_up(concave):
 def test_sorties_of_one_vehicle_get_a_file_each():
     area = make_area([on_globe([(0, 0), (900, 0), (900, 700), (0, 700)])])
     plan = plan_area(area, 1, 60.0, footprint(60.0, math.radians(60.0)), options=Options(endurance_s=900.0))
-    names = mission_files(plan, "ardupilot")
+    names = mission_files(plan, ["ardupilot"])
     count = len(plan.vehicles[0].sorties)
     assert count > 1
     assert set(names) == {f"v1-sortie{k + 1}.{kind}" for k in range(count) for kind in ("plan", "waypoints")}

@@ -293,3 +293,16 @@ def test_help_is_quick_and_shows_an_example():
     assert "example:" in done.stdout and "--fov-min" in done.stdout
     heavy = {"numpy", "numba", "shapely", "matplotlib", "pymavlink", "torch"}
     assert not heavy & {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
+
+
+def test_vehicles_are_given_autopilots_in_turn(area, tmp_path, capsys):
+    out = tmp_path / "out"
+    start = "--start={},{}".format(*on_globe([(-50.0, -50.0)]).shell[0])
+    flags = [*FLAGS, "--vehicles", "3", start, "--out", out, "--json"]
+    assert plan(area, *flags, "--autopilot", "ardupilot", "--autopilot", "px4") == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["autopilot"] == "mixed"
+    assert [vehicle["autopilot"] for vehicle in figures["vehicles"]] == ["ardupilot", "px4", "ardupilot"]
+    kinds = [json.loads((out / f"v{k}.plan").read_text())["mission"]["firmwareType"] for k in (1, 2, 3)]
+    assert kinds[0] == kinds[2] != kinds[1]
+    assert "even 20 s off schedule" in figures["separation"]  # the most that one of them needs

@@ -126,7 +126,8 @@ def test_missions_that_cross_without_a_plan_are_red(make_world):
 def test_a_track_takes_the_planners_time_and_height():
     one = line(AP, 0, 80.0)
     assert highest_m(one) == 30.0
-    assert flight_seconds(one) == pytest.approx(30 / 2.5 + 160 / 8 + 30 / 1.5 + 8, abs=8.0)
+    # Takeoff and setting off, climb, 160 m, turning, waiting above home, 20 m down, and the last 10 m.
+    assert flight_seconds(one) == pytest.approx(6 + 30 / 2.5 + 160 / 8 + 5 + 12 + 20 / 1.5 + 10 / 0.5, abs=4.0)
 
 
 def test_the_next_start_keeps_every_pair_apart():

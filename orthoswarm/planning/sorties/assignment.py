@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import End
@@ -36,7 +37,8 @@ class Options:
     """Everything about the flights that has a good default.
 
     Attributes:
-        motion: speeds of the vehicles.
+        motion: speeds of the vehicles, and the times of the slowest autopilot, by which the work is shared.
+        autopilots: the times of each vehicle's autopilot, given in turn; none: those of `motion` for all.
         end: what a sortie does at last: return to launch, land at home, or hover at the end of its last leg.
         starts: takeoff points as (latitude, longitude) in degrees: none (each vehicle starts where its first leg
             begins), one for all, or several that vehicles are given in turn.
@@ -52,6 +54,7 @@ class Options:
     """
 
     motion: Motion = field(default_factory=Motion)
+    autopilots: Sequence[AutopilotConfig] = ()
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     endurance_s: float = float("inf")
@@ -61,6 +64,12 @@ class Options:
     most_items: int = 650
     run_in_m: float = 0.0
     wait_s: float = 0.0
+
+    def motion_of(self, vehicle: int) -> Motion:
+        """How a vehicle, counted from 0, moves."""
+        if not self.autopilots:
+            return self.motion
+        return replace(self.motion, autopilot=self.autopilots[vehicle % len(self.autopilots)])
 
     def check(self) -> None:
         """Refuse values that mean nothing.
@@ -166,9 +175,11 @@ class Crew:
         climb = self._heights.above_m
         if self.starts is not None:
             climb = max(self._heights.at(home, 0.0) - self._heights.ground_at(home) for home in self.starts)
-        fixed = (climb + above) / motion.climb_m_s + motion.speed_m_s / motion.acceleration_m_s2
+        fixed = (climb + above) / motion.climb_m_s + motion.stop_s
+        fixed += motion.autopilot.takeoff_s + motion.autopilot.set_off_s + motion.autopilot.height_change_s
         if self._returns:
-            fixed += (climb + above) / motion.descent_m_s + above / motion.climb_m_s
+            fixed += (climb + above) / motion.descent_m_s + motion.landing_s(climb + above)
+            fixed += above / motion.climb_m_s + motion.autopilot.height_change_s
         most_legs = max(
             1,
             (self._options.most_items - active().planning.spare_items)
@@ -194,7 +205,7 @@ class Crew:
         if by_time.balance <= active().planning.fair_balance:
             return by_time
         # Where turns take most of the time, even times are uneven paths: try even paths, too.
-        by_length = self._shared(legs, reorder, replace(self._options.motion, acceleration_m_s2=math.inf))
+        by_length = self._shared(legs, reorder, self._options.motion.without_turns())
         return by_length if by_length.score < by_time.score else by_time
 
     def _shared(self, legs: Array, reorder: bool, motion: Motion) -> Work:
@@ -216,7 +227,8 @@ class Crew:
             homes.append(home)
             work.append(flown)
             lengths.append(sum(f.length_m for f in flights))
-            times.append(sum(f.time_s(options.motion) for f in flights) + (len(flights) - 1) * self._limits.swap_s)
+            moves = options.motion_of(vehicle)
+            times.append(sum(f.time_s(moves) for f in flights) + (len(flights) - 1) * self._limits.swap_s)
         return Work(work, homes, max(times), max(lengths) / (sum(lengths) / len(lengths)))
 
     def schedule(self, work: Work) -> list[list[Slot]]:
@@ -225,7 +237,8 @@ class Crew:
         for vehicle, (flown, home) in enumerate(zip(work.sorties, work.homes, strict=True)):
             waits = [0.0] * (len(flown) - 1) + [self._wait_s(flown[-1], home, float(self._endurances_s[vehicle]))]
             makers.append([partial(self._flight, f, home, wait_s=w) for f, w in zip(flown, waits, strict=True)])
-        return separate(makers, self._options.motion, self._options.separation)
+        motions = [self._options.motion_of(vehicle) for vehicle in range(len(makers))]
+        return separate(makers, motions, self._options.separation)
 
     def _wait_s(self, legs: Array, home: Array, endurance_s: float) -> float:
         """How long a vehicle can stay at the end of a flight: as long as is asked for and its endurance allows."""

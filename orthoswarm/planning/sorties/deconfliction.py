@@ -38,7 +38,7 @@ class Separation:
     distance_m: float = 10.0
     height_m: float = 5.0
     layers: int = 4
-    slack_s: float = field(default_factory=lambda: active().planning.schedule_slack_s)
+    slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = 5.0
     swap_s: float = 120.0
 
@@ -152,13 +152,13 @@ class _Frozen:
 class _Sky:
     """The flights placed so far."""
 
-    def __init__(self, motion: Motion, apart: Separation) -> None:
-        self._motion, self._apart = motion, apart
+    def __init__(self, speed_m_s: float, apart: Separation) -> None:
+        self._apart = apart
         self._tracks: list[tuple[int, _Track]] = []
         # Between samples a vehicle moves: half a step is added to the distance to keep.
-        self._reach = apart.distance_m + 0.5 * _step_s() * motion.speed_m_s
+        self._reach = apart.distance_m + 0.5 * _step_s() * speed_m_s
 
-    def place(self, make: Maker, ready_s: float) -> Slot:
+    def place(self, make: Maker, motion: Motion, ready_s: float) -> Slot:
         """Give a flight its layers and takeoff, not before it is ready, and remember it."""
         ready = int(np.ceil(ready_s / _step_s()))
         layers = self._apart.layers + 1
@@ -171,7 +171,7 @@ class _Sky:
             if best is not None and price + soonest >= best[0]:
                 break
             flight = make(out * self._apart.height_m, home * self._apart.height_m)
-            track = _sampled(flight, self._motion, active().planning.pad_distances * self._apart.distance_m)
+            track = _sampled(flight, motion, active().planning.pad_distances * self._apart.distance_m)
             marks = self._launches(track, ready)
             if best is None:  # whatever the layers, takeoffs at one start come one after the other
                 soonest = _first_zero(marks) * _step_s()
@@ -234,25 +234,25 @@ def _first_zero(marks: NDArray[np.int64]) -> int:
     return int(np.argmax(np.cumsum(marks) == 0))
 
 
-def separate(sorties: Sequence[Sequence[Maker]], motion: Motion, apart: Separation) -> list[list[Slot]]:
+def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apart: Separation) -> list[list[Slot]]:
     """Layers and takeoff times for all sorties of all vehicles.
 
     Args:
         sorties: per vehicle and sortie, what makes its flight with the way out, and the way home, so many metres
             higher than the legs.
-        motion: says where a vehicle is when.
+        motions: say where each vehicle is when.
         apart: the distances to keep.
 
     Returns:
         The same structure with layers, start and flight.
     """
-    sky = _Sky(motion, apart)
+    sky = _Sky(max(motion.speed_m_s for motion in motions), apart)
     result: list[list[Slot]] = [[] for _ in sorties]
     ready = [0.0] * len(sorties)
     for turn in range(max(map(len, sorties))):
-        due = {v: ready[v] + row[turn](0.0, 0.0).time_s(motion) for v, row in enumerate(sorties) if turn < len(row)}
+        due = {v: ready[v] + row[turn](0.0, 0.0).time_s(motions[v]) for v, row in enumerate(sorties) if turn < len(row)}
         for vehicle in sorted(due, key=lambda v: -due[v]):  # a delay hurts least where there is time left: it goes last
-            slot = sky.place(sorties[vehicle][turn], ready[vehicle])
+            slot = sky.place(sorties[vehicle][turn], motions[vehicle], ready[vehicle])
             result[vehicle].append(slot)
-            ready[vehicle] = slot.start_s + slot.flight.time_s(motion) + apart.swap_s
+            ready[vehicle] = slot.start_s + slot.flight.time_s(motions[vehicle]) + apart.swap_s
     return result

@@ -1,34 +1,38 @@
 """How long a multirotor takes along a path, and where it is when."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
+from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.angles import wrap_rad
 
 Array = NDArray[np.float64]
 
 _TURN_RAD = np.radians(10.0)
+_SPOT_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A simple multirotor: constant speed on straights, time lost where the direction changes.
+    """A multirotor: constant speed on straights, and what its autopilot loses in turns, takeoff and landing.
 
     Attributes:
         speed_m_s: ground speed without wind.
-        acceleration_m_s2: horizontal acceleration (ArduCopter's default is 2.5).
         climb_m_s: rate of climb.
         descent_m_s: rate of descent.
         wind_m_s: where the wind blows to, east and north. The speed is then that through the air.
+        autopilot: acceleration in turns, and the times of takeoff and landing.
     """
 
     speed_m_s: float = 10.0
-    acceleration_m_s2: float = 2.5
     climb_m_s: float = 2.5
     descent_m_s: float = 1.5
     wind_m_s: tuple[float, float] = (0.0, 0.0)
+    autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
 
     @property
     def crab_rad(self) -> float:
@@ -55,7 +59,11 @@ class Motion:
         The velocity changes by 2 v sin(angle / 2), which takes that over the acceleration; half of it is lost
         against constant speed. A full stop and start costs v / a.
         """
-        return np.asarray(self.speed_m_s * np.sin(0.5 * angle_rad) / self.acceleration_m_s2)
+        return np.asarray(self.speed_m_s * np.sin(0.5 * angle_rad) / self.autopilot.acceleration_m_s2)
+
+    def without_turns(self) -> "Motion":
+        """The same vehicle, if turns took no time."""
+        return replace(self, autopilot=replace(self.autopilot, acceleration_m_s2=math.inf))
 
     @property
     def turn_m(self) -> float:
@@ -63,24 +71,50 @@ class Motion:
         return float(2.0 * self.turn_s(np.array(0.5 * np.pi)) * self.speed_m_s)
 
     def times(self, points: Array) -> Array:
-        """When each point (n, 3) of a path is passed, seconds from 0, starting and ending at rest."""
+        """When each point (n, 3) of a path is passed, seconds from 0, starting at rest.
+
+        A first step straight up is a takeoff, a last one straight down a landing, which begins with slowing down.
+        """
         step = np.diff(points, axis=0)
         flat = np.hypot(step[:, 0], step[:, 1])
         rise = step[:, 2]
         vertical = np.maximum(rise, 0.0) / self.climb_m_s + np.maximum(-rise, 0.0) / self.descent_m_s
         seconds = np.maximum(flat / self.ground_speed(step[:, :2]), vertical)
-        moving = np.flatnonzero(flat > 0.01)
+        moving = np.flatnonzero(flat > _SPOT_M)
         if len(moving):
             seconds[moving[1:]] += self.turn_s(angles(points))
-            seconds[moving[0]] += 0.5 * self.speed_m_s / self.acceleration_m_s2
-            seconds[moving[-1]] += 0.5 * self.speed_m_s / self.acceleration_m_s2
+            seconds[moving[0]] += self.autopilot.set_off_s + 0.5 * self.stop_s
+        upright = (flat <= _SPOT_M) & (np.abs(rise) > _SPOT_M)
+        ends = np.zeros(len(step), bool)
+        if len(step) and upright[0] and rise[0] > 0.0:
+            ends[0] = True
+            seconds[0] += self.autopilot.takeoff_s
+        if len(step) and upright[-1] and rise[-1] < 0.0:
+            ends[-1] = True
+            seconds[-1] += self.landing_s(-float(rise[-1]))
+        seconds[upright & ~ends] += self.autopilot.height_change_s
         return np.concatenate([[0.0], np.cumsum(seconds)])
+
+    @property
+    def stop_s(self) -> float:
+        """Seconds lost by a full stop and start."""
+        return self.speed_m_s / self.autopilot.acceleration_m_s2
+
+    def landing_s(self, height_m: float) -> float:
+        """Seconds that coming down from above home takes longer than a descent at the usual rate."""
+        slow_m = min(height_m, self.autopilot.landing_below_m)
+        return self.autopilot.home_wait_s + slow_m / self.autopilot.landing_m_s - slow_m / self.descent_m_s
+
+
+def autopilot_config(name: str) -> AutopilotConfig:
+    """What is known of an autopilot's times: of PX4 if its name is `px4`, otherwise of ArduCopter."""
+    return active().px4 if name == "px4" else active().ardupilot
 
 
 def angles(points: Array) -> Array:
     """Changes of direction in radians, [0, pi], along a path (n, 2 or 3), points on one spot skipped."""
     step = np.diff(points[:, :2], axis=0)
-    step = step[np.hypot(*step.T) > 0.01]
+    step = step[np.hypot(*step.T) > _SPOT_M]
     heading = np.arctan2(step[:, 1], step[:, 0])
     return np.asarray(np.abs(wrap_rad(np.diff(heading))))
 

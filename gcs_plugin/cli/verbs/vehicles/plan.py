@@ -42,7 +42,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
-    add("--autopilot", choices=["ardupilot", "px4"], default="ardupilot", help="whose dialect (default ardupilot)")
+    autopilot_help = "whose dialect and times of flight; give it again for vehicles in turn (default ardupilot)"
+    add("--autopilot", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
     relief_help = "with --dem: legs follow the ground, lie at one level, or whichever is done sooner (default auto)"
@@ -98,8 +99,8 @@ def run(args: argparse.Namespace) -> int:
     _say("files")
     from gcs_plugin.plans.plan_picture import draw
 
-    figures = report(plan, args.autopilot, request.fov_min_deg)
-    files: dict[str, str | bytes] = dict(mission_files(plan, args.autopilot))
+    figures = report(plan, request.autopilots, request.fov_min_deg)
+    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
     files["plan.png"] = draw(plan, area)
@@ -135,7 +136,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         fov_min_deg=args.fov_min if args.map is None else _fov_of_map(args.map, args.dem is None),
         no_fly=args.no_fly,
         method=args.method,
-        autopilot=args.autopilot,
+        autopilots=args.autopilot or ["ardupilot"],
         end=args.end,
         starts=[_position(text) for text in args.start],
         speed_m_s=args.speed,

@@ -1,0 +1,56 @@
+"""How much longer autopilots with their factory settings take than constant speed on straight lines.
+
+Measured in flights of both firmwares in simulation: 44 of ArduCopter 4.7 and 8 of PX4 1.17 (docs/vehicles.md).
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArduPilotConfig:
+    """ArduCopter."""
+
+    acceleration_m_s2: float = 2.5
+    """Acceleration in turns, metres per second squared (its WPNAV_ACCEL; turns take what follows from it to 0.5 s)."""
+    takeoff_s: float = 2.6
+    """Seconds lost in the takeoff, against its rate of climb (measured: 2.3 to 2.9)."""
+    set_off_s: float = 3.0
+    """Seconds above its home until it accelerates towards the first point (measured: 2.6 to 3.3)."""
+    height_change_s: float = 1.4
+    """Seconds lost in a climb or descent on one spot amid the flight (measured: 0.9 to 2.2)."""
+    home_wait_s: float = 12.0
+    """Seconds of slowing down and waiting above home before it descends (measured: 10 to 14; 5 are RTL_LOIT_TIME)."""
+    landing_m_s: float = 0.5
+    """Rate of the last part of the descent, metres per second (its LAND_SPEED)."""
+    landing_below_m: float = 10.0
+    """Height above home at which that part begins, metres (its LAND_ALT_LOW)."""
+    schedule_slack_s: float = 10.0
+    """How much later than planned one vehicle may be than another while they stay separated, seconds: four times the
+    greatest difference from these times in flight (measured: 2.4), for wind, loads and other settings."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Px4Config:
+    """PX4 multicopters."""
+
+    acceleration_m_s2: float = 1.0
+    """Acceleration in turns, metres per second squared (measured: it nearly stops at each waypoint, a right angle at
+    10 m/s takes 6.4 to 7.1 s)."""
+    takeoff_s: float = 5.5
+    """Seconds lost in the takeoff, against a rate of climb of 2.5 m/s (measured: 3.7 to 8.3)."""
+    set_off_s: float = 2.0
+    """Seconds above its home until it accelerates towards the first point (measured: 0.5 to 2.7)."""
+    height_change_s: float = 2.2
+    """Seconds lost in a climb or descent on one spot amid the flight (measured: 1.1 to 3.7)."""
+    home_wait_s: float = 10.0
+    """Seconds of slowing down and waiting above home before it descends (measured: 7 to 12, once 16)."""
+    landing_m_s: float = 0.7
+    """Rate of the last part of the descent, metres per second (its MPC_LAND_SPEED)."""
+    landing_below_m: float = 7.5
+    """Height above home at which that part begins, metres (between its MPC_LAND_ALT1 and MPC_LAND_ALT2)."""
+    schedule_slack_s: float = 20.0
+    """How much later than planned one vehicle may be than another while they stay separated, seconds: more than two
+    vehicles differed in flight (measured: up to 7 late at 10 m/s, up to 12 at 5 m/s, up to 6 early)."""
+
+
+AutopilotConfig = ArduPilotConfig | Px4Config
