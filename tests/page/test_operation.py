@@ -20,6 +20,8 @@ from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess,
 playwright = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 REFINED = "async () => (await (await fetch('/api/completions')).json()).filter((row) => 'version' in row).length"
+IDLE = "async () => (await (await fetch('/api/jobs')).json()).every((job) => !/queued|running/.test(job.state))"
+LATE_MS = 15_000  # the daemon refines what a vehicle takes after its mission once it has been silent for 8 s
 WORDS = "[...document.querySelectorAll('.tile .word')].map((e) => e.textContent)"
 
 
@@ -93,15 +95,19 @@ def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address, s
         row = next(filter(has_position, rows))
         page = opened_here.enter_context(opened(browser, f"{served.url}/#token={served.token}", size, fake=False))
         page.set_default_timeout(600_000)
-        operate(page, tmp_path, small_area(row["lat_deg"], row["lon_deg"]), vehicles=1, altitude_m=60, fov_deg=75)
+        area = small_area(row["lat_deg"], row["lon_deg"])
+        operate(page, tmp_path, area, vehicles=1, altitude_m=60, fov_deg=75, way_home=True)
 
 
 def has_position(row):
     return bool(row.get("lat_deg")) and (row.get("gps_fix") or 0) >= 3
 
 
-def operate(page, folder, area, *, vehicles, altitude_m, fov_deg):
-    """Plan, check, fly, pause, resume, complete, mark a find, take the pack; leaves a picture of each in the folder."""
+def operate(page, folder, area, *, vehicles, altitude_m, fov_deg, way_home=False):
+    """Plan, check, fly, pause, resume, complete, mark a find, take the pack; leaves a picture of each in the folder.
+
+    `way_home`: pictures of it come after the mission is complete, and the pack waits for them, too.
+    """
     page.click("#tab-plan")
     file = {"name": "area.geojson", "mimeType": "application/json", "buffer": json.dumps(area).encode()}
     page.set_input_files("input[type=file]", files=[file])
@@ -149,6 +155,12 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg):
     accessible(page)
     page.click(".find-pictures button[aria-label=Close]")
     poll_until(page, lambda: page.evaluate(REFINED) == vehicles)
+    if way_home:
+        page.click("#tab-fly")
+        until(page, vehicles, "t === 'complete' || t === 'on ground'")
+        page.wait_for_timeout(LATE_MS)
+        poll_until(page, lambda: page.evaluate(IDLE))
+        page.click("#tab-map")
     page.click("#panel-map form button:text-is('Export')")
     link = page.locator(".files a:has-text('map.zip')")
     link.wait_for(timeout=240_000)
