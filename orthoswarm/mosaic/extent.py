@@ -44,9 +44,9 @@ def from_takeoff(
 ) -> tuple[Sequence[PlacedFrame], float]:
     """Cameras and ground moved together until heights count from the takeoff level as well as that is known.
 
-    Images leave the zero of the heights open by some decimetres. Two things tell it: the recorded heights count from
-    the takeoff level, and the takeoff spot is a piece of the mapped ground, as far from its median level as the relief
-    makes it. Their weighted mean becomes zero. No homography changes by this, only the heights stated with it.
+    Images leave the zero of the heights open by some decimetres. Two observations fix it: the recorded heights count
+    from the takeoff level, and the place of takeoff is part of the mapped ground, off its median level by no more than
+    the relief. Their weighted mean becomes zero. No homography changes by this, only the heights stated with it.
 
     Args:
         placed: placed frames.

@@ -20,7 +20,7 @@ def tan_limit() -> float:
 
 
 def least_descent() -> float:
-    """What a ray goes down per unit of depth at that angle at least: a straight line that cuts off the horizon."""
+    """Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
     return float(np.cos(np.radians(active().mosaic.most_off_nadir_deg)))
 
 

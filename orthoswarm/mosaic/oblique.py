@@ -53,7 +53,7 @@ def stray_warning(reasons: dict[str, str]) -> list[str]:
 def weakly_held_warning(placed: Sequence[PlacedFrame], reported: Sequence[PlacedFrame] = ()) -> list[str]:
     """The warning about pictures with too few observations in the adjustment; they are drawn where no other looks.
 
-    Those reported already are left out, and so are all where none is better.
+    `reported`: pictures that another warning names. There is no warning where all pictures are like that.
     """
     known = {p.frame.image for p in reported}
     weak = sorted(p.frame.image for p in placed if p.weak and p.frame.image not in known)

@@ -156,7 +156,7 @@ def _thinned(meetings: _Meetings, frames: int) -> _Meetings:
 
 
 def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain) -> OverlapColors:
-    """The samples at places of which both frames tell a colour."""
+    """The samples at places whose colour both frames show."""
     count = len(meetings.a)
     ratio, usable = np.zeros((count, 3), np.float32), np.zeros(count, bool)
     contrast = np.zeros(count, np.float32)

@@ -149,7 +149,7 @@ def add_logs(
         vehicle: id, for messages.
         logs: all logs.
         findings: findings are appended here.
-        workers: threads that read photos if times do not tell which camera event they belong to.
+        workers: threads that read photos if their times do not decide which camera event they belong to.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):

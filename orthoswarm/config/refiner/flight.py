@@ -58,8 +58,10 @@ class FlightConfig:
     first_height_sigma_m: float = 0.5
     """Sigma of a recorded height to begin with, metres (chosen; not measured)."""
     height_leap_m: float = 5.0
-    """A recorded height that leaves those around it by more than this is replaced by theirs, metres: a spike, or the
-    climb after the takeoff."""
+    """A recorded height that leaves those around it by more than this is a spike, which is replaced by theirs, or a
+    climb, metres (chosen; not measured)."""
+    fastest_climb_m_s: float = 10.0
+    """Greatest rate at which heights are a climb or descent and no spike, metres per second (multirotors: up to 8)."""
     height_reach_photos: int = 3
     """Photos before and after whose median is compared with a recorded height (chosen; not measured)."""
     height_sigma_range_m: tuple[float, float] = (0.1, 2.0)

@@ -1,4 +1,4 @@
-"""Lenses as rows of numbers for the compiled kernels, with boxes that tell quickly what they see."""
+"""Lenses as rows of numbers for the compiled kernels, with boxes of what they certainly and possibly see."""
 
 from functools import lru_cache
 

@@ -175,7 +175,7 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     n = len(records.position)
     width, height = pictures.size
     position = records.position.copy()
-    position[:, 2], z_sigma = _height_prior(records, calibration)
+    position[:, 2], z_sigma = height_prior(records, calibration)
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
@@ -212,12 +212,12 @@ def first_points(cameras: CameraBlock, tracks: Tracks) -> Array:
     return np.column_stack([*xy, np.zeros(tracks.count)])
 
 
-def _height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Array, Array]:
+def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Array, Array]:
     """Recorded heights above the ground and their sigmas; one common height if the record is not trusted.
 
-    A height unlike those around it may be a spike or the climb after takeoff: it is replaced by the others' height with
-    a
-    sigma as large as the difference, and the pictures decide.
+    A height unlike those around it may be a spike or the climb after takeoff: its sigma becomes as large as the
+    difference, and the pictures decide. A spike, at which no vehicle arrives in the time that it has, also gets the
+    others' height.
     """
     c = active().flight
     z = records.position[:, 2]
@@ -227,7 +227,17 @@ def _height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arr
     smooth = np.array([np.median(z[max(0, i - reach) : i + reach + 1]) for i in range(len(z))])
     off = np.abs(z - smooth)
     leaps = off > c.height_leap_m
-    return np.where(leaps, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
+    spikes = leaps & ~_climbed_to(records)
+    return np.where(spikes, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
+
+
+def _climbed_to(records: FlightRecords) -> NDArray[np.bool_]:
+    """Heights that a vehicle reaches from those before and after in the time between them, bool (N,)."""
+    if not records.timed:
+        return np.zeros(len(records.position), bool)
+    rise = np.abs(np.diff(records.position[:, 2]))
+    can = rise <= active().flight.fastest_climb_m_s * np.diff(records.time_s)
+    return np.asarray(np.concatenate([[True], can]) & np.concatenate([can, [True]]))
 
 
 def fov_deg(flight: Flight) -> float:

@@ -35,7 +35,7 @@ _NEGLIGIBLE = 16.0
 _MARGIN = 0.9
 """Of the shortest interval seen: none is expected below."""
 _COARSE_S = 0.5
-"""Resolution of a clock from which on pictures tell more than times do."""
+"""Resolution of a clock from which on pictures decide better than times."""
 _LEAST_AGREEMENT = 0.9
 _LEAST_MATCHED = 0.6
 """Share of photos or events with a partner; a clock that leaves more alone is not the right one."""
