@@ -10,7 +10,7 @@ from orthoswarm.config import active
 from orthoswarm.model.geo import local_origin
 from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.features.flow_calibration import Calibration
-from orthoswarm.refine.flight.relative_block import _height_prior
+from orthoswarm.refine.flight.relative_block import height_prior
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
@@ -65,10 +65,10 @@ def test_heights_that_leave_those_around_them_are_as_doubtful_as_they_differ(sce
     told = Calibration(
         focal_px=200.0, height_m=90.0, yaw_offset=np.zeros(len(frames)), trusted_height=True, pairs=6, warnings=[]
     )
-    height, sigma = _height_prior(records, told)
+    height, sigma = height_prior(records, told)
     expected = np.full(len(frames), active().flight.first_height_sigma_m)
     expected[[0, 9]] = 70.0, 310.0
     np.testing.assert_allclose(sigma, expected)
     assert height[15] == 93.0 and (np.delete(height, 15) == 90.0).all()
-    height, sigma = _height_prior(records, replace(told, trusted_height=False, height_m=55.0))
+    height, sigma = height_prior(records, replace(told, trusted_height=False, height_m=55.0))
     assert (height == 55.0).all() and (sigma == active().flight.first_height_sigma_m).all()
