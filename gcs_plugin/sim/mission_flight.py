@@ -1,6 +1,7 @@
 """A simulated vehicle's flight of its mission: items, camera, and the end as its autopilot does it."""
 
 import enum
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from random import Random
@@ -22,11 +23,14 @@ from gcs_plugin.mission.items import (
 )
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion, Pose
+from orthoswarm.model.angles import wrap_rad
 
 _LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
 _RTL_HEIGHT_M: Final = 15.0
 _REACHED_M: Final = 1.5
-_FINAL_SINK_M_S: Final = 0.7
+_FINAL_SINK_M_S, _FINAL_BELOW_M = 0.7, 5.0
+_OWN_TAKEOFF_S: Final = 0.7  # what the motion itself loses: by gathering speed in a takeoff,
+_OWN_STOP_S: Final = 1.0  # and by slowing down above home
 
 
 class Landed(enum.IntEnum):
@@ -231,7 +235,10 @@ class Flight:
                 self.motion.go((0.0, 0.0, self.motion.up))
                 self._task = Task.GO_HOME
             case Task.GO_HOME if self.motion.distance()[0] < _REACHED_M:
-                self._descend(0.0, 0.0)
+                times = self.motion.airframe.times
+                self._waited += STEP_S
+                if times is None or self._waited > times.home_wait_s - _OWN_STOP_S:
+                    self._descend(0.0, 0.0)
             case Task.DESCEND:
                 self._touch_down()
         if self._trigger_m > 0.0 and self.landed is Landed.IN_AIR:
@@ -339,12 +346,33 @@ class Flight:
             return
         self._waited += STEP_S
         hold = item.params[0] if item.command in (16, _LOITER_TIME, DELAY) else 0.0
-        if self._waited <= hold:
+        if self._waited <= hold + self._lost_s(item):
             return
         if item.command == TAKEOFF:
             self.landed = Landed.IN_AIR
         self._reach(self.seq)
         self._run_from(self.seq + 1)
+
+    def _lost_s(self, item: MissionItem) -> float:
+        """Seconds that the autopilot takes at a point beyond its motion."""
+        motion, times = self.motion, self.motion.airframe.times
+        if times is None or motion.target is None:
+            return 0.0
+        if item.command == TAKEOFF:
+            return times.takeoff_s + times.set_off_s - _OWN_TAKEOFF_S
+        came, goes = _step(motion.came_from, motion.target), _step(motion.target, self._next_place())
+        if not came or not goes:
+            return times.height_change_s
+        angle = abs(wrap_rad(math.atan2(goes[1], goes[0]) - math.atan2(came[1], came[0])))
+        return motion.airframe.turn_s(motion.speed, angle)
+
+    def _next_place(self) -> tuple[float, ...]:
+        """North and east of the point after the present one; home at the end."""
+        seq = self._next_nav(self.seq + 1)
+        item = None if seq is None else self.store.items[seq]
+        if item is None or not (item.x or item.y):
+            return 0.0, 0.0
+        return self.motion.chart.to_metres(item.lat_deg, item.lon_deg)
 
     def _reach(self, seq: int) -> None:
         self._reached_any = True
@@ -367,16 +395,17 @@ class Flight:
         self._trigger_m = 0.0
         north, east = self.motion.seen
         self.motion.go((north, east, max(self.motion.up, _RTL_HEIGHT_M)))
-        self._task = Task.CLIMB_HOME
+        self._task, self._waited = Task.CLIMB_HOME, 0.0
 
     def _descend(self, north: float, east: float) -> None:
         self.landed, self._task = Landed.LANDING, Task.DESCEND
         self.motion.go((north, east, -1.0))
 
     def _touch_down(self) -> None:
-        motion = self.motion
-        if motion.up < 5.0 and motion.vu < -_FINAL_SINK_M_S:
-            motion.vu = -_FINAL_SINK_M_S
+        motion, times = self.motion, self.motion.airframe.times
+        sink, below = (_FINAL_SINK_M_S, _FINAL_BELOW_M) if times is None else (times.landing_m_s, times.landing_below_m)
+        if motion.up < below and motion.vu < -sink:
+            motion.vu = -sink
         if motion.up > 0.05:
             return
         in_mission = self.mode == self.modes.mission and self._ends_mission
@@ -407,3 +436,9 @@ class Flight:
             return
         lat, lon = self.motion.chart.to_degrees(north, east)
         self.exposures.append(Exposure(len(self.exposures), self.time_s, self.motion.pose(self.time_s), lat, lon))
+
+
+def _step(before: tuple[float, ...], place: tuple[float, ...]) -> tuple[float, float] | None:
+    """North and east of a step, None on one spot."""
+    step = place[0] - before[0], place[1] - before[1]
+    return step if math.hypot(*step) > 2.0 * _REACHED_M else None

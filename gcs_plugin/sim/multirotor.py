@@ -9,12 +9,14 @@ does, so that the true path drifts while the recorded one looks straight.
 import bisect
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Final
 
+from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.earth import EQUATOR_RADIUS_M
+from orthoswarm.planning.sorties import flight_time as planner
 
 _GRAVITY: Final = 9.80665
 _ECCENTRICITY2: Final = 6.69437999014e-3
@@ -86,6 +88,7 @@ class Airframe:
         drag: forward lean at speed, m/s2 per m/s.
         yaw_rate: turning speed, rad/s.
         gps_sigma_m: one sigma of the receiver's horizontal error, which wanders with gps_tau_s.
+        times: what an autopilot takes beyond its motion; None flies as fast as the motion allows.
     """
 
     speed_m_s: float = 8.0
@@ -96,6 +99,19 @@ class Airframe:
     yaw_rate: float = math.radians(60.0)
     gps_sigma_m: float = 0.0
     gps_tau_s: float = 60.0
+    times: AutopilotConfig | None = None
+
+    def as_flown(self, times: AutopilotConfig) -> "Airframe":
+        """The same vehicle with the times of a real autopilot, and its rates of climb and descent."""
+        usual = planner.Motion()
+        return replace(self, climb_m_s=usual.climb_m_s, sink_m_s=usual.descent_m_s, times=times)
+
+    def turn_s(self, speed_m_s: float, angle_rad: float) -> float:
+        """Seconds that its autopilot takes longer than its motion for a turn."""
+        if self.times is None:
+            return 0.0
+        slower = 1.0 / self.times.acceleration_m_s2 - 1.0 / self.accel_m_s2
+        return max(0.0, speed_m_s * math.sin(0.5 * angle_rad) * slower)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -153,6 +169,11 @@ class Motion:
         """Stand on the ground."""
         self.vn = self.ve = self.vu = self._an = self._ae = self.pitch = self.roll = self.up = 0.0
         self.target = None
+
+    @property
+    def came_from(self) -> tuple[float, float]:
+        """North and east of where the way to the target began."""
+        return self._start
 
     @property
     def seen(self) -> tuple[float, float]:

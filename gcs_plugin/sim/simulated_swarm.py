@@ -18,6 +18,7 @@ from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import InputError
+from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _TICK_S: Final = 0.02
 
@@ -220,6 +221,7 @@ def make_swarm(
     home: tuple[float, float, float] = (47.397742, 8.545594, 488.0),
     spacing_m: float = 5.0,
     airframe: Airframe | None = None,
+    as_flown: bool = False,
     seed: int = 0,
     boot_utc_s: float | None = None,
     **options: Any,
@@ -231,7 +233,7 @@ def make_swarm(
         autopilots: dialects, taken in turn.
         home: latitude, longitude (degrees), altitude (metres) of the first.
         spacing_m: distance between neighbours.
-        airframe: what they can do.
+        airframe: what they can do. as_flown: they take the times of real autopilots.
         seed: varies their receivers' errors and, a little, their headings.
         boot_utc_s: UTC of their boot; now unless said.
         options: more of SimVehicle.
@@ -247,7 +249,7 @@ def make_swarm(
             system=number + 1,
             autopilot=autopilots[number % len(autopilots)],
             home=(lat, lon, home[2]),
-            airframe=airframe or Airframe(),
+            airframe=_airframe(airframe or Airframe(), autopilots[number % len(autopilots)], as_flown),
             boot_utc_s=utc,
             seed=seed,
             **options,
@@ -255,3 +257,7 @@ def make_swarm(
         vehicle.flight.motion.yaw = random.uniform(-0.3, 0.3)
         swarm.append(vehicle)
     return swarm
+
+
+def _airframe(frame: Airframe, autopilot: Autopilot, as_flown: bool) -> Airframe:
+    return frame.as_flown(autopilot_config(autopilot.value)) if as_flown else frame

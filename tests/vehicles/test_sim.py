@@ -20,10 +20,12 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
+from gcs_plugin.mission.track import flight_seconds
 from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -390,3 +392,28 @@ def test_a_radio_carries_no_more_than_its_rate():
         radio.put("packet", 0.0, 100)  # three seconds' worth at once: what would wait longer than one is lost
     assert len(radio.take(0.55)) == 5 and radio.lost == 19
     assert len(radio.take(2.0)) == 6
+
+
+@BOTH
+def test_a_vehicle_as_flown_takes_the_times_of_its_autopilot(autopilot):
+    items = [at(WAYPOINT, 0, 0)] if autopilot is AP else []
+    items += [at(TAKEOFF, 0, 0, 40.0, autopilot), MissionItem.do(CHANGE_SPEED, 1, 10)]
+    corners = [(60, 20), (60, 200), (90, 200), (90, 20), (0, 0)]
+    items += [at(WAYPOINT, *corner, 40.0, autopilot) for corner in corners]
+    mission = Mission(autopilot, (*items, MissionItem.do(RTL)))
+
+    def flown_s(airframe):
+        sim = SimVehicle(system=1, autopilot=autopilot, airframe=airframe)
+        world = make_world([sim])
+        world.meet()
+        assert world.finish(world.fleet.upload(1, mission))[0].ok
+        assert world.finish(world.fleet.start(1))[0].ok
+        assert world.until(lambda: sim.flight.motion.up > 0.3, 30.0)
+        begun = world.clock.now
+        assert world.until(lambda: not sim.flight.armed, 600.0)
+        return world.clock.now - begun
+
+    times = autopilot_config(autopilot.value)
+    planned = flight_seconds(mission)
+    assert flown_s(Airframe().as_flown(times)) == pytest.approx(planned, abs=0.5 * times.schedule_slack_s)
+    assert flown_s(Airframe()) < planned - times.schedule_slack_s

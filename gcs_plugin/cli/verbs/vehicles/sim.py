@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     }[args.autopilot]  # fmt: skip
     vehicles = make_swarm(
         args.vehicles, autopilots=autopilots, home=_home(args.home), spacing_m=args.spacing,
-        airframe=Airframe(gps_sigma_m=args.gps_sigma), seed=args.seed, ready_s=args.ready,
+        airframe=Airframe(gps_sigma_m=args.gps_sigma), as_flown=True, seed=args.seed, ready_s=args.ready,
         wipes=args.wipe,
     )  # fmt: skip
     events = sorted([*_events(args.reboot, "reboot"), *_events(args.silence, "silence")])
