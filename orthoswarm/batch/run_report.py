@@ -1,5 +1,6 @@
 """The report of a run: frames.jsonl, footprints, report.json and the report's page."""
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -72,8 +73,10 @@ def _report(
     solutions = refinement.fine if refinement else []
     wall, cpu, memory = run.clock.totals()
     count, left_out = len(placed), len(state.rejected)
+    reasons = Counter(r.reason for r in state.rejected.values())
     return {
         "frames": {"input": count + left_out, "used": count, "rejected": left_out},
+        "left_out": dict(reasons.most_common()),
         "vehicles": vehicle_rows(solutions, placed),
         "legs": leg_rows(solutions),
         "stages": [stage_row(s) for s in run.clock.stages],

@@ -81,14 +81,19 @@ def test_damaged_files_are_named_and_the_rest_is_mapped(scene, basemap, tmp_path
     assert np.median(errors(scene, rows, shots)) < 1.0
 
 
-def test_photos_without_position_are_left_out(scene, basemap, tmp_path, mosaic):
+def test_photos_without_position_are_left_out_and_counted_by_reason(scene, basemap, tmp_path, mosaic, capsys):
     shots = legs(count=2, photos=8)
     shots[3] = replace(shots[3], tags="none")
     shots[12] = replace(shots[12], tags="none")
     scene.fly(tmp_path / "photos", shots)
     code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
+    reason = rows["DJI_0003.JPG"]["reason"]
     assert code == 0 and report["frames"] == {"input": 16, "used": 14, "rejected": 2}
-    assert "position" in rows["DJI_0003.JPG"]["reason"]
+    assert report["left_out"] == {reason: 2}
+    assert "position" in reason
+    again = ["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "again"), "--until", "realtime"]
+    assert main([*again, "--workers", "1"]) == 0
+    assert f"left out: 2: {reason}" in capsys.readouterr().err
     assert np.median(errors(scene, rows, shots)) < 1.0
 
 

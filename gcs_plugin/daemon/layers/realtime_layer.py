@@ -205,7 +205,10 @@ class Drawer:
         row = self._journal.one(query, (time.time() - self._late_s,))
         before, self.put_off = self.put_off, 0 if row is None else int(row["n"])
         if bool(before) != bool(self.put_off):
-            _log.warning("%s", self.overload or "all pictures are on the map again")
+            if self.put_off:
+                _log.warning("%s", self.overload)
+            else:
+                _log.info("all pictures are on the map again")
         if before != self.put_off:
             self._events.publish("overload", put_off=self.put_off, text=self.overload)
 

@@ -5,6 +5,8 @@ import gc
 from importlib.util import find_spec
 from pathlib import Path
 
+_REASONS = 5  # printed; all are in the report
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
@@ -187,6 +189,14 @@ def _tell(report: dict[str, object], out: Path) -> None:
     frames = report["frames"]
     assert isinstance(frames, dict)
     print(f"{frames['used']} of {frames['input']} pictures mapped in {report['wall_s']:.0f} s: {out}")
+    left_out = report["left_out"]
+    assert isinstance(left_out, dict)
+    reasons = list(left_out.items())
+    for reason, count in reasons[:_REASONS]:
+        print(f"left out: {count}: {reason}", file=sys.stderr)
+    if len(reasons) > _REASONS:
+        rest = sum(count for _, count in reasons[_REASONS:])
+        print(f"left out: {rest} more, see {out / 'report.html'}", file=sys.stderr)
     warnings = report["warnings"]
     assert isinstance(warnings, list)
     for warning in warnings:
