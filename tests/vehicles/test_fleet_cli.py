@@ -88,7 +88,8 @@ def test_a_px4_is_watched_until_it_has_come_home(folder, capsys):
         assert fleet(capsys, "upload", folder / "v1.plan", "--link", link)[0] == 0
         code, flown = fleet(capsys, "start", "--watch", "--seconds", 60, "--link", link, "--json")
     assert code == 0 and flown["ended"]
-    assert [v["flight"]["state"] for v in flown["vehicles"]] == ["complete"]
+    (vehicle,) = flown["vehicles"]  # "on ground" until it says that its motors are off
+    assert vehicle["flight"]["state"] in ("complete", "on ground")
 
 
 def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plans(swarm, folder, capsys):

@@ -20,7 +20,7 @@ from gcs_plugin.daemon.store.journal import Journal, fact_change
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
-from orthoswarm.model.earth import distance_m
+from orthoswarm.model.earth import DEGREE_M, distance_m
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, utm_epsg
@@ -65,7 +65,8 @@ class MapSite:
         self._journal, self._layer, self._folder = journal, layer, folder
         self._gsd_m, self._fov_rad, self._on_area, self._anchor = gsd_m, fov_rad, on_area, anchor
         self._draw_again = draw_again
-        self._far: list[tuple[float, float]] | None = None
+        self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
+        self._counted = 0
         self.area: Area | None = None
         self.grid: LocalGrid | None = None
         self.mosaic: RealtimeMosaic | None = None
@@ -125,24 +126,32 @@ class MapSite:
         if away_m <= _FAR_M:
             return None
         wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
-        if (wrong or (anchor is None and self._is_majority(frame))) and not self._solved():
+        if (wrong or (anchor is None and self._is_majority(frame, self.area))) and not self._solved():
             self._move_away()
             return None
         return (
             f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
         )
 
-    def _is_majority(self, frame: Frame) -> bool:
-        """Whether more frames lie around this one, too far from the map, than on the map."""
-        if self._far is None:
-            rows = self._journal.rows("SELECT pose FROM frames WHERE stage = 'rejected'")
-            poses = [pose for row in rows if is_position(pose := json.loads(row["pose"]))]
-            self._far = [(pose["lat_deg"], pose["lon_deg"]) for pose in poses]
+    def _is_majority(self, frame: Frame, area: Area) -> bool:
+        """Whether more frames lie around this one, too far from the map, than around the map's origin.
+
+        All frames of the journal count, drawn or not: while they are drawn again the map would move to and fro.
+        """
+        for row in self._journal.rows("SELECT seq, pose FROM frames WHERE seq > ? ORDER BY seq", (self._counted,)):
+            self._counted = int(row["seq"])
+            pose = json.loads(row["pose"])
+            if pose.get("lat_deg") is not None and pose.get("lon_deg") is not None and is_position(pose):
+                self._positions.append((pose["lat_deg"], pose["lon_deg"]))
         here = (frame.fix.lat_deg, frame.fix.lon_deg)
-        self._far.append(here)
-        around = sum(distance_m(*here, *other) <= _FAR_M for other in self._far)
-        row = self._journal.one("SELECT COUNT(*) AS n FROM frames WHERE drawn = 1 AND reason IS NULL")
-        return row is not None and around > int(row["n"])
+        return self._around(here) > self._around(_origin_of(area))
+
+    def _around(self, place: tuple[float, float]) -> int:
+        """Number of frames less than a map's reach from a place."""
+        near_deg = 1.01 * _FAR_M / DEGREE_M  # of latitude: most others are out of the question
+        return sum(
+            abs(place[0] - other[0]) <= near_deg and distance_m(*place, *other) <= _FAR_M for other in self._positions
+        )
 
     def _solved(self) -> bool:
         query = "SELECT 1 FROM solutions UNION SELECT 1 FROM coarse LIMIT 1"
@@ -158,7 +167,7 @@ class MapSite:
 
         self._journal.write(change)
         self._draw_again()
-        self.area, self.grid, self.mosaic, self._far = None, None, None, None
+        self.area, self.grid, self.mosaic = None, None, None
         self._layer.replace(None)
 
     def _is_other_scale(self, camera: Camera) -> bool:

@@ -6,7 +6,11 @@ import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
 from gcs_plugin.daemon.layers.anchor import Anchor
+from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.store.journal import Journal, add_frame
 from orthoswarm.model.earth import distance_m
+from orthoswarm.model.frame import Fix, Frame
 from tests.kit.daemon_kit import Shot, camera_at, jpeg, line, pose_of, serving, tile_over
 from tests.kit.sim_cameras import square
 
@@ -55,6 +59,31 @@ def test_most_pictures_anchor_the_map_and_none_is_lost(tmp_path):
         assert sum(row["on_map"] for row in served.get("/api/frames?vehicle=v1").json()) == 5
         send_all(served, line(1, "late", east=40))
         drawn(served, "late", 1)
+
+
+def test_a_map_that_was_begun_at_a_wrong_place_moves_once_while_pictures_are_drawn_again(tmp_path):
+    journal, again = Journal(tmp_path / "journal.db"), []
+    (tmp_path / "layers").mkdir()
+    site = MapSite(
+        journal, Layer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None,
+        on_area=lambda area: None, anchor=lambda: None, draw_again=lambda: again.append(1),
+    )  # fmt: skip
+    frames = []
+    for k, (lat, lon) in enumerate([(10.0, 10.0)] * 2 + [(48.0, 11.0)] * 3):
+        pose = {"lat_deg": lat, "lon_deg": lon, "height_m": 60.0}
+        journal.write(add_frame(b"%d" % k, "v1", f"{k}.jpg", time_s=float(k), path="", size=(640, 480), pose=pose))
+        fix = Fix(lat_deg=lat, lon_deg=lon, height_m=60.0)
+        frames.append(
+            Frame(image=f"{k}.jpg", path=tmp_path, vehicle="v1", time_s=float(k), fix=fix, width=640, height=480)
+        )
+    stray, other = frames[0], frames[4]
+    assert not isinstance(site.place(stray, 0), str)  # the first one begins the map
+    assert not isinstance(site.place(other, 0), str)
+    assert again == [1]
+    for frame in frames:  # nothing that was drawn is in the journal yet
+        assert isinstance(site.place(frame, 0), str) == (frame in frames[:2])
+    assert again == [1]
+    journal.close()
 
 
 def test_the_newest_plan_says_where_the_map_lies(tmp_path):
