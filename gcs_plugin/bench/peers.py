@@ -113,7 +113,7 @@ def _script(name: str) -> Callable[[Job, Path], list[str]]:
 
 
 def _stitched(job: Job) -> tuple[Path, int | None]:
-    from gcs_plugin.bench.alignment import lay_on_reference
+    from gcs_plugin.bench.georeferencing import lay_on_reference
 
     out = job.out / "laid.tif"  # the most favourable georeference that it could get
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
@@ -124,7 +124,7 @@ def _pasted(job: Job) -> tuple[Path, int | None]:
     import numpy as np
 
     import telemetry
-    from gcs_plugin.bench.alignment import placed_models
+    from gcs_plugin.bench.georeferencing import placed_models
     from gcs_plugin.bench.pasting import paste
     from orthoswarm.model.geo import LocalGrid, area_epsg
     from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -286,7 +286,7 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
 
 def _shape(product: Path, job: Job) -> dict[str, Any] | None:
     """The figures of a map after registration on the truth by one homography; None where that fails."""
-    from gcs_plugin.bench.alignment import lay_on_reference
+    from gcs_plugin.bench.georeferencing import lay_on_reference
 
     laid = job.out / "shape.tif"
     try:

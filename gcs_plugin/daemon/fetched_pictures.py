@@ -50,7 +50,7 @@ def make_picture_requests(
 
 
 def _names(journal: Journal, vehicle: str) -> PictureNames:
-    """The names of a vehicle's pictures that have arrived, and how their numbers go with its camera events."""
+    """The names of a vehicle's pictures that have arrived, and how their numbers match its camera events."""
     name = (packed(vehicle),)
     pictures = journal.rows("SELECT image, time FROM frames WHERE vehicle = ? AND time IS NOT NULL", name)
     events = journal.rows("SELECT number, time FROM exposures WHERE vehicle = ?", name)

@@ -91,7 +91,7 @@ class GapFlights:
         over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m"), "terrain_items": False}
         altitude = body.get("altitude_m", over["nominal_m"])
         if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
-            raise InputError("altitude_m is missing or no height; send metres above takeoff, for example 80")
+            raise InputError("altitude_m is missing or not a height; send metres above takeoff, for example 80")
         solved = self._coverage.planning_fovs_deg(heights_over_level_ground=self._plans.dem is None)
         unknown = [vehicle for vehicle in vehicles if vehicle not in solved]
         found = [solved[vehicle] for vehicle in vehicles if vehicle in solved]
@@ -129,7 +129,7 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -
         OrthoSwarmError: a vehicle is still flying, or lost.
     """
     if not isinstance(in_air, list | tuple) or not all(isinstance(vehicle, str) for vehicle in in_air):
-        raise InputError('in_air is no list of vehicles; send for example ["v1"], or nothing')
+        raise InputError('in_air is not a list of vehicles; send for example ["v1"], or nothing')
     if not isinstance(wanted, dict) or not wanted:
         raise InputError('vehicles is missing; send for example {"v1": null, "v2": 12}')
     chosen = {}
@@ -142,7 +142,7 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -
             raise OrthoSwarmError(f"{vehicle} gets no other flight: {row['busy']}")
         minutes = row["minutes"] if given is None else given
         if minutes is None:
-            raise InputError(f"how long {vehicle} can fly is not known; send its minutes, it is not guessed")
+            raise InputError(f"how long {vehicle} can fly is not known; send its minutes, no figure is assumed")
         if isinstance(minutes, bool) or not isinstance(minutes, int | float) or not 0.0 < minutes <= _LONGEST_MIN:
             raise InputError(f"{vehicle} cannot fly for {minutes} minutes; send a number from 1 to {_LONGEST_MIN:g}")
         chosen[str(vehicle)] = float(minutes) - (_home_min(row) if goes_on else 0.0)

@@ -29,7 +29,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     single("uptime_seconds", "gauge", "Since the daemon was started.", time.time() - daemon.started)
     rows = daemon.journal.rows("SELECT stage, COUNT(*) AS n FROM frames GROUP BY stage")
     metric("frames", "gauge", "Frames in the workspace by stage.", [({"stage": r["stage"]}, r["n"]) for r in rows])
-    single("frames_accepted_total", "counter", "Pictures taken in since the start.", sum(daemon.posted.values()))
+    single("frames_accepted_total", "counter", "Pictures accepted since the start.", sum(daemon.posted.values()))
     single("frames_drawn_total", "counter", "Frames drawn in real time since the start.", drawer.drawn)
     single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
     single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
@@ -61,7 +61,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     )  # fmt: skip
     single("coverage_gaps", "gauge", "Gaps in the planned area.", len(covered["gaps"]))
     single("coverage_seconds", "gauge", "Time that finding the gaps took last.", daemon.coverage.seconds)
-    single("problems", "gauge", "Things that are wrong at present.", len(daemon.problems()))
+    single("problems", "gauge", "Problems at present.", len(daemon.problems()))
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
     single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())
     return "\n".join(lines) + "\n"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from gcs_plugin.mission.control import CheckMission, InOrder
+from gcs_plugin.mission.command_dialogues import CheckMission, InOrder
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import MISSION, NEVER, Verdict
 from gcs_plugin.mission.items import Mission

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M, RESERVE
 from gcs_plugin.fleet.separation_watch import number_name
+from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
-from gcs_plugin.mission.control import unflyable
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
 from orthoswarm.model.earth import distance_m
 

@@ -10,8 +10,8 @@ from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import Route, Routes
 from gcs_plugin.fleet.telemetry_check import has_place
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.mission.command_dialogues import Pilot
 from gcs_plugin.mission.completion import CompletionDetector
-from gcs_plugin.mission.control import Pilot
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import Modes, modes_of
 from gcs_plugin.mission.items import Mission

@@ -38,8 +38,8 @@ from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
+from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel, check_dem
-from orthoswarm.raster.picture_store import PictureStore
 
 __all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "Load", "Options", "Progress", "run"]
 
@@ -61,8 +61,7 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
         InputError: if the inputs have no picture with a position, or the basemap cannot be used.
         OrthoSwarmError: if nothing could be made, or the refinement failed by an error of the program: then the
             real-time picture, the frames as recorded and the report with the error exist, but no orthoimage, which
-            would
-            look like a refined one.
+            would look like a refined one.
     """
     if options.basemap is not None and not options.basemap.exists():
         raise InputError(f"the basemap {options.basemap} does not exist; check the path")
@@ -164,7 +163,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     if run.options.until != "realtime":
         images = [p.frame.image for p in state.recorded.placed]
         state.previews = PreviewFile.create(run.space.file("previews"), images)
-        state.pictures = PictureStore.create(run.space.file("pictures"), state.ingest.frames)
+        state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
     known = run.space.recall("realtime")
     if known is not None and (run.out / REALTIME).exists():
         stats, stage = known

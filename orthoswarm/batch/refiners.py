@@ -7,24 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.placement import Refiner
+from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel
-from orthoswarm.raster.picture_store import PictureStore
 
 Array = NDArray[np.float64]
 RefinerName = Literal["swarm", "paper"]
-Factory = Callable[[int, Array, HeightModel | None, PictureStore | None], Refiner]
+Factory = Callable[[int, Array, HeightModel | None, GreyPictures | None], Refiner]
 """Makes a refiner of the area's grid (EPSG code), the origin (2,) of its local frame, a height model or None, and the
 pictures that are decoded already, or None."""
 
 
-def _swarm(epsg: int, origin: Array, dem: HeightModel | None, pictures: PictureStore | None) -> Refiner:
+def _swarm(epsg: int, origin: Array, dem: HeightModel | None, pictures: GreyPictures | None) -> Refiner:
     from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
 
     options = Options(dem=dem) if pictures is None else Options(dem=dem, read=pictures.gray)
     return SwarmRefiner(epsg, origin, options)
 
 
-def _paper(epsg: int, origin: Array, dem: HeightModel | None, pictures: PictureStore | None) -> Refiner:
+def _paper(epsg: int, origin: Array, dem: HeightModel | None, pictures: GreyPictures | None) -> Refiner:
     """The paper's refiner; its ground is flat, so it does not use a height model. It reads the pictures by itself."""
     from orthoswarm.paper import PaperRefiner
 
@@ -39,7 +39,7 @@ def make_refiner(
     epsg: int,
     origin: Array,
     dem: HeightModel | None = None,
-    pictures: PictureStore | None = None,
+    pictures: GreyPictures | None = None,
 ) -> Refiner:
     """The refiner of a name for an area.
 

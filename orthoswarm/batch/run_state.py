@@ -23,9 +23,9 @@ from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Blend
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
+from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_rgb
-from orthoswarm.raster.picture_store import PictureStore
 from orthoswarm.refine.registration.map_offset import MapOffset
 
 Bytes = NDArray[np.uint8]
@@ -135,7 +135,7 @@ class RunState:
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     previews: PreviewFile | None = None
-    pictures: PictureStore | None = None
+    pictures: GreyPictures | None = None
     undrawn: Mapping[str, str] = field(default_factory=dict)
     control_points: list[Checkpoint] = field(default_factory=list)
     control: GroundControl | None = None

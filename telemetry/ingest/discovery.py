@@ -188,7 +188,7 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
             folders[file.parent] = folder
             return
     if explicit:
-        raise InputError(f"{file.name} is of no kind that can be read; name a folder of photos, a video or a log")
+        raise InputError(f"{file.name} is of a kind that cannot be read; name a folder of photos, a video or a log")
 
 
 def _name_vehicles(folders: list[Folder], root: Path) -> None:

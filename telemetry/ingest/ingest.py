@@ -1,8 +1,7 @@
 """From inputs to frames: finds the sources, merges them field by field, decides between contradicting tags.
 
 For each field the better source is used, and missing fields come from others: a geo.txt without angles leaves the
-photos'
-angles, and an absolute altitude never becomes a height.
+photos' angles, and an absolute altitude never becomes a height.
 """
 
 import math
@@ -127,7 +126,7 @@ def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery
     """Findings on lines of a pose table that have no pose, or name missing pictures."""
     findings = []
     if table.useless:
-        text = f"{plural(table.useless, 'line')} of {path.name} hold no position that can be one; they are not used"
+        text = f"{plural(table.useless, 'line')} of {path.name} hold no valid position; they are not used"
         findings.append(Finding("table-lines", text))
     pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
     names = {name for p in pictures for name in names_of(p.relative_to(folder).as_posix())}

@@ -41,7 +41,7 @@ def add_log(poses: Poses, found: VideoScan, logs: Sequence["LogSource"]) -> list
         entry.used = True
         text = f"{plural(count, 'picture')} of {name} got poses from {log.path.name}; its clock was found {how}"
         return [Finding("posed-by-log", text, note=how != "by the container's creation time")]
-    text = f"no log beside {name} could be brought together with it: no turns and no creation time"
+    text = f"no log beside {name} could be aligned with it: it has no turns and no creation time"
     return [Finding("log-unused", text)]
 
 

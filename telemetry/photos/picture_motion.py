@@ -28,7 +28,7 @@ class PictureFile:
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Of one picture at reduced size.
+    """Features of one picture at reduced size.
 
     Attributes:
         points: (N, 2) column and row. descriptors: (N, 128) float32. centre: (2,) column and row of the middle.

@@ -1,10 +1,9 @@
 """Finds pictures of a video that are damaged because data from which they are predicted was lost.
 
 A picture predicted from a damaged one is damaged, too, although the decoder reports only the first: so damage extends
-in
-decoding order from the lost packet to the next recovery point, a complete key picture (H.264: IDR or recovery
-point SEI, H.265: IRAP). Losses in files show as gaps in the continuity counters of MPEG-TS (ISO/IEC 13818-1, 2.4.3.3),
-as decoding errors, and as pictures concealed by the decoder; for live streams see `LiveDamage`.
+in decoding order from the lost packet to the next recovery point, a complete key picture (H.264: IDR or recovery point
+SEI, H.265: IRAP). Losses in files show as gaps in the continuity counters of MPEG-TS (ISO/IEC 13818-1, 2.4.3.3), as
+decoding errors, and as pictures concealed by the decoder; for live streams see `LiveDamage`.
 """
 
 from bisect import bisect_right

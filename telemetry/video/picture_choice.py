@@ -40,8 +40,7 @@ class Picker:
     """Selects pictures from a stream, at most one per spacing.
 
     Among the pictures whose progress is near the spacing, the sharpest undamaged one is selected. Where pictures are
-    further
-    apart than the spacing (a slow camera, a thinned video), all are selected.
+    further apart than the spacing (a slow camera, a thinned video), all are selected.
 
     Args:
         every_m: spacing in metres; with neither this nor every_s 4 % of the height, else half a second.

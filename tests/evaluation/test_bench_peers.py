@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from gcs_plugin.bench import alignment, meter, peers
+from gcs_plugin.bench import georeferencing, meter, peers
 from gcs_plugin.cli.main import main
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError
@@ -76,7 +76,7 @@ def test_a_similarity_is_found_in_spite_of_outliers(seed, scale, angles):
     target = scale * source @ rotation.T + (327_000.0, 3_383_000.0, 150.0)
     off = rng.choice(60, 6, replace=False)
     target[off] += rng.normal(size=(6, 3)) * 3 * scale
-    found = alignment.fit_similarity(source, target)
+    found = georeferencing.fit_similarity(source, target)
     good = np.setdiff1d(np.arange(60), off)
     assert np.abs(found.apply(source)[good] - target[good]).max() < 0.05 * scale
     assert found.scale == pytest.approx(scale, rel=0.01)
@@ -88,7 +88,7 @@ def test_a_similarity_is_found_in_spite_of_outliers(seed, scale, angles):
 )
 def test_positions_that_leave_a_rotation_undetermined_are_refused(source):
     with pytest.raises(OrthoSwarmError, match=r"too few|collinear"):
-        alignment.fit_similarity(source, source * 2.0)
+        georeferencing.fit_similarity(source, source * 2.0)
 
 
 def model_of(cameras, names, rng):
@@ -123,13 +123,13 @@ def test_models_in_frames_of_their_own_come_to_the_recorded_grid():
     line = names[:3]  # too few to be placed
     models = [model_of(cameras, part, rng) for part in (line, small, large)]
     recorded = {n: c.position for n, c in cameras.items()}
-    placed, level = alignment.placed_models(models, recorded)
+    placed, level = georeferencing.placed_models(models, recorded)
     assert sorted(placed) == names and level == pytest.approx(-4.0, abs=1e-6)
     pixels = np.array([[0.0, 0.0], [639.0, 240.0], [320.0, 479.0]])
     for name in names:
         assert np.abs(placed[name].to_ground(pixels, level) - cameras[name].to_ground(pixels, -4.0)).max() < 1e-4
     with pytest.raises(OrthoSwarmError, match="no model"):
-        alignment.placed_models(models[:1], recorded)
+        georeferencing.placed_models(models[:1], recorded)
 
 
 def texture(seed, size=700):
@@ -155,7 +155,10 @@ def test_a_stitched_picture_is_laid_where_it_belongs(tmp_path):
     picture = cv2.warpPerspective(ground, h, (430, 440), flags=cv2.INTER_AREA)
     picture[:50] = 0  # what a stitcher leaves empty
     cv2.imwrite(str(tmp_path / "picture.png"), picture)
-    assert alignment.lay_on_reference(tmp_path / "picture.png", tmp_path / "reference.tif", tmp_path / "laid.tif") >= 40
+    assert (
+        georeferencing.lay_on_reference(tmp_path / "picture.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
+        >= 40
+    )
     with rasterio.open(tmp_path / "laid.tif") as laid:
         seen, gray = laid.dataset_mask() > 0, laid.read(1)
     assert 0.3 < seen.mean() < 0.7 and not seen[:100].any()
@@ -169,9 +172,9 @@ def test_a_picture_of_another_place_is_not_laid_anywhere(tmp_path):
     write_map(tmp_path / "reference.tif", texture(1))
     cv2.imwrite(str(tmp_path / "picture.png"), texture(2))
     with pytest.raises(OrthoSwarmError, match="cannot be read as a picture"):
-        alignment.lay_on_reference(tmp_path / "none.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
+        georeferencing.lay_on_reference(tmp_path / "none.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
     with pytest.raises(OrthoSwarmError, match="could not be registered"):
-        alignment.lay_on_reference(tmp_path / "picture.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
+        georeferencing.lay_on_reference(tmp_path / "picture.png", tmp_path / "reference.tif", tmp_path / "laid.tif")
 
 
 # -- judging ------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gcs_plugin.links.mavlink import Autopilot, command_name, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission import mission_files
-from gcs_plugin.mission.control import unflyable
+from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.items import (
     LAND,
     LOITER_UNLIM,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.mission.control import Command
+from gcs_plugin.mission.command_dialogues import Command
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,

@@ -20,7 +20,7 @@ _AT_ONCE: Final = 5
 _TRIES: Final = 8
 _AGAIN_S: Final = 2.0
 _LONGEST_HOLE: Final = 200
-"""A camera whose numbers jump by more has counted anew."""
+"""A camera whose numbers jump by more has restarted its count."""
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Folders and files of a vehicle read over MAVLink FTP, without input and output of their own.
+"""Folders and files of a vehicle read over MAVLink FTP, as state machines without sockets and clocks.
 
 Each job says what to ask next (`next_request`) and is given each answer once, in any order (`answered`). Numbers of
 requests, repetition and pace are those of the caller.

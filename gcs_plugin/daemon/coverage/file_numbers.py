@@ -51,7 +51,7 @@ class PictureNames:
     def find(self, number: int, files: Mapping[str, int]) -> tuple[str, str]:
         """The path of an event's picture among a vehicle's files, and why there is none ("" where there is one)."""
         if self.shift is None:
-            return "", "the numbers of its files do not go with those of its camera events"
+            return "", "the numbers of its files do not match those of its camera events"
         pictures = [path for path in files if path.lower().endswith(_PICTURES)]
         if self.images:
             forms = {_form(image) for image in self.images}

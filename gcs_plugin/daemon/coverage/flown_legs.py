@@ -27,8 +27,7 @@ class FlownLegs:
     Attributes:
         legs: of the plan. reach_m: largest cross-track distance of a vehicle on a leg.
         ahead_m: how far from a leg's ends the first and last position may be; at least a picture spacing where only
-        pictures
-            give positions.
+            pictures give positions.
         flown: bool (n,), legs flown from end to end.
         flights: vehicle -> number of flights begun. down: vehicles that have left their mission or are
             lost. grounded: those of them that have landed since.

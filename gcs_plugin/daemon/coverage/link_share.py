@@ -1,7 +1,8 @@
 """How fast pictures are asked for, so that a link's other messages are not held up.
 
 The rate follows the delay, as in LEDBAT (RFC 6817): answers that take longer than the quickest lately have waited
-behind others, so the rate falls; it rises slowly otherwise, up to a bound. Pictures so take what a link has to spare.
+behind others, so the rate falls; it rises slowly otherwise, up to a bound. So pictures use only what a link has to
+spare.
 """
 
 from collections import deque

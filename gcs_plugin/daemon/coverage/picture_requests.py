@@ -174,7 +174,7 @@ class PictureRequests:
             server.files, server.listed_at, server.listings = job.files, now, server.listings + 1
             if job.refused:
                 server.not_before = now + _AGAIN_S
-                self._refuse_all(talk.system, f"not to be had from the vehicle: {job.refused}")
+                self._refuse_all(talk.system, f"not available from the vehicle: {job.refused}")
         elif request is not None and job.refused:
             request.state, request.reason, request.read = "refused", job.refused, None
         elif request is not None and isinstance(job, FileRead):

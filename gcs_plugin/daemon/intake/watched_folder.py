@@ -124,7 +124,7 @@ class FolderReader:
     def _busy(self) -> bool:
         return any(not file.done and not file.told for file in self._files.values())
 
-    # -- looking --------------------------------------------------------------------------------------------------
+    # -- scanning -------------------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> None:
         """Scan the folder once, and process the result."""
@@ -198,9 +198,9 @@ class FolderReader:
         file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.told:
             file.told = True
-            self._intake.tell(f"{self._name(path)} of {self._intake.vehicle} is not whole; copy it again")
+            self._intake.tell(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
 
-    # -- taking ---------------------------------------------------------------------------------------------------
+    # -- storing -----------------------------------------------------------------------------------------------
 
     def _take_photos(self, paths: Sequence[Path], now: float) -> None:
         """Store the complete photos of one scan together, as wrong angles are found by comparing neighbours."""
@@ -246,7 +246,9 @@ class FolderReader:
             rejection = rejected.get(os.path.normpath(path.absolute()))
             self._files[path].done = True
             if rejection is None or not rejection.lacks_position:
-                _log.warning("%s: %s", self._name(path), rejection.reason if rejection else "it gives no picture")
+                _log.warning(
+                    "%s: %s", self._name(path), rejection.reason if rejection else "no picture can be read from it"
+                )
                 continue
             linked = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
             name = self._taken.name(self._name(path), digest)

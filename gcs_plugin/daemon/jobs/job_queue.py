@@ -93,10 +93,10 @@ class Preempted(Exception):
 
 
 ReportProgress = Callable[[float, str], None]
-"""Told a job's progress, 0 to 1, and what is being done."""
+"""Called with a job's progress, 0 to 1, and what is being done."""
 Handler = Callable[[Job, ReportProgress], Change]
-"""Does a job, telling its progress; gives the change that makes its result so. That the job is done is written with
-it, in one transaction."""
+"""Does a job, reporting its progress; returns the change that records its result. The job's end is written with it, in
+one transaction."""
 After = Callable[[Job], None]
 
 

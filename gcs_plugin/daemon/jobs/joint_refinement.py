@@ -86,7 +86,7 @@ class JointRefinement:
         others = [self.publisher.solutions / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
         if not others:
             return _note(job, "it has no neighbours")
-        tell(0.05, f"solving again beside {len(others)} neighbour{'s' * (len(others) > 1)}")
+        tell(0.05, f"refining again together with {len(others)} neighbour{'s' * (len(others) > 1)}")
         area = self.publisher.area()
         task = JointTask(
             before=self.publisher.solutions / row["path"],
@@ -98,18 +98,18 @@ class JointRefinement:
         )
         found = self.workers.run(refine_jointly, task)
         if found is None:
-            return _note(job, "nothing of it is to be solved again")
+            return _note(job, "nothing of it needs refining again")
         solved, moved_m = found
         job.detail |= {
             "frames": len(solved.stages), "neighbours": len(others), "moved_p95_m": round(moved_m, 3),
             "solve_cpu_s": round(solved.cpu_s, 3), "warnings": solved.warnings,
         }  # fmt: skip
         if moved_m < self.least_px * area.gsd_m:
-            return _note(job, "it lies well beside its neighbours")
+            return _note(job, "it agrees with its neighbours already")
         with self.publisher.turn("fine"):
             now = solution_row(self.journal, job)
             if now is None or now["path"] != row["path"]:
-                return _note(job, "it was refined anew meanwhile")
+                return _note(job, "it was refined again meanwhile")
             tell(0.7, "drawing")
             self._print(job, target, solved, detail)
         self.publisher.retire(self.publisher.solutions / row["path"])

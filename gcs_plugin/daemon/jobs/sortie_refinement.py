@@ -90,7 +90,7 @@ class SortieRefinement:
         area = self.publisher.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
         before = self._beside(job, len(frames))
-        tell(0.05, f"refining {len(frames)} pictures" if before is None else "laying late pictures beside the others")
+        tell(0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others")
         target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         task = SolveTask(
             frames=frames,

@@ -167,7 +167,7 @@ class ToneBalance:
                 self.on_published(self.layer, job)
 
     def _draw(self, key: tuple[str, int], before: tuple[Path, BoundingBox], target: Path) -> bool:
-        """Draw and publish a sortie; False if it was refined anew meanwhile."""
+        """Draw and publish a sortie; False if it was refined again meanwhile."""
         old, ground = before
         with self.publisher.turn(self.layer):
             if self.publisher.shown(self.layer).get(key, (None,))[0] != old:

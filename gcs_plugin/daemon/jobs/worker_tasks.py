@@ -115,7 +115,7 @@ def solve(task: SolveTask) -> SortieResult:
 
 
 def register_late(task: SolveTask) -> SortieResult:
-    """Lay pictures that came late beside the others of their sortie, which was refined without them."""
+    """Register late pictures to the others of their sortie, which was refined without them."""
     from orthoswarm.refine.registration.late_pictures import register_late_pictures
     from orthoswarm.refine.strategy.vehicle_passes import read_frame
 

@@ -2,8 +2,7 @@
 
 A layer that is drawn in real time changes tile by tile. A refined layer is replaced as a whole: its next generation is
 made separately, sharing the files of unchanged tiles, and becomes the layer by a change of the journal. So a reader
-sees
-all of a vehicle's old pixels or all of its new ones, and a crash leaves the one or the other.
+sees all of a vehicle's old pixels or all of its new ones, and a crash leaves the one or the other.
 """
 
 import contextlib

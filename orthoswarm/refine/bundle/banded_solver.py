@@ -116,8 +116,7 @@ def camera_order(tracks: Tracks, points: int, free: NDArray[np.bool_]) -> tuple[
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
     Cameras that observe a common point must lie within the band. Takes the better of the input order and that of
-    Cuthill and
-    McKee (1969).
+    Cuthill and McKee (1969).
     """
     count = len(free)
     index = np.flatnonzero(free)

@@ -127,15 +127,11 @@ def map_distortion_variance(place: Array, residual: Array, height_m: float) -> f
     """Variance per axis of the map's displacement under one picture, from place to place, metres squared.
 
     Matching noise is independent from tie to tie, a distortion of the map is similar for neighbours: so the
-    semivariogram
-    of the residuals rises with distance by the distortion's variance. The part that varies within a picture averages
-    out over
-    its ties: the variance of a picture's mean is the semivariogram at large distance minus that at the usual distance
-    within it
-    (Cressie 1993, Statistics for Spatial Data, chapter 2). Medians instead of means of the
-    squared differences are used, as ties may be wrong (for two Gaussian axes the median is ln 2 of the mean). The
-    residuals
-    lack the share that the adjustment absorbed (`distortion_followed`).
+    semivariogram of the residuals rises with distance by the distortion's variance. The part that varies within a
+    picture averages out over its ties: the variance of a picture's mean is the semivariogram at large distance minus
+    that at the usual distance within it (Cressie 1993, Statistics for Spatial Data, chapter 2). Medians instead of
+    means of the squared differences are used, as ties may be wrong (for two Gaussian axes the median is ln 2 of the
+    mean). The residuals lack the share that the adjustment absorbed (`distortion_followed`).
 
     Args:
         place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), their residuals, metres.

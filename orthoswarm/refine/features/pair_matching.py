@@ -153,8 +153,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
     """Pairs with possibly overlapping footprints, spread over all directions, int32 (n, 2), sorted, first < second.
 
     Each photo chooses partners in every direction, both of its own group and of others, preferring those whose distance
-    is
-    near the best one.
+    is near the best one.
 
     Args:
         centre: complex (N,), east + i north of the ground at each photo's centre.

@@ -1,9 +1,8 @@
 """Sparse photos of several vehicles matched and adjusted together, then split into flights.
 
 Alone, each vehicle would have its own scale, tilt and drift: legs and vehicles only fit each other if the photos on
-both
-sides are adjusted together. Cameras of the same name share a lens until the end; then each vehicle gets its
-own lens, close to the shared one.
+both sides are adjusted together. Cameras of the same name share a lens until the end; then each vehicle gets its own
+lens, close to the shared one.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """Headings of photos: relative ones from the rotation between pictures, absolute ones from the course flown.
 
 Yaw tags may be flipped by 180 degrees, relative to the airframe, or missing; they are used only for photos whose
-heading
-cannot be found from pairs.
+heading cannot be found from pairs.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 
 It takes milliseconds and needs no tags except positions. The shapes of matches give the tilt and, where the photos
 point in several directions, the focal length (`tilt_and_lens`). Level pictures are similar to the ground: rotations
-give
-headings (`heading`), scales give relative heights (`relative_scale`), shifts give positions (`planar_network`).
+give headings (`heading`), scales give relative heights (`relative_scale`), shifts give positions (`planar_network`).
 """
 
 from collections.abc import Sequence

@@ -2,8 +2,7 @@
 
 Corners lie at the edges of raised objects, so a surface through them is a little above the open ground, although every
 point is right: pictures rectified on it and compared with the map are then shifted by that height times the obliquity
-of
-the view. Small patches at free positions, not at corners, measure the ground itself.
+of the view. Small patches at free positions, not at corners, measure the ground itself.
 """
 
 from dataclasses import dataclass, replace

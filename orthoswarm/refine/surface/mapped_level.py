@@ -18,8 +18,7 @@ def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: 
 
     Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is at the lower
     flank of their heights (`lower_flank`). On level ground these are heights above zero, else heights above the
-    terrain,
-    whose median below the cameras and around them is added.
+    terrain, whose median below the cameras and around them is added.
 
     Args:
         terrain: the ground, in the frame of the cameras; None: 0.

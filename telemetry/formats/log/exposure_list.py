@@ -37,7 +37,7 @@ def read_exposure_list(path: Path) -> FlightLog:
     log = FlightLog(path=path, kind="DJI MRK" if is_marks else "RTKLIB events", vehicle=path.stem)
     log.events = _marks(text) if is_marks else _positions(text)
     if not log.events:
-        raise NotALog("the file holds no exposure with a position; check that it is the list of events")
+        raise NotALog("the file holds no exposure with a position; check that it is an exposure list")
     return log
 
 

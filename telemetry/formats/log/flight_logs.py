@@ -230,7 +230,7 @@ class _TlogVehicle:
         )
         log.position_sigma_m = self._poses.position_sigma_m
         if self._poses.reboots:
-            text = f"the vehicle of {path.name} was started again {plural(self._poses.reboots, 'time')}"
+            text = f"the vehicle of {path.name} was restarted {plural(self._poses.reboots, 'time')}"
             log.findings.append(Finding("reboot", text))
         pace = max(self._paces, default=1.0)
         if not 0.8 < pace < 1.25:

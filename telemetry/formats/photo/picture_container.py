@@ -35,7 +35,7 @@ class Container:
         kind: "jpeg", "png", "webp", "tiff" or "bmp".
         width: columns as stored. height: rows.
         exif: its EXIF tags. xmp: its XMP packet, b"" if none.
-        georeferenced: True for a GeoTIFF, which is a map and no picture of a camera.
+        georeferenced: True for a GeoTIFF, which is a map, not a picture of a camera.
         raw: True for a DNG, which has to be developed first.
     """
 

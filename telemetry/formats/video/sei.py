@@ -187,8 +187,7 @@ def _decode_misb_time(body: bytes) -> Sample | None:
     """MISB ST 0604 precision time stamp: status, then 8 bytes with FF between the pairs.
 
     The UUID names micro- or nanoseconds, but real encoders write nanoseconds under the UUID of microseconds: a value
-    that would
-    be later than the year 4000 in microseconds is read as nanoseconds.
+    that would be later than the year 4000 in microseconds is read as nanoseconds.
     """
     value = _misb_integer(body)
     if value is None:

@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MOST_PHOTOS = 24
-"""Of a chain: relief and errors of the scale add up along it."""
+"""Longest chain: relief and errors of the scale add up along it."""
 _PHASE_STEP_S = 0.06
 _SCALES = (0.96, 1.0, 1.04)
-"""Of a chain against the flight's: height over the ground."""
+"""Scale of a chain over the flight's: height over the ground varies."""
 _LEAST_SPEED_M_S = 0.3
 _FALSE_MATCH = 1e-3
 _SAME_EXPOSURE = 0.35
-"""Of the usual way between events: a photo this near to one is that exposure."""
+"""Share of the usual way between events: a photo this near to one is that exposure."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,7 +157,7 @@ def test_gaps_in_no_fly_zones_are_told_and_not_flown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "minutes", "error", "said"),
     [
-        (_landed("v1"), None, InputError, "it is not guessed"),
+        (_landed("v1"), None, InputError, "no figure is assumed"),
         (_row("v1"), 9.0, OrthoSwarmError, "still flying"),
         (_landed("v1", state="lost"), 9.0, OrthoSwarmError, "lost"),
         (_landed("v1"), True, InputError, "cannot fly for"),

@@ -256,7 +256,7 @@ FILES = {f"/DCIM/100/DJI_{n:04d}.JPG": 1 for n in range(40, 60)}
         (PictureNames({"DJI_0041.JPG"}, 0), 45, FILES | {"/DCIM/101/DJI_0045.JPG": 1}, "/DCIM/100/DJI_0045.JPG"),
         (PictureNames({"DJI_0001.JPG"}, 0), 45, FILES, "/DCIM/100/DJI_0045.JPG"),
         (PictureNames({"v1-0041.jpg"}, 0), 45, FILES, "its files have other names than the pictures that have arrived"),
-        (PictureNames(set(), None), 45, FILES, "the numbers of its files do not go with those of its camera events"),
+        (PictureNames(set(), None), 45, FILES, "the numbers of its files do not match those of its camera events"),
         (PictureNames(), 45, {"/DCIM/DJI_0045.txt": 1}, "it has no picture file with number 45"),
     ],
 )

@@ -92,7 +92,7 @@ def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights
         if count == 1:
             first = solution(daemon, "v1")[0]
     together = [job for job in daemon.jobs.all() if job.kind == "together"]
-    assert [job.detail["note"] for job in together] == ["it lies well beside its neighbours"] * 2
+    assert [job.detail["note"] for job in together] == ["it agrees with its neighbours already"] * 2
     assert solution(daemon, "v1")[0] == first
     kept = {row["path"] for t in ("solutions", "coarse") for row in daemon.journal.rows(f"SELECT path FROM {t}")}
     assert {path.name for path in (daemon.settings.workspace / "solutions").iterdir()} == kept  # nothing is left over

@@ -8,8 +8,8 @@ from PIL import Image
 
 from orthoswarm.config import override
 from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.picture_file import PictureError, read_gray, read_rgb
-from orthoswarm.raster.picture_store import PictureStore
 
 
 @pytest.fixture
@@ -24,8 +24,8 @@ def _photo(folder: Path, width: int, height: int) -> Frame:
     return Frame(image="a.jpg", path=path, vehicle="a", width=width, height=height, fix=Fix(51.0, 0.0), time_s=None)
 
 
-def _store(tmp_path: Path, *photos: Frame) -> PictureStore:
-    store = PictureStore.create(tmp_path / "pictures", photos)
+def _store(tmp_path: Path, *photos: Frame) -> GreyPictures:
+    store = GreyPictures.create(tmp_path / "pictures", photos)
     assert store is not None
     return store
 
@@ -42,7 +42,7 @@ def test_a_picture_that_was_drawn_is_not_decoded_again(tmp_path: Path, photo: Fr
 
 
 def test_grey_values_do_not_depend_on_who_read_first(tmp_path: Path, photo: Frame) -> None:
-    drawn, refined = _store(tmp_path, photo), PictureStore(tmp_path / "other")
+    drawn, refined = _store(tmp_path, photo), GreyPictures(tmp_path / "other")
     refined.folder.mkdir()
     drawn.rgb(photo.path)
     np.testing.assert_array_equal(drawn.gray(photo), refined.gray(photo))
@@ -61,7 +61,7 @@ def test_large_pictures_are_stored_reduced(tmp_path: Path) -> None:
 
 
 def test_without_a_place_to_write_pictures_are_decoded(tmp_path: Path, photo: Frame) -> None:
-    store = PictureStore(tmp_path / "missing")
+    store = GreyPictures(tmp_path / "missing")
     np.testing.assert_array_equal(store.gray(photo), store.gray(photo))
     assert not store.folder.exists()
 
@@ -83,7 +83,7 @@ def test_a_damaged_picture_is_refused_as_without_a_store(tmp_path: Path, photo: 
 def test_more_pictures_than_the_disk_is_meant_for_are_not_stored(tmp_path: Path, photo: Frame) -> None:
     try:
         override({"raster": {"grey_pictures_mb": 0.1}})
-        assert PictureStore.create(tmp_path / "pictures", [photo] * 2) is None
-        assert PictureStore.create(tmp_path / "pictures", [photo]) is not None
+        assert GreyPictures.create(tmp_path / "pictures", [photo] * 2) is None
+        assert GreyPictures.create(tmp_path / "pictures", [photo]) is not None
     finally:
         override({})

@@ -20,7 +20,7 @@ _SHAPE = np.dtype("<i4")
 
 
 @dataclass(frozen=True, slots=True)
-class PictureStore:
+class GreyPictures:
     """Grey pictures as they were decoded first, one file each; what cannot be written is decoded again.
 
     Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
@@ -34,7 +34,7 @@ class PictureStore:
     folder: Path
 
     @classmethod
-    def create(cls, folder: Path, frames: Iterable[Frame]) -> "PictureStore | None":
+    def create(cls, folder: Path, frames: Iterable[Frame]) -> "GreyPictures | None":
         """A store for these frames, with what an earlier run left in the folder.
 
         Returns:
