@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.control.control_observations import in_photos, on_basemap
-from orthoswarm.control.similarity import ControlFit, Similarity, fit_similarity
+from orthoswarm.control.similarity import ControlFit, fit_similarity
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.model.plane_similarity import Similarity
 
 Array = NDArray[np.float64]
 
@@ -126,16 +127,14 @@ def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
 def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: float) -> PlacedFrame:
     """A photo after a similarity; heights over the ground's level are scaled, too, so that no pixel's ray is bent."""
     similarity, camera = fit.similarity, placed.camera
-    height = level_m + similarity.scale * (camera.position[2] - level_m)
+    height = similarity.moved_heights(camera.position[2], level_m)
     position = np.array([*similarity.moved(camera.nadir), height])
-    turn = similarity.turn_rad
-    about_up = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
     own = placed.sigma_m
     if placed.stage != "fine":  # the receivers' common error has given way to that of the control points
         own = float(np.hypot(np.sqrt(max(own**2 - base_sigma_m**2, 0.0)), active().control.receivers_local_sigma_m))
     sigma = float(np.hypot(own, similarity.sigma_m(camera.nadir)))
     return replace(
-        placed, camera=replace(camera, position=position, rotation=about_up @ camera.rotation), sigma_m=sigma
+        placed, camera=replace(camera, position=position, rotation=similarity.about_up @ camera.rotation), sigma_m=sigma
     )
 
 
@@ -155,7 +154,7 @@ def _moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> 
 
     def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
         heights = replace(terrain, z=z, bare=None).height(before)
-        return np.asarray(level_m + similarity.scale * (heights - level_m), np.float32)
+        return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 
     bare = None if terrain.bare is None else moved(terrain.bare)
     return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)

@@ -254,6 +254,12 @@ class RegistrationConfig:
     """Neighbours' pictures are drawn to this share of their diagonal from their cameras (chosen: half and some
     tilt)."""
 
+    # Vehicles that no map holds, registered to each other and placed by all their receivers
+    datum_shift_sigma_m: float = 100.0
+    """What is known of the shift of such a block before its receivers are asked, metres: nothing (chosen)."""
+    datum_rounds: int = 5
+    """Rounds of reweighting, so that a receiver that is far off counts little (chosen: it has settled by then)."""
+
     # Heights of ground that only oblique views show, from the map
     oblique_cell_share: float = 0.06
     """Distance of the positions, as a share of the flying height (chosen for cost) ..."""

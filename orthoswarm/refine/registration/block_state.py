@@ -38,7 +38,7 @@ class VehicleState:
         map_shift: float64 (N, 2) or (2,), what the coarse registration added to the coarse cameras.
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
-            were carry it.
+            were carry it. joined: if no map holds it, but it was registered to neighbours that none holds either.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
@@ -64,6 +64,7 @@ class VehicleState:
     timings: dict[str, float] = field(default_factory=dict)
     had_map: bool = False
     carried: bool = False
+    joined: bool = False
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))

@@ -1,10 +1,14 @@
 """A vehicle that is not found on the map (blank there, or changed) is registered to neighbours that are.
 
+Where there is no map, vehicles are registered to each other in the same way.
+
 First as a whole: its strips are correlated with a mosaic of the neighbours' pictures, as if that were the map. Then by
 its points, which are observed in these pictures, whose cameras are fixed; so relief does not matter.
 """
 
 from copy import deepcopy
+from dataclasses import replace
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -18,6 +22,7 @@ from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, shift_cameras
 from orthoswarm.refine.registration.neighbour_ties import FixedCameras, fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
+from orthoswarm.refine.surface.vehicle_ground import fit_surface
 
 Array = NDArray[np.float64]
 
@@ -90,21 +95,48 @@ def register_to_neighbours(item: tuple[VehicleState, list[VehicleState]], *, eps
         A state that is `carried`; the same one where the neighbours' pictures share too little with it.
     """
     state, others = item
-    others = [other for other in others if lies_on_map(other)]
-    out = deepcopy(state)
-    out.carried = True  # so that the cameras of neighbours on the map are fixed
-    fixed = fixed_cameras_near(out, others)
-    if fixed is None:
+    carried = replace(state, carried=True)  # so that the cameras of neighbours on the map are fixed
+    found = _registered(carried, [other for other in others if lies_on_map(other)], epsg, origin, near_first=False)
+    return found or state
+
+
+def join_neighbours(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
+    """Register a vehicle that no map holds to neighbours that none holds either, so that they make one block.
+
+    Receivers without corrections differ by metres, which is farther than links are searched. Arguments as above.
+
+    Returns:
+        A state that is `joined`; the same one where the neighbours' pictures share too little with it.
+    """
+    state, others = item
+    others = [other for other in others if not lies_on_map(other)]
+    found = _registered(state, others, epsg, origin, near_first=True)
+    if found is None:
         return state
-    for fit in coarse_fits(out.flight, FixedCameraMosaic(fixed, epsg, origin), origin):
-        out = deepcopy(state)
-        out.carried = True
-        if _linked(out, fit, others):
-            out.flight.pictures.drop()
-            for other in others:
-                other.flight.pictures.drop()
-            return out
-    return state
+    found.joined, found.confidence = True, state.confidence
+    found.surface = fit_surface(found.flight.adjustment, found.surface)
+    return found
+
+
+def _registered(
+    state: VehicleState, others: list[VehicleState], epsg: int, origin: Array, *, near_first: bool
+) -> VehicleState | None:
+    """A copy of the state where links to the others confirm a guess; near_first: the first guess is where it is."""
+    fixed = fixed_cameras_near(state, others)
+    if fixed is None:
+        return None
+    here = CoarseFit(np.zeros((len(state.flight.frames), 2)), [], np.zeros(0, bool), 1.0)
+    guesses = coarse_fits(state.flight, FixedCameraMosaic(fixed, epsg, origin), origin)
+    try:
+        for fit in chain([here] if near_first else [], guesses):
+            out = deepcopy(state)
+            if _linked(out, fit, others):
+                out.flight.pictures.drop()
+                return out
+        return None
+    finally:
+        for used in (state, *others):
+            used.flight.pictures.drop()
 
 
 def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> bool:

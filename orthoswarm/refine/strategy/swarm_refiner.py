@@ -26,6 +26,7 @@ from orthoswarm.refine.flight.vehicle_refinement import as_recorded, refine_vehi
 from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
 from orthoswarm.refine.strategy.first_pass import first_passes
+from orthoswarm.refine.strategy.joined_vehicles import join_unmapped
 from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
     coarse_terrain,
@@ -106,6 +107,7 @@ class SwarmRefiner:
     ) -> Solution:
         """The second pass of a vehicle's units, with others held as they are."""
         own = register_unfound(own, others, self.epsg, self.origin, serial)
+        own = join_unmapped(own, others, self.epsg, self.origin, serial)[0]
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
@@ -210,6 +212,7 @@ def _second_passes(
 ) -> list[VehicleState]:
     """All vehicles again, on a common level, each with its neighbours held as the first pass left them."""
     states = register_unfound(states, [], epsg, origin, run)
+    states, unmapped = join_unmapped(states, [], epsg, origin, run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]
@@ -229,7 +232,7 @@ def _second_passes(
     mapped += carried
     # Without a map no vehicle is the reference: each is tied to those before it, or all would move at each pass.
     before: list[VehicleState] = []
-    for k in sorted(set(range(len(states))) - set(mapped)):
+    for k in (k for block in unmapped for k in block):
         (out[k],) = run(task, [(states[k], neighbours_of(states[k], before), float(network.correction_m[k]))])
         before.append(out[k])
         if progress:
