@@ -8,23 +8,7 @@ import argparse
 import json
 from pathlib import Path
 
-import rasterio
-from rasterio.enums import Resampling
-
-from benchmarks.robustness.wrong_maps import measure
-
-
-def averaged(source: Path, target: Path, gsd_m: float) -> None:
-    """Write a map averaged to a ground pixel."""
-    with rasterio.open(source) as file:
-        shape = (max(2, round(file.height * file.res[1] / gsd_m)), max(2, round(file.width * file.res[0] / gsd_m)))
-        picture = file.read(out_shape=(file.count, *shape), resampling=Resampling.average)
-        place = file.transform * file.transform.scale(file.width / shape[1], file.height / shape[0])
-        profile = {"crs": file.crs, "count": file.count, "dtype": picture.dtype}
-    with rasterio.open(
-        target, "w", driver="GTiff", width=shape[1], height=shape[0], transform=place, **profile
-    ) as file:
-        file.write(picture)
+from benchmarks.robustness.wrong_maps import averaged, measure
 
 
 def main() -> None:

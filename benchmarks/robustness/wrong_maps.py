@@ -1,10 +1,10 @@
 """Wrong maps are refused, right ones are not: what the refiner accepts of maps that show other ground.
 
-    python -m benchmarks.robustness.wrong_maps SET... --out DIR [--town OTHER_SET] [--kinds mirror_ns blank ...]
+    python -m benchmarks.robustness.wrong_maps SET... --out DIR [--gsd M] [--town OTHER_SET] [--kinds mirror_ns ...]
 
-SET is a folder of `orthoswarm twin make`. Each kind of map is made of the set's basemap, lies at the same place and
-is given to a refiner. A line a run: how many legs are `refine_matched`, `carried`, `failed`, how many pictures are
-`fine`, and the median error of their middles on the ground.
+SET is a folder of `orthoswarm twin make`. Each kind of map is made of the set's basemap, averaged to --gsd if given,
+lies at the same place and is given to a refiner. A line a run: how many legs are `refine_matched`, `carried`, `failed`,
+how many pictures are `fine`, and the median error of their middles on the ground.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+from rasterio.enums import Resampling
 
 import telemetry
 from orthoswarm.batch.refiners import make_refiner
@@ -89,6 +90,19 @@ WRONG = {f.__name__: f for f in (mirror_ns, mirror_ew, turned_90, turned_180, qu
 RIGHT = {f.__name__: f for f in (right, darkened, season)}
 
 
+def averaged(source: Path, target: Path, gsd_m: float) -> None:
+    """Write a map averaged to a ground pixel."""
+    with rasterio.open(source) as file:
+        shape = (max(2, round(file.height * file.res[1] / gsd_m)), max(2, round(file.width * file.res[0] / gsd_m)))
+        picture = file.read(out_shape=(file.count, *shape), resampling=Resampling.average)
+        place = file.transform * file.transform.scale(file.width / shape[1], file.height / shape[0])
+        profile = {"crs": file.crs, "count": file.count, "dtype": picture.dtype}
+    with rasterio.open(
+        target, "w", driver="GTiff", width=shape[1], height=shape[0], transform=place, **profile
+    ) as file:
+        file.write(picture)
+
+
 def altered(source, target, change, town=None):
     """Write a map of the same place with other content (of another town's map, cut or mirrored to size, if given)."""
     with rasterio.open(source) as file:
@@ -138,6 +152,7 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--refine", default="swarm", choices=("swarm", "paper"))
     parser.add_argument("--town", type=Path, help="another set, whose map is given as that of another town")
+    parser.add_argument("--gsd", type=float, metavar="M", help="average the maps to this ground pixel first, metres")
     parser.add_argument("--kinds", nargs="+", choices=[*WRONG, "town", *RIGHT])
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -148,7 +163,14 @@ def main():
             for kind in kinds:
                 target = args.out / f"{folder.name}-{kind}.tif"
                 town = args.town / "basemap.tif" if kind == "town" else None
-                altered(folder / "basemap.tif", target, {**WRONG, **RIGHT}.get(kind, right), town)
+                source = folder / "basemap.tif"
+                if args.gsd:
+                    averaged(source, args.out / "averaged.tif", args.gsd)
+                    source = args.out / "averaged.tif"
+                if town and args.gsd:
+                    averaged(town, args.out / "town.tif", args.gsd)
+                    town = args.out / "town.tif"
+                altered(source, target, {**WRONG, **RIGHT}.get(kind, right), town)
                 row = {"set": folder.name, "map": kind, **measure(folder, target, args.refine)}
                 target.unlink()
                 print(json.dumps(row), flush=True)

@@ -13,6 +13,7 @@ from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
+from orthoswarm.refine.registration.coarse_map import CoarseMapShift
 from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
@@ -23,6 +24,10 @@ NOT_FOUND = (
     "no part of this flight was found on the map: it lies where its receiver says; check that the map shows this place"
 )
 CARRIED = "the map does not show what this flight saw; pictures of its neighbours carry it"
+SHIFTED = (
+    "the map's pixel is {gsd_m:.0f} m: the flight was shifted onto it as a whole, good to {sigma_m:.1f} m (one sigma "
+    "of each axis); a map of 2 m or finer places it within decimetres"
+)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -39,6 +44,7 @@ class VehicleState:
         dense: extra ground points (K, 3) and sigmas (K,). high: points (H, 3) on what stands high above the ground.
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
             were carry it. joined: if no map holds it, but it was registered to neighbours that none holds either.
+        coarse_shift: how its block was shifted onto a map of far coarser pixels, None if it was not.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
@@ -65,6 +71,7 @@ class VehicleState:
     had_map: bool = False
     carried: bool = False
     joined: bool = False
+    coarse_shift: CoarseMapShift | None = None
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -74,14 +81,17 @@ class VehicleState:
 
 
 def lies_on_map(state: VehicleState) -> bool:
-    """Whether a vehicle lies in the map's frame, found on it or carried by others that were."""
-    return state.on_map or state.carried
+    """Whether a vehicle lies in the map's frame, found on it, alone or as part of a block, or carried by others."""
+    return state.on_map or state.carried or state.coarse_shift is not None
 
 
 def findings(state: VehicleState) -> list[str]:
     """Warnings about a vehicle: findings of its records, and how it was registered."""
     if state.carried:
         return [*state.flight.warnings, CARRIED]
+    if state.coarse_shift is not None:
+        shift = state.coarse_shift
+        return [*state.flight.warnings, SHIFTED.format(gsd_m=shift.gsd_m, sigma_m=shift.sigma_m)]
     return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
 
 
@@ -184,9 +194,10 @@ def leg_states(state: VehicleState) -> list[Leg]:
     """How the map held each leg.
 
     Matched: tie points of its own agree with its place more often than by chance. Where that holds for no leg alone
-    (few photos a leg) but for all tie points of the vehicle together, the legs whose ties agree are matched. Carried:
-    legs without such ties beside matched ones, of the vehicle itself or of neighbours. Failed: all others, as the
-    vehicle lies where its receiver says.
+    (few photos a leg) but for all tie points of the vehicle together, the legs whose ties agree are matched. So are
+    those of a block that was shifted onto a coarse map by the evidence of all its pictures. Carried: legs without such
+    ties beside matched ones, of the vehicle itself or of neighbours. Failed: all others, as the vehicle lies where its
+    receiver says.
     """
     flight = state.flight
     config = active().registration
@@ -200,6 +211,8 @@ def leg_states(state: VehicleState) -> list[Leg]:
     agree = [int((agrees & (leg_of_tie == k)).sum()) for k in range(count)]
     chance = [agreement_probability(a, n, config.leg_agrees_m, config.tie_reach_m) for a, n in zip(agree, ties)]
     matched = [state.on_map and p <= config.leg_by_chance for p in chance]
+    if state.coarse_shift is not None:
+        matched = [True] * count
     if state.on_map and not any(matched):
         matched = [2 * a > n for a, n in zip(agree, ties)] if sum(agree) else [True] * count
     other: LegState = "carried" if lies_on_map(state) else "failed"
@@ -208,6 +221,8 @@ def leg_states(state: VehicleState) -> list[Leg]:
         members = np.flatnonzero(flight.leg == k)
         how: LegState = "matched" if matched[k] else other
         share = agree[k] / max(ties[k], 1) if matched[k] else 0.0
+        if state.coarse_shift is not None:
+            share = state.coarse_shift.confidence
         sigma = float(np.median(state.sigma_m[members]))
         out.append(
             Leg(

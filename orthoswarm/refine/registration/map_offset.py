@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
 
 Array = NDArray[np.float64]
@@ -76,6 +77,12 @@ class MapOffset:
         ]
 
 
+def had_corrections(frames: Sequence[Frame]) -> bool:
+    """Whether a vehicle's receiver states an accuracy that only corrections (RTK, PPK) give."""
+    stated = [np.inf if f.fix.position_sigma_m is None else f.fix.position_sigma_m for f in frames]
+    return float(np.median(stated)) <= active().registration.corrected_sigma_m
+
+
 def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
     """The offset of the map against the receivers, by the frames that were refined on the map; None without any.
 
@@ -104,7 +111,9 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
         sigmas.append(np.hypot(own, spread))
     offset, sigma = _together(np.array(means), np.array(sigmas))
     common = 0.0 if corrected else config.receiver_common_sigma_m
-    return MapOffset(float(offset[0]), float(offset[1]), float(np.hypot(sigma, common)), len(used), bool(corrected))
+    found = min(p.sigma_m for p in refined if p.stage == "fine")  # how well the place on the map itself is known
+    sigma = float(np.linalg.norm([sigma, common, found]))
+    return MapOffset(float(offset[0]), float(offset[1]), sigma, len(used), bool(corrected))
 
 
 def _mean(moved: Array) -> tuple[Array, float]:

@@ -75,10 +75,10 @@ def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float
     Returns:
         Column and row of the shift from the centre (sub-pixel), peak, ratio of second peak to peak.
     """
-    return _highest(correlation(moving, fixed, reach), active().registration.peak_apart_px)
+    return highest(correlation(moving, fixed, reach), active().registration.peak_apart_px)
 
 
-def _highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
+def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
     """Peak of a correlation as `correlate` gives it; what is nearer than `apart` + 1 pixels belongs to the peak."""
     n = len(score)
     r, c = np.unravel_index(int(score.argmax()), score.shape)
@@ -90,6 +90,13 @@ def _highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, floa
         dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
         dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
     return c + dc - n // 2, r + dr - n // 2, peak, ratio
+
+
+def without_peak(score: NDArray[np.float32], apart: int) -> NDArray[np.float32]:
+    """The values (n,) of a correlation that do not belong to its highest peak."""
+    r, c = np.unravel_index(int(score.argmax()), score.shape)
+    rest = _without(score, int(r), int(c), apart)
+    return np.asarray(rest[rest != 0])
 
 
 def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> NDArray[np.float32]:
@@ -257,10 +264,8 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         total = score if total is None else total + score
     if total is None:
         return None
-    column, row, peak, ratio = _highest(total, apart)
-    r, c = np.unravel_index(int(total.argmax()), total.shape)
-    rest = _without(total, int(r), int(c), apart)
-    rest = rest[rest != 0]
+    column, row, peak, ratio = highest(total, apart)
+    rest = without_peak(total, apart)
     z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
     offset, gsd = np.mean([s.offset for s in strips], axis=0), strips[0].gsd_m
     return offset + gsd * np.array([column, -row]), z, ratio

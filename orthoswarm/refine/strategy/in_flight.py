@@ -24,6 +24,7 @@ from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
 from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
+from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
 from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.strategy.vehicle_passes import Options, adjust_without_map, read_frame, registered_state
@@ -105,7 +106,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     _check(flight)
     state = registered_state(flight, surface, origin, basemap=None, watch=watch)
     found = None
-    if basemap is not None:
+    if basemap is not None and not is_coarse(flight, basemap):
         found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
         flight.pictures.drop()
     fit = None if found is None else found.fit

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
+from orthoswarm.refine.registration.coarse_map import is_coarse, shift_on_coarse_map
+from orthoswarm.refine.registration.map_offset import had_corrections
 from orthoswarm.refine.registration.neighbour_registration import join_neighbours
 from orthoswarm.refine.strategy.vehicle_group import neighbours_of
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
@@ -26,15 +29,22 @@ Join = Callable[[tuple[VehicleState, list[VehicleState]]], VehicleState]
 
 
 def join_unmapped(
-    states: Sequence[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
+    states: Sequence[VehicleState],
+    others: Sequence[VehicleState],
+    basemap: MapWindow | None,
+    epsg: int,
+    *,
+    origin: Array,
+    run: Run,
 ) -> tuple[list[VehicleState], list[Block]]:
     """Register vehicles that no map holds to each other.
 
     Vehicles whose receivers had corrections stay where they are, as do `others`; the rest is registered to them. A
-    block without any of these is placed by all its receivers together.
+    block without any of these is placed by all its receivers together. Where a map is there that is too coarse to show
+    single pictures, blocks are shifted onto it.
 
     Args:
-        states: vehicles to place. others: more that stay as they are.
+        states: vehicles to place. others: more that stay as they are. basemap: the map on the area's grid, or None.
         epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
 
     Returns:
@@ -43,7 +53,7 @@ def join_unmapped(
     out, join = list(states), partial(join_neighbours, epsg=epsg, origin=origin)
     left = [k for k, state in enumerate(out) if not lies_on_map(state)]
     held = [state for state in others if not lies_on_map(state)]
-    blocks = [[k for k in left if _corrected(out[k])]]
+    blocks = [[k for k in left if had_corrections(out[k].flight.frames)]]
     _grow(out, blocks[0], left, held=held, join=join, run=run)
     while left := [k for k in left if not any(k in block for block in blocks)]:
         rest = [out[k] for k in left]
@@ -51,13 +61,10 @@ def join_unmapped(
         _grow(out, block, left, held=[], join=join, run=run)
         _back_to_receivers(out, block)
         blocks.append(block)
+    if basemap is not None and not held:
+        for block in blocks[1:]:  # corrected receivers are more accurate than such a map
+            _onto_coarse_map(out, block, basemap, origin)
     return out, [block for block in blocks if block]
-
-
-def _corrected(state: VehicleState) -> bool:
-    """Whether a vehicle's receiver states an accuracy that only corrections (RTK, PPK) give."""
-    stated = [np.inf if f.fix.position_sigma_m is None else f.fix.position_sigma_m for f in state.flight.frames]
-    return float(np.median(stated)) <= active().registration.corrected_sigma_m
 
 
 def _grow(
@@ -106,9 +113,31 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
         )
         away = ((similarity.moved(now[:, :2]) - alone[:, :2]) ** 2).sum(axis=1) / sigma_m**2
         counts = 1.0 / (1.0 + away / config.bundle.position_robust_c) ** 2
-    level_m = float(np.median(np.concatenate([out[k].flight.adjustment.points[:, 2] for k in block])))
+    level_m = _level_m(out, block)
     for k in block:
         out[k] = _moved(out[k], similarity, level_m)
+
+
+def _onto_coarse_map(out: list[VehicleState], block: Block, basemap: MapWindow, origin: Array) -> None:
+    """Shift a block onto a coarse map that shows its ground."""
+    if not block or not all(is_coarse(out[k].flight, basemap) for k in block):
+        return
+    found = shift_on_coarse_map([out[k].flight for k in block], basemap, origin, _level_m(out, block))
+    if found is None:
+        return
+    shift = Similarity(np.zeros(2), np.array([found.east, found.north, 0.0, 0.0]), np.zeros((4, 4)))
+    for k in block:
+        out[k] = replace(
+            _moved(out[k], shift, 0.0),
+            coarse_shift=found,
+            confidence=found.confidence,
+            false_matches=found.false_matches,
+        )
+
+
+def _level_m(out: Sequence[VehicleState], block: Block) -> float:
+    """Median height of a block's points, metres."""
+    return float(np.median(np.concatenate([out[k].flight.adjustment.points[:, 2] for k in block])))
 
 
 def _own_solution(state: VehicleState) -> tuple[Array, Array, float, float]:

@@ -85,7 +85,10 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     stated = stated_errors(adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor)
     state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_sigma_deg(flight, state.surface)))
     state.sigma_m, state.pose_covariance = stated.sigma_m[: len(flight.frames)], stated.pose[: len(flight.frames)]
-    if not lies_on_map(state):
+    if state.coarse_shift is not None:  # it replaces the receivers' error, which all pictures have in common
+        own = state.coarse_sigma_m
+        state.sigma_m = np.hypot(np.sqrt(np.maximum(own**2 - own.min() ** 2, 0.0)), state.coarse_shift.sigma_m)
+    elif not lies_on_map(state):
         state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # neighbours off the map add no accuracy
     elif not state.on_map:
         theirs = [float(np.median(other.sigma_m)) for other in others if lies_on_map(other)]

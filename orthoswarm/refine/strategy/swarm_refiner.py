@@ -107,7 +107,7 @@ class SwarmRefiner:
     ) -> Solution:
         """The second pass of a vehicle's units, with others held as they are."""
         own = register_unfound(own, others, self.epsg, self.origin, serial)
-        own = join_unmapped(own, others, self.epsg, self.origin, serial)[0]
+        own = join_unmapped(own, others, basemap, self.epsg, origin=self.origin, run=serial)[0]
         everyone = [*own, *others]
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
@@ -212,7 +212,7 @@ def _second_passes(
 ) -> list[VehicleState]:
     """All vehicles again, on a common level, each with its neighbours held as the first pass left them."""
     states = register_unfound(states, [], epsg, origin, run)
-    states, unmapped = join_unmapped(states, [], epsg, origin, run)
+    states, unmapped = join_unmapped(states, [], basemap, epsg, origin=origin, run=run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]
@@ -222,7 +222,7 @@ def _second_passes(
         out[k] = state
         if progress:
             progress("joint", done + 1, len(states))
-    carried = [k for k, s in enumerate(states) if lies_on_map(s) and not s.on_map]
+    carried = [k for k, s in enumerate(states) if s.carried and not s.on_map]
     # After the mapped ones: their refined pictures hold it, and its accuracy is theirs at best.
     items = [(states[k], neighbours_of(states[k], out), float(network.correction_m[k])) for k in carried]
     for done, (k, state) in enumerate(zip(carried, run(task, items), strict=True)):

@@ -34,8 +34,10 @@ from orthoswarm.refine.flight.relative_block import (
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.registration.absolute_orientation import orient_on_map
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
+from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, learned_fit
 from orthoswarm.refine.registration.confirmed_registration import confirmed
+from orthoswarm.refine.registration.map_offset import had_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
@@ -170,7 +172,8 @@ def registered_state(
         coarse_surface=surface,
     )
     if basemap is not None:
-        state.had_map = True
+        state.had_map = not (is_coarse(flight, basemap) and had_corrections(flight.frames))
+    if basemap is not None and not is_coarse(flight, basemap):
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
         if state.unfound and learned:
             _onto_map_by_learning(state, learned_fit(flight, basemap, origin), basemap, origin, watch)

@@ -1,0 +1,175 @@
+"""Where a block of vehicles lies on a map whose pixels are far coarser than theirs, as satellite maps of 5 to 10 m.
+
+On such a map no single picture can be recognised, and nothing but one shift of all can be found: the pictures, averaged
+to the map's pixel, are correlated with it as one mosaic. The correlation at all other shifts tells how high a peak is
+by chance (an a-contrario test as in `map_evidence`); leaving out a part of the ground at a time tells how well the peak
+is known (delete-a-group jackknife; Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 11).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from orthoswarm.config import active
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.registration.orientation_correlation import (
+    correlation,
+    highest,
+    strip_mosaic,
+    without_peak,
+)
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_STEP = 2
+"""Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseMapShift:
+    """One shift of a block onto a coarse map.
+
+    Attributes:
+        east, north: metres to add. sigma_m: of each axis. gsd_m: the map's pixel.
+        confidence: 1 minus the ratio of the second peak to the first.
+        false_matches: expected number of peaks as high on a map of other ground.
+    """
+
+    east: float
+    north: float
+    sigma_m: float
+    gsd_m: float
+    confidence: float
+    false_matches: float
+
+
+def is_coarse(flight: Flight, basemap: MapWindow) -> bool:
+    """Whether a map's pixels are too coarse for tie points of a flight's pictures."""
+    config, cameras = active().registration, flight.cameras()
+    picture_m = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    return basemap.native_gsd_m > max(config.coarse_map_gsd_m, config.coarse_map_pictures * picture_m)
+
+
+def shift_on_coarse_map(
+    flights: Sequence[Flight], basemap: MapWindow, origin: Array, ground_z: float
+) -> CoarseMapShift | None:
+    """Where vehicles that make one block lie on a coarse map; None where it does not show their ground.
+
+    Args:
+        flights: adjusted, in one frame. basemap: the map. origin: float64 (2,) of the local frame.
+        ground_z: level of their ground, metres.
+    """
+    config, gsd = active().registration, basemap.native_gsd_m / _STEP
+    drawn = _mosaic(flights, ground_z, gsd)
+    if drawn is None:
+        return None
+    grey, valid, west, north = drawn
+    reach = int(np.ceil(config.coarse_reach_m[0] / gsd))
+    rows, columns = (n + 2 * reach for n in grey.shape)
+    left, top = origin[0] + west - reach * gsd, origin[1] + north + reach * gsd
+    bounds = BoundingBox(left, top - rows * gsd, left + columns * gsd, top)
+    ground, known = basemap.gray(bounds, gsd)
+    ground, known = ground[:rows, :columns], known[:rows, :columns]
+    if ground.shape != (rows, columns) or known.mean() < config.strip_map_share:
+        return None
+    moving, fixed = _texture(grey, valid), _texture(ground, known)
+    if min(np.count_nonzero(moving), np.count_nonzero(fixed)) < config.strip_fewest_edges:
+        return None
+    score = correlation(moving, fixed, reach)
+    column, row, peak, ratio = highest(score, config.peak_apart_px)
+    rest = without_peak(score, config.peak_apart_px)
+    z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
+    false_matches = float(np.exp(np.log(score.size) + log_ndtr(-z)))
+    if false_matches > config.false_matches:
+        return None
+    spread = _jackknife(moving, fixed, reach)
+    grid = GroundGrid.around(basemap.epsg, bounds, gsd)
+    return CoarseMapShift(
+        east=float(grid.west - bounds.west + gsd * column),
+        north=float(grid.north - bounds.north - gsd * row),
+        sigma_m=float(np.hypot(gsd * spread, config.coarse_map_sigma_px * basemap.native_gsd_m)),
+        gsd_m=basemap.native_gsd_m,
+        confidence=1.0 - ratio,
+        false_matches=false_matches,
+    )
+
+
+def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[Grey, Mask, float, float] | None:
+    """Grey mosaic of all vehicles, averaged over the map's pixel, with its validity, west and north edges."""
+    fine = gsd_m / _STEP
+    parts = []
+    for flight in flights:
+        every = np.arange(len(flight.frames))
+        part = strip_mosaic(flight.adjustment.cameras, every, flight.pictures.small, ground_z, fine)
+        flight.pictures.drop()
+        if part is not None:
+            parts.append(part)
+    if not parts:
+        return None
+    west = float(np.floor(min(p[2] for p in parts) / gsd_m) * gsd_m)
+    north = float(np.ceil(max(p[3] for p in parts) / gsd_m) * gsd_m)
+    places = [(round((north - n) / fine), round((w - west) / fine)) for _, _, w, n in parts]
+    rows, columns = (
+        -(-max(at[axis] + p[0].shape[axis] for at, p in zip(places, parts)) // _STEP) * _STEP for axis in (0, 1)
+    )
+    total, count = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    for (row, column), (grey, valid, _, _) in zip(places, parts):
+        cut = (slice(row, row + grey.shape[0]), slice(column, column + grey.shape[1]))
+        total[cut] += np.where(valid, grey, 0.0)
+        count[cut] += valid
+    side = _STEP * _STEP  # the map's pixel
+    shown = (count > 0).astype(np.float32)
+    sums = (_box(part, side) for part in (np.where(count > 0, total / np.maximum(count, 1.0), 0.0), shown))
+    mean, share = (part[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP] for part in sums)
+    valid = share > active().registration.coarse_map_share
+    return np.asarray(np.where(valid, mean / np.maximum(share, 1e-6), 0.0), np.float32), valid, west, north
+
+
+def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
+    """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.texture_field`."""
+    config, side = active().registration, active().registration.strip_border_px
+    gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)
+    length = np.abs(gradient)
+    middle = config.coarse_map_texture * float(np.median(length[inner])) if inner.any() else 0.0
+    weight = middle / np.maximum(length**2 + middle**2, 1e-6)
+    return np.asarray(np.where(inner, gradient * weight, 0), np.complex64)
+
+
+def _box(values: NDArray[np.floating], side: int) -> Grey:
+    """Mean over a square of an even side, centred on each pixel's upper left corner."""
+    return np.asarray(
+        cv2.boxFilter(
+            values.astype(np.float32), -1, (side, side), anchor=(side // 2, side // 2), borderType=cv2.BORDER_CONSTANT
+        )
+    )
+
+
+def _jackknife(moving: NDArray[np.complex64], fixed: NDArray[np.complex64], reach: int) -> float:
+    """Sigma of an axis of the peak's place, pixels, by leaving out a part of the mosaic at a time."""
+    config = active().registration
+    rows, columns = np.nonzero(moving)
+    across = max(1, round(float(np.sqrt(config.coarse_map_parts))))
+    row_edges = np.quantile(rows, np.linspace(0.0, 1.0, across + 1))
+    column_edges = np.quantile(columns, np.linspace(0.0, 1.0, across + 1))
+    places = []
+    for i in range(across):
+        for j in range(across):
+            part = (rows >= row_edges[i]) & (rows <= row_edges[i + 1])
+            part &= (columns >= column_edges[j]) & (columns <= column_edges[j + 1])
+            if not part.any() or part.all():
+                continue
+            left = moving.copy()
+            left[rows[part], columns[part]] = 0
+            places.append(highest(correlation(left, fixed, reach), config.peak_apart_px)[:2])
+    n = len(places)
+    return float("inf") if n < 2 else float(np.sqrt((n - 1) * np.array(places).var(axis=0).mean()))
