@@ -34,7 +34,7 @@ _STEP = 2
 """Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseMapShift:
     """One shift of a block onto a coarse map.
 

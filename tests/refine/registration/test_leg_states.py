@@ -16,7 +16,7 @@ def vehicle(ties, *, on_map=True, carried=False, residual_m=0.3, had_map=True):
     flight = SimpleNamespace(leg=leg, adjustment=SimpleNamespace(tie_residual=residual))
     return SimpleNamespace(
         vehicle="v", flight=flight, matches=SimpleNamespace(camera=camera), on_map=on_map, carried=carried,
-        had_map=had_map, sigma_m=np.full(len(leg), 0.2),
+        coarse_shift=None, had_map=had_map, sigma_m=np.full(len(leg), 0.2),
     )  # fmt: skip
 
 

@@ -40,6 +40,7 @@ def moved(before: list[PlacedFrame], east: float, north: float, stage: str = "fi
         replace(
             p,
             stage=stage,
+            sigma_m=0.05,
             camera=replace(
                 p.camera, position=p.camera.position + np.array([*(bias[p.frame.vehicle] + [east, north]), 0.4])
             ),
@@ -87,3 +88,10 @@ def test_frames_that_do_not_lie_on_the_map_say_nothing():
     before = recorded(2)
     assert measure_map_offset(before, moved(before, 40.0, 0.0, stage="coarse")) is None
     assert measure_map_offset(before, []) is None
+
+
+def test_the_sigma_covers_how_well_the_place_on_the_map_is_known():
+    before = recorded(3)
+    onto_coarse_map = [replace(p, sigma_m=2.4) for p in moved(before, 5.0, -5.0)]
+    offset = measure_map_offset(before, onto_coarse_map)
+    assert offset is not None and offset.sigma > 2.4 and not offset.doubted

@@ -114,18 +114,27 @@ def test_a_vehicle_that_completes_later_is_refined_beside_the_first(scene):
     np.testing.assert_array_equal(before, [p.camera.position for p in one.placed])
 
 
-def test_damaged_pictures_are_dropped_with_a_reason_and_the_rest_is_placed(twin, tmp_path, scene):
+def test_a_picture_that_breaks_after_it_was_read_is_dropped_with_a_reason(twin, tmp_path, scene):
     _, grid, basemap, _ = scene
+    photos = tmp_path / "photos"
+    shutil.copytree(twin / "photos", photos)
+    frames = [f for f in load([photos]).frames if f.vehicle == "uav01"]
+    victim = sorted(Path(photos).rglob("*.JPG"))[7]
+    victim.write_bytes(victim.read_bytes()[:9000] + bytes(20000))
+    (solution,) = refine_all({"uav01": frames}, basemap, grid).fine
+    assert set(solution.dropped) == {f"{victim.parent.name}/{victim.name}"}
+    assert all(solution.dropped.values())
+    assert len(solution.placed) == len(frames) - 1
+
+
+def test_a_picture_that_is_cut_off_is_refused_when_it_is_read(twin, tmp_path):
     photos = tmp_path / "photos"
     shutil.copytree(twin / "photos", photos)
     victim = sorted(Path(photos).rglob("*.JPG"))[7]
     victim.write_bytes(victim.read_bytes()[:9000] + bytes(20000))
-    frames = [f for f in load([photos]).frames if f.vehicle == "uav01"]
-    result = refine_all({"uav01": frames}, basemap, grid)
-    (solution,) = result.fine
-    named = {f"{victim.parent.name}/{victim.name}"}
-    assert set(solution.dropped) == named or len(frames) == 19
-    assert len(solution.placed) + len(solution.dropped) == len(frames)
+    found = load([photos])
+    assert [(r.image, "cut off" in r.reason) for r in found.rejected] == [(f"{victim.parent.name}/{victim.name}", True)]
+    assert len(found.frames) == 39
 
 
 def test_a_map_of_other_ground_leaves_the_flight_in_its_own_frame(scene):
