@@ -242,6 +242,9 @@ class RegistrationConfig:
     unfound_reach_px: int = 24
     """How far points are searched in the neighbours' pictures once strips agree, pixels: relief moves them by metres
     across a border (chosen)."""
+    unfound_cell_share: float = 0.15
+    """`link_cell_m` for it is at most this share of a picture's width: low flights have room for few points 40 m apart
+    (chosen; legs of six photos from 40 m had 2 to 4 links)."""
     unfound_scales: tuple[float, float, float, float, float] = (1e4, 400.0, 36.0, 9.0, 9.0)
     """Robust scales of the steps with these links (chosen; not measured)."""
     unfound_fewest: int = 8

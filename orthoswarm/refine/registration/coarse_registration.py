@@ -37,7 +37,7 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
     Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
     """
     config = active().registration
-    gsd = float(np.clip(_picture_width(flight) / config.strip_across_px, *config.strip_gsd_m))
+    gsd = float(np.clip(picture_width_m(flight) / config.strip_across_px, *config.strip_gsd_m))
     tiles = TiledMap(basemap, gsd)
     near, far = config.coarse_reach_m
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
@@ -100,7 +100,7 @@ def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit 
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
     config = active().registration
     cameras, reach_m = flight.cameras(), config.learned_reach_m
-    gsd = float(np.clip(_picture_width(flight) / config.learned_across_px, *config.learned_gsd_m))
+    gsd = float(np.clip(picture_width_m(flight) / config.learned_across_px, *config.learned_gsd_m))
     windows = _windows(flight.leg, config.learned_pictures)
     basemap = TiledMap(basemap, gsd)
     spread = np.linspace(0, len(windows) - 1, config.learned_strips).round().astype(int)
@@ -149,7 +149,7 @@ def shift_cameras(flight: Flight, correction: Array) -> None:
                 adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
 
 
-def _picture_width(flight: Flight) -> float:
+def picture_width_m(flight: Flight) -> float:
     """Width of a picture on the ground, metres."""
     cameras = flight.cameras()
     return flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))

@@ -19,7 +19,12 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
-from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, shift_cameras
+from orthoswarm.refine.registration.coarse_registration import (
+    CoarseFit,
+    coarse_fits,
+    picture_width_m,
+    shift_cameras,
+)
 from orthoswarm.refine.registration.neighbour_ties import FixedCameras, fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
@@ -147,7 +152,8 @@ def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> 
     fixed = fixed_cameras_near(state, others)
     if fixed is None:
         return False
-    found = link_to_fixed(flight, fixed, working_gsd(flight), config.unfound_reach_px)
+    cell_m = min(config.link_cell_m, config.unfound_cell_share * picture_width_m(flight))
+    found = link_to_fixed(flight, fixed, working_gsd(flight), config.unfound_reach_px, cell_m=cell_m)
     if found < config.unfound_fewest:
         return False
     adj = flight.adjustment

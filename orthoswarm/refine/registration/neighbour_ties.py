@@ -75,12 +75,14 @@ def link_to_fixed(
     gsd_m: float,
     reach_px: int | None = None,
     pictures: NDArray[np.bool_] | None = None,
+    cell_m: float | None = None,
 ) -> int:
     """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.
 
     Args:
         gsd_m: pixel in which they are compared. reach_px: how far a point is searched there, None: as configured.
-        pictures: bool (N,), own ones to compare, None for all.
+        pictures: bool (N,), own ones to compare, None for all. cell_m: one point a leg in each cell of this size,
+            None: as configured.
     """
     config = active().registration
     adj = flight.adjustment
@@ -90,7 +92,8 @@ def link_to_fixed(
     usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + fixed.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)
-    chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, config.link_cell_m)
+    cell_m = config.link_cell_m if cell_m is None else cell_m
+    chosen = one_per_cell(adj.points, leg[np.maximum(seen.camera, 0)], cost, cell_m)
     candidates = np.arange(n, len(joint))
 
     def gray(i: int) -> Gray:
