@@ -64,7 +64,8 @@ def from_takeoff(
     zeros = [(level, config.ground_level_sigma_m**2 + relief**2)]
     if recorded:
         zeros.append((float(np.median(recorded)), config.recorded_height_sigma_m**2))
-    zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= config.takeoff_level_limit_m]
+    limit = config.takeoff_level_limit_m + config.takeoff_level_reliefs * relief
+    zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= limit]
     if not zeros:
         return placed, level
     weight = np.array([1.0 / variance for _, variance in zeros])
