@@ -42,8 +42,8 @@ class MosaicConfig:
     takeoff_level_limit_m: float = 3.0
     """A level that lies farther from the refiner's zero is not believed, metres (chosen) ..."""
     takeoff_level_reliefs: float = 2.0
-    """... and so many sigmas of the ground's heights: the refiner holds the ground's median at its zero, and the place of
-    takeoff may lie anywhere in the relief."""
+    """... and so many sigmas of the ground's heights: the refiner holds the ground's median at its zero, and the place
+    of takeoff may lie anywhere in the relief."""
 
     # Candidates of a cell of the seam lines
     weak_cost: float = 1e6
