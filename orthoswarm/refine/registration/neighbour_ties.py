@@ -74,6 +74,7 @@ def link_to_fixed(
     fixed: FixedCameras,
     gsd_m: float,
     reach_px: int | None = None,
+    *,
     pictures: NDArray[np.bool_] | None = None,
     cell_m: float | None = None,
 ) -> int:
