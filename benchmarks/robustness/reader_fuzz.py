@@ -36,15 +36,15 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     from telemetry.formats.table.pose_csv import read_pose_csv
     from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
     from telemetry.photos.photo_tags import read_photo
-    from telemetry.video.extraction import pictures
-    from telemetry.video.picture_poses import Poses
-    from telemetry.video.video_file import scan
+    from telemetry.videos.extraction import pictures
+    from telemetry.videos.picture_poses import Poses
+    from telemetry.videos.video_file import scan
     from telemetry.write.sei_writer import add_sei
     from tests.telemetry.formats import test_can_logs, test_flight_logs, test_gpmf, test_klv, test_reader_fuzz, test_srt
     from tests.telemetry.formats.test_exposure_lists import write_mrk, write_pos
     from tests.telemetry.formats.test_tables import TABLES
     from tests.telemetry.ingest import test_photos
-    from tests.telemetry.video import test_video
+    from tests.telemetry.videos import test_video
 
     def file(read: Callable[[Path], Any], name: str) -> Reader:
         def run(data: bytes, folder: Path) -> None:

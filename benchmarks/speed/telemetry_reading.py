@@ -40,7 +40,7 @@ def bench_video(count: int) -> None:
 
     from telemetry.formats.video import bitstream, sei
     from telemetry.samples.sample import Sample
-    from telemetry.video.extraction import extract
+    from telemetry.videos.extraction import extract
     from telemetry.write.sei_writer import add_sei
 
     with tempfile.TemporaryDirectory() as folder:

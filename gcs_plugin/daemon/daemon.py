@@ -13,15 +13,15 @@ from typing import Any, Final
 
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.airspace.terrain_data import TerrainData
-from gcs_plugin.daemon.coverage.event_requests import EventRequests
-from gcs_plugin.daemon.coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
-from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
-from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
-from gcs_plugin.daemon.coverage.picture_requests import PictureRequests
-from gcs_plugin.daemon.coverage.picture_views import PictureViews
-from gcs_plugin.daemon.coverage.planned_area import area_source
 from gcs_plugin.daemon.exports import Exports
 from gcs_plugin.daemon.fetched_pictures import make_picture_requests
+from gcs_plugin.daemon.flight_coverage.event_requests import EventRequests
+from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
+from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests
+from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
+from gcs_plugin.daemon.flight_coverage.planned_area import area_source
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source

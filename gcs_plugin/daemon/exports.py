@@ -13,7 +13,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import ExportTask, write_products
 from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import Area, Layer
-from gcs_plugin.daemon.places import pictures_at, places_of
+from gcs_plugin.daemon.place_list import pictures_at, places_of
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked

@@ -4,8 +4,8 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.daemon.coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.coverage.picture_requests import PictureRequests, WantedPicture, wanted_pictures
+from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
+from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests, WantedPicture, wanted_pictures
 from gcs_plugin.daemon.intake.pose_relay import linked_pose
 from gcs_plugin.daemon.intake.posted_pose import PostedPose
 from gcs_plugin.daemon.settings import Settings

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from gcs_plugin.daemon.coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.flight_limits import RESERVE

@@ -15,7 +15,7 @@ from orthoswarm.twin.site import Site, disaster_zones, with_heading
 from orthoswarm.twin.true_flight import FlightPlan, Motion
 
 if TYPE_CHECKING:
-    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import Stage
 
 _FAR_M = 20_000.0
 

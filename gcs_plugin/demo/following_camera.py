@@ -31,7 +31,7 @@ from telemetry.samples.sample import Sample
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
-    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import Stage
     from orthoswarm.twin.site import Site
 
 LATE_S: Final = 0.25

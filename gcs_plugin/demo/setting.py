@@ -11,7 +11,7 @@ from orthoswarm.twin.site import Site, disaster_zones
 from orthoswarm.twin.true_flight import FlightPlan
 
 if TYPE_CHECKING:
-    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import Stage
 
 HEIGHT_M: Final = 90.0
 FOV_MIN_DEG: Final = 75.0

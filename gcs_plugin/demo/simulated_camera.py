@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from gcs_plugin.demo.setting import HEIGHT, WIDTH, Errors, Setting
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.twin.camera.ray_marching import lens_rays, render
-from orthoswarm.twin.camera.sensor import Sensor
+from orthoswarm.twin.imaging.ray_marching import lens_rays, render
+from orthoswarm.twin.imaging.sensor import Sensor
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
     from gcs_plugin.sim.mission_flight import Exposure
-    from orthoswarm.twin.camera.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import Stage
     from orthoswarm.twin.site import Site
 
 _POSITION_M: Final = 0.8

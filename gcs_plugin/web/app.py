@@ -17,7 +17,7 @@ from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
 from gcs_plugin.web.areas import read_area
-from gcs_plugin.web.commands import CommandRoutes
+from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.coverage_routes import CoverageRoutes
 from gcs_plugin.web.event_stream import stream_events
 from gcs_plugin.web.guard import Guard

@@ -26,7 +26,7 @@ class ComputeConfig:
     """Memory that a canvas keeps of its tiles, megabytes; tiles beyond it are on disk (chosen)."""
     tile_store_mb: float = 64.0
     """Memory that a drawing task keeps of the tiles that it writes, megabytes (chosen)."""
-    grey_pictures_mb: float = 160.0
+    working_pictures_mb: float = 160.0
     """Memory that a vehicle's refinement keeps of its pictures at working scale, megabytes (chosen)."""
     pictures_per_task: int = 64
     """Pictures that a drawing task reads, or copies to previews (chosen: its overhead is small then)."""

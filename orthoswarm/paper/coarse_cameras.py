@@ -16,7 +16,7 @@ from orthoswarm.paper.leg_lines import Line, find_legs, fit_line
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
 from orthoswarm.refine.bundle.flight_records import Array, read_records
-from orthoswarm.refine.features.grey_pictures import Pictures
+from orthoswarm.refine.features.working_pictures import Pictures
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from orthoswarm.model.robust import mad_sigma
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.bundle.flight_records import Array
-from orthoswarm.refine.features.grey_pictures import Pictures
+from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
 

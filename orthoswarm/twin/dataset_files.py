@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.twin.camera.ray_marching import Stage, make_stage, satellite_view
 from orthoswarm.twin.city.builder import Slot
 from orthoswarm.twin.city.city import place_cars
 from orthoswarm.twin.city.scene import TEXEL_M, WATER, Scene
 from orthoswarm.twin.city.sunlight import change_season, lit_texture
 from orthoswarm.twin.disaster import Zone, debris_flow, flood, haze_opacity, zone_mask
+from orthoswarm.twin.imaging.ray_marching import Stage, make_stage, satellite_view
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.site import Site, light_of, map_lean
 from orthoswarm.twin.true_flight import Flight

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.twin.camera.ray_marching import HAZE_CELL_M
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
 from orthoswarm.twin.city.scene import TEXEL_M, Scene
+from orthoswarm.twin.imaging.ray_marching import HAZE_CELL_M
 
 Floats = NDArray[np.float32]
 

@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from orthoswarm.model.camera import Camera, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.twin.camera.photo_tags_writer import PhotoTags, with_tags
-from orthoswarm.twin.camera.ray_marching import Stage, lens_rays, render
-from orthoswarm.twin.camera.sensor import Sensor
 from orthoswarm.twin.dataset_files import (
     after_disaster,
     photo_name,
@@ -24,6 +21,9 @@ from orthoswarm.twin.dataset_files import (
     write_plan,
     write_truth,
 )
+from orthoswarm.twin.imaging.photo_tags_writer import PhotoTags, with_tags
+from orthoswarm.twin.imaging.ray_marching import Stage, lens_rays, render
+from orthoswarm.twin.imaging.sensor import Sensor
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.recorded_noise import Record, record
 from orthoswarm.twin.site import Site, disaster_zones

@@ -16,9 +16,9 @@ from telemetry.photos.photo_frames import frames_of
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
-from telemetry.video.extraction import extract
-from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import VideoScan, scan
+from telemetry.videos.extraction import extract
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import VideoScan, scan
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
 

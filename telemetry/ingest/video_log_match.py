@@ -13,8 +13,8 @@ from telemetry.ingest.pairing.clock_offset import (
     turning_of_pictures,
 )
 from telemetry.samples.findings import Finding, plural
-from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import VideoScan
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import VideoScan
 
 Array = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ def picture_rates(found: VideoScan) -> tuple[Array, Array]:
     """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
     import cv2
 
-    from telemetry.video.extraction import decoded
-    from telemetry.video.picture_choice import luma
+    from telemetry.videos.extraction import decoded
+    from telemetry.videos.picture_choice import luma
 
     rate = found.rate or 30.0
     every = max(1, round(rate / _RATE_HZ))

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from telemetry.formats.video import bitstream, klv, sei
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
-from telemetry.video.extraction import to_rgb
-from telemetry.video.packet_loss import LiveDamage
-from telemetry.video.picture_choice import Candidate, Picker
-from telemetry.video.video_file import NotAVideo, open_video, parked
+from telemetry.videos.extraction import to_rgb
+from telemetry.videos.packet_loss import LiveDamage
+from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.video_file import NotAVideo, open_video, parked
 
 _HELD_S = 0.5
 _KEPT_SAMPLES = 64
@@ -60,7 +60,7 @@ def open_stream(
     clock: Callable[[], float] = time.time,
     on_state: Callable[[str], None] | None = None,
 ) -> Iterator[LivePicture]:
-    """Pictures of a live stream, thinned like those of a file (`telemetry.video.picture_choice`).
+    """Pictures of a live stream, thinned like those of a file (`telemetry.videos.picture_choice`).
 
     Args:
         url: rtsp://, rtmp://, udp://, tcp://, or a file.

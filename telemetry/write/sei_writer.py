@@ -12,7 +12,7 @@ from typing import Any
 from orthoswarm.model.errors import InputError
 from telemetry.formats.video import bitstream, sei
 from telemetry.samples.sample import Sample
-from telemetry.video.video_file import NotAVideo, demux, open_video
+from telemetry.videos.video_file import NotAVideo, demux, open_video
 
 _RAW = frozenset({".h264", ".264", ".avc", ".h265", ".265", ".hevc"})
 
@@ -82,8 +82,8 @@ def presentation_order(path: Path) -> list[int]:
 
 def _order_by_decoding(path: Path, count: int) -> list[int]:
     """The order where the stream has no times (raw streams), from the decoder."""
-    from telemetry.video.extraction import decoded
-    from telemetry.video.video_file import scan
+    from telemetry.videos.extraction import decoded
+    from telemetry.videos.video_file import scan
 
     order = list(range(count))
     for number, index, _ in decoded(scan(path)):

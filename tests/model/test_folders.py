@@ -28,3 +28,27 @@ def test_every_room_says_what_it_is(tree):
         or not ast.get_docstring(ast.parse((room / "__init__.py").read_text(encoding="utf-8")))
     ]
     assert not silent, "give these an __init__.py with one sentence"
+
+
+def _named_after_others(path: Path) -> bool:
+    """Whether a module has the name of what it configures, or of the verb that it runs."""
+    return "config" in path.parts or "verbs" in path.parts
+
+
+def test_no_name_stands_for_two_things():
+    places: dict[str, list[str]] = {}
+    for tree in ("orthoswarm", "telemetry", "gcs_plugin"):
+        for path in (ROOT / tree).rglob("*.py"):
+            if path.name == "__init__.py":
+                path, name = path.parent, path.parent.name
+            else:
+                name = path.stem
+            # A room's main module has the room's name (canvas/canvas.py).
+            if not _named_after_others(path.relative_to(ROOT)) and name != "__main__" and path.parent.name != name:
+                places.setdefault(name, []).append(str(path.relative_to(ROOT)))
+    assert not {name: where for name, where in places.items() if len(where) > 1}
+
+
+def test_no_two_tests_have_one_name():
+    names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert not [name for name, count in names.items() if count > 1]

@@ -3,7 +3,7 @@
 import base64
 
 from tests.kit.page_kit import DESK, PHONE, ok_for_all, opened, send, standing, vehicle
-from tests.page.test_commands import confirm
+from tests.page.test_command_bar import confirm
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="

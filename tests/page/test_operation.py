@@ -14,7 +14,7 @@ from tests.kit.daemon_kit import GRID, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.page_kit import DESK, PHONE, TABLET, opened
 from tests.kit.sim_cameras import Cameras, square
-from tests.page.test_commands import confirm
+from tests.page.test_command_bar import confirm
 from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess, free_port, small_area
 
 playwright = pytest.importorskip("playwright.sync_api")

@@ -116,7 +116,7 @@ class Source:
 
     def _stream(self) -> None:
         from telemetry.live.live_stream import open_stream
-        from telemetry.video.extraction import encode_jpeg
+        from telemetry.videos.extraction import encode_jpeg
 
         def state(text: str) -> None:
             before, self._state = self._state, text.split(":")[0]

@@ -18,8 +18,8 @@ from orthoswarm.refine.bundle.observation_selection import BestViews, best_views
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
-from orthoswarm.refine.features.grey_pictures import Pictures
 from orthoswarm.refine.features.tracks import follow, predicted_homography
+from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
 
 Array = NDArray[np.float64]

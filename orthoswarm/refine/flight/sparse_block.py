@@ -15,7 +15,7 @@ from orthoswarm.refine.bundle import flight_records
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, F, Tracks
 from orthoswarm.refine.features.flow_calibration import Calibration
-from orthoswarm.refine.features.grey_pictures import Pictures
+from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_adjustment import datum_prior, heights_above_ground, solve_sparse, trusted_heights

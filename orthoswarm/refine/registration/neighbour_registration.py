@@ -153,7 +153,7 @@ def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> 
     if fixed is None:
         return False
     cell_m = min(config.link_cell_m, config.unfound_cell_share * picture_width_m(flight))
-    found = link_to_fixed(flight, fixed, working_gsd(flight), config.unfound_reach_px, cell_m=cell_m)
+    found = link_to_fixed(flight, fixed, working_gsd(flight), reach_px=config.unfound_reach_px, cell_m=cell_m)
     if found < config.unfound_fewest:
         return False
     adj = flight.adjustment

@@ -73,6 +73,7 @@ def link_to_fixed(
     flight: Flight,
     fixed: FixedCameras,
     gsd_m: float,
+    *,
     reach_px: int | None = None,
     *,
     pictures: NDArray[np.bool_] | None = None,

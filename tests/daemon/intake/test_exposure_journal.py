@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gcs_plugin.daemon.coverage.event_requests import EventRequests
-from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.flight_coverage.event_requests import EventRequests
+from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.lossy_radio import Faults

@@ -14,7 +14,7 @@ from telemetry.photos import photo_tags
 from telemetry.write.sei_writer import add_sei
 from tests.telemetry.formats.test_flight_logs import ulog
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
-from tests.telemetry.video.test_video import make_video, pose
+from tests.telemetry.videos.test_video import make_video, pose
 
 GOOD = "good.jpg"
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from telemetry.formats.video.gpmf import read_gpmf
-from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import PictureNote, VideoScan
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import PictureNote, VideoScan
 
 
 def entry(key, kind, size, rows, body):

@@ -8,7 +8,7 @@ from orthoswarm.model.errors import InputError
 from telemetry.formats.video import bitstream
 from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.ingest import LoadOptions, survey
-from tests.telemetry.video.test_video import make_video
+from tests.telemetry.videos.test_video import make_video
 
 av = pytest.importorskip("av")
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from telemetry.formats.video.djmd import parse_message, read_djmd
 from telemetry.formats.video.srt import parse_srt, read_srt
-from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import PictureNote, VideoScan
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import PictureNote, VideoScan
 
 
 def block(text: str, n: int = 1) -> str:

@@ -11,7 +11,7 @@ from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.ingest.summary import summarise
 from tests.telemetry.ingest.test_ingest import flight, photo
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
-from tests.telemetry.video.test_video import make_video, pose
+from tests.telemetry.videos.test_video import make_video, pose
 
 from telemetry.write.sei_writer import add_sei  # isort: skip
 

@@ -98,7 +98,7 @@ def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
     import os
 
     from orthoswarm.raster.picture_file import read_rgb
-    from telemetry.video.extraction import encode_jpeg
+    from telemetry.videos.extraction import encode_jpeg
     from telemetry.write.tag_writer import with_pose
 
     folder = out.joinpath(*(_safe(part) for part in frame.vehicle.split("/")))

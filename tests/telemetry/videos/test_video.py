@@ -11,10 +11,10 @@ from gcs_plugin.cli.main import main
 from orthoswarm.model.errors import InputError
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.samples.sample import Sample
-from telemetry.video.extraction import decoded, extract
-from telemetry.video.picture_choice import Candidate, Picker
-from telemetry.video.picture_poses import Poses
-from telemetry.video.video_file import NotAVideo, scan
+from telemetry.videos.extraction import decoded, extract
+from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import NotAVideo, scan
 from telemetry.write.sei_writer import add_sei, presentation_order, with_sei
 
 av = pytest.importorskip("av")

@@ -31,7 +31,7 @@ class Pictures:
         cache_mb: float | None = None,
     ) -> None:
         config = active().features
-        cache_mb = active().compute.grey_pictures_mb if cache_mb is None else cache_mb
+        cache_mb = active().compute.working_pictures_mb if cache_mb is None else cache_mb
         work_width = config.work_width_px if work_width is None else work_width
         self._frames, self._read = frames, read
         width, height = frames[0].width, frames[0].height

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from telemetry.live.live_stream import open_stream
-from telemetry.video.extraction import decoded, extract
-from telemetry.video.packet_loss import Damage
-from telemetry.video.video_file import scan
+from telemetry.videos.extraction import decoded, extract
+from telemetry.videos.packet_loss import Damage
+from telemetry.videos.video_file import scan
 
 av = pytest.importorskip("av")
 

@@ -1,7 +1,7 @@
 """Assigns poses to the pictures of a video.
 
-Metadata in or with a picture's own packet (SEI, djmd) belongs to that packet and follows it through the
-decoder (`telemetry.video.extraction`), so that B-frames and threads cannot mix it up. Metadata with its own times (KLV,
+Metadata in or with a picture's own packet (SEI, djmd) belongs to that packet and follows it through the decoder
+(`telemetry.videos.extraction`), so that B-frames and threads cannot mix it up. Metadata with its own times (KLV,
 subtitles) is interpolated at the picture's time. The sources are merged field by field, the one with a position first.
 """
 
@@ -16,7 +16,7 @@ from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
-from telemetry.video.video_file import VideoScan
+from telemetry.videos.video_file import VideoScan
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.daemon.coverage.file_download import FtpJob, numbered
-from gcs_plugin.daemon.coverage.link_share import LinkShare
+from gcs_plugin.daemon.flight_coverage.file_download import FtpJob, numbered
+from gcs_plugin.daemon.flight_coverage.link_share import LinkShare
 from gcs_plugin.links.file_transfer import FRAME_BYTES, FtpPayload
 from gcs_plugin.links.mavlink import Message
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from telemetry.live.live_stream import open_stream
-from telemetry.video.video_file import NotAVideo
+from telemetry.videos.video_file import NotAVideo
 from telemetry.write.sei_writer import add_sei
-from tests.telemetry.video.test_video import make_video, pose
+from tests.telemetry.videos.test_video import make_video, pose
 
 av = pytest.importorskip("av")
 

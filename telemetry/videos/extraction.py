@@ -15,11 +15,11 @@ from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
-from telemetry.video.extraction_cache import CachedExtraction, CachedPicture, key_of, recall, remember
-from telemetry.video.packet_loss import Damage, transport_gaps
-from telemetry.video.picture_choice import Candidate, Picker
-from telemetry.video.picture_poses import Pose, Poses
-from telemetry.video.video_file import VideoScan, demux, open_video, parked, scan
+from telemetry.videos.extraction_cache import CachedExtraction, CachedPicture, key_of, recall, remember
+from telemetry.videos.packet_loss import Damage, transport_gaps
+from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.picture_poses import Pose, Poses
+from telemetry.videos.video_file import VideoScan, demux, open_video, parked, scan
 
 JPEG_QUALITY = 95
 _ZOOM_STEP = 0.03
@@ -238,7 +238,7 @@ def extract(
         vehicle: id of the vehicle if the metadata names none; None for the file's name.
 
     Raises:
-        telemetry.video.NotAVideo: it is not a video.
+        telemetry.videos.NotAVideo: it is not a video.
         OSError: a picture cannot be written.
     """
     found = found or scan(path)

@@ -16,13 +16,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.coverage.battery_use import BatteryUse
-from gcs_plugin.daemon.coverage.cells_picture import cells_png, picture_corners
-from gcs_plugin.daemon.coverage.exposure_journal import ExposureJournal
-from gcs_plugin.daemon.coverage.flawed_pictures import FlawedPictures
-from gcs_plugin.daemon.coverage.flown_legs import FlownLegs, flies
-from gcs_plugin.daemon.coverage.picture_views import Measured, PictureViews
-from gcs_plugin.daemon.coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
+from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
+from gcs_plugin.daemon.flight_coverage.cells_picture import cells_png, picture_corners
+from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.flight_coverage.flawed_pictures import FlawedPictures
+from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
+from gcs_plugin.daemon.flight_coverage.picture_views import Measured, PictureViews
+from gcs_plugin.daemon.flight_coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.coverage.camera_events import missing_by_events

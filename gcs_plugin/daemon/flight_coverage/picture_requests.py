@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from gcs_plugin.daemon.coverage.file_download import FileRead, FolderList
-from gcs_plugin.daemon.coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.coverage.ftp_talk import FtpTalk
-from gcs_plugin.daemon.coverage.link_share import LinkShare
+from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
+from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
+from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk
+from gcs_plugin.daemon.flight_coverage.link_share import LinkShare
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 

@@ -1,7 +1,7 @@
 """All metadata of video files.
 
 One pass over the packets, without decoding, finds all metadata: SEI of each picture, KLV, DJI's djmd track, a
-subtitle track. `telemetry.video.picture_poses` makes one pose for each picture of it.
+subtitle track. `telemetry.videos.picture_poses` makes one pose for each picture of it.
 """
 
 from collections import Counter

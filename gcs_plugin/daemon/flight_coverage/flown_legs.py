@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.coverage.planned_area import PlannedLegs
+from gcs_plugin.daemon.flight_coverage.planned_area import PlannedLegs
 
 Array = NDArray[np.float64]
 _LEAST_REACH_M: Final = 12.0

@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
-from telemetry.video.picture_poses import Poses
+from telemetry.videos.picture_poses import Poses
 
 _LIST = "pictures.json"
 _VERSION = 3

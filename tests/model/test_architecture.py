@@ -1,0 +1,66 @@
+"""docs/architecture.md names what is in the tree: each room has its sentence, each module that it names exists."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("orthoswarm", "telemetry", "gcs_plugin")
+TEXT = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+_NAME = re.compile(r"`([A-Za-z_][\w./]*)`")
+# Names of files and entry points that are no modules of this tree.
+_OTHER = {"frames.jsonl", "pyproject.toml", "orthoswarm.sei", "orthoswarm.matchers"}
+
+
+def named() -> list[str]:
+    return sorted(set(_NAME.findall(TEXT)) - _OTHER)
+
+
+def symbols() -> set[str]:
+    """Names of all functions, classes and constants of the three packages."""
+    found: set[str] = set()
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                    found.add(node.name)
+                elif isinstance(node, ast.Assign):
+                    found.update(target.id for target in node.targets if isinstance(target, ast.Name))
+                elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                    found.add(node.target.id)
+    return found
+
+
+def paths() -> set[str]:
+    """Each module and room, written with slashes, without suffix: "orthoswarm/model/frame"."""
+    found = set()
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            relative = path.relative_to(ROOT)
+            found.add(str(relative.parent if path.name == "__init__.py" else relative.with_suffix("")))
+    return found
+
+
+def test_named_modules_exist():
+    present, known = paths(), symbols()
+    missing = []
+    for name in named():
+        path = name.removesuffix(".py").rstrip("/").replace(".", "/")
+        if not any(other == path or other.endswith("/" + path) for other in present) and name not in known:
+            missing.append(name)
+    assert not missing, "docs/architecture.md names what is not in the tree"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_room_has_its_row(package):
+    rooms = TEXT[TEXT.index("## Every room") : TEXT.index("## Where to add")]
+    words = {part for name in _NAME.findall(rooms) for part in re.split(r"[./]", name)}
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / package).rglob("__init__.py")}
+    silent = [str(folder) for folder in sorted(folders) if folder.name not in words]
+    assert not silent, "give these a sentence in docs/architecture.md"
+
+
+def test_the_pages_stay_two():
+    assert len(TEXT.splitlines()) <= 140
