@@ -75,7 +75,6 @@ def link_to_fixed(
     gsd_m: float,
     *,
     reach_px: int | None = None,
-    *,
     pictures: NDArray[np.bool_] | None = None,
     cell_m: float | None = None,
 ) -> int:
