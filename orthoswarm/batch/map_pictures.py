@@ -209,7 +209,8 @@ def _copy_coarse(run: RunContext, state: RunState) -> None:
     """Without a map the orthoimage is the coarse product, too."""
     with written_whole(run.out / COARSE) as part:
         shutil.copyfile(run.out / ORTHOIMAGE, part)
-    if run.options.basemap is None:
+    moved = state.control is not None and state.control.by_receivers is not None
+    if run.options.basemap is None and not moved:
         state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
 
 

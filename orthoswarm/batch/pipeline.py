@@ -22,6 +22,7 @@ from orthoswarm.batch.run_state import (
     RunState,
 )
 from orthoswarm.batch.split_legs import legs_as_vehicles
+from orthoswarm.batch.unpositioned import with_control_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers
@@ -101,6 +102,8 @@ def _load(run: RunContext, load: Load) -> RunState:
         ingest = load(run.progress)
     except OSError as error:  # pictures of videos are written
         raise disk_error(error, run.out) from None
+    if run.options.control is not None and ingest.unpositioned:
+        ingest = with_control_positions(run, ingest)
     if not ingest.frames:
         raise InputError(nothing_to_map(ingest))
     grid = area_grid(ingest.frames)

@@ -91,8 +91,11 @@ class Ingest:
         frames: sorted by vehicle, then time (then name where times are unknown).
         rejected: every file with a picture's suffix, or picture of a video, that is not a frame.
         warnings: findings that a user should read, in plain words.
+        unpositioned: photos that are rejected for nothing but the lack of a position (latitude and longitude of their
+            fix are NaN), by vehicle, then time: surveyed points may place them.
     """
 
     frames: list[Frame]
     rejected: list[Rejection]
     warnings: list[str]
+    unpositioned: list[Frame] = field(default_factory=list)

@@ -25,7 +25,7 @@ from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_frames import frames_of
+from telemetry.photos.photo_frames import frame_without_position, frames_of
 from telemetry.photos.photo_tags import PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
@@ -50,7 +50,7 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
     found = survey(inputs, progress=progress, options=options)
     findings = [*found.findings, *(f for source in found.sources for f in source.findings)]
     warnings = dict.fromkeys(str(finding) for finding in findings if not finding.note)
-    return Ingest(found.frames(), found.rejected, list(warnings))
+    return Ingest(found.frames(), found.rejected, list(warnings), found.unpositioned)
 
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
@@ -59,7 +59,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     for layout in options.sei_layouts:
         register(read_sei_layout(layout))
     found = discover([Path(path) for path in inputs], options.exclude)
-    result = Survey(found.root, found)
+    result = Survey(root=found.root, discovery=found)
     vehicles = {folder.path: folder.vehicle for folder in found.folders}
     for path, why in found.left_out:
         result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, "")))
@@ -190,7 +190,7 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
 
 
 def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
-    """Keep photos with a position; the others are rejected."""
+    """Keep photos with a position; the others are rejected, and listed for surveyed points to place them."""
     placed = []
     for photo in photos:
         if photo.lat_deg is not None and photo.lon_deg is not None:
@@ -198,6 +198,7 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
         else:
             reason = "the picture has no position; put a geo.txt beside it or name a log, too"
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
+            result.unpositioned.append(frame_without_position(photo, vehicle, found.name(photo.path)))
     return placed
 
 

@@ -62,7 +62,7 @@ class SourceInfo:
     shown: dict[str, int] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Survey:
     """All sources of a set of inputs."""
 
@@ -70,6 +70,7 @@ class Survey:
     discovery: Discovery | None = None
     sources: list[SourceInfo] = field(default_factory=list)
     rejected: list[Rejection] = field(default_factory=list)
+    unpositioned: list[Frame] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
 
     def frames(self) -> list[Frame]:

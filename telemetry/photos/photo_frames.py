@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,12 @@ def frames_of(
             _frame(photo, vehicle, name(photo.path), height_m=heights[i], angles=angles, yaw_origin=yaw_origin)
         )
     return frames
+
+
+def frame_without_position(photo: PhotoTags, vehicle: str, image: str) -> Frame:
+    """The frame of a photo without a position: latitude and longitude are NaN, and no angle is believed."""
+    nowhere = replace(photo, lat_deg=math.nan, lon_deg=math.nan)
+    return _frame(nowhere, vehicle, image, height_m=photo.height_m, angles=(None, None, None), yaw_origin="")
 
 
 def _frame(

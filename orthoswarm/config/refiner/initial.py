@@ -192,3 +192,23 @@ class InitialConfig:
     """Shorter steps have no direction (chosen; not measured)."""
     leg_turn_deg: float = 35.0
     """A leg ends where a step leaves the mean of its steps by more than this (chosen; not measured)."""
+
+    # Photos without recorded positions, placed by surveyed points
+    free_pair_share: float = 0.02
+    """Two level photos put the centre of their matches so far apart, sigma as a share of the picture's width: tilts of
+    two or three degrees and relief (chosen)."""
+    free_scale_sigma: float = 0.02
+    """... and their scales and turns differ from those of the similarity by so much, sigma, radians or relative (chosen
+    for tilts of two or three degrees)."""
+    free_schedule: tuple[float, ...] = (400.0, 400.0, 100.0, 100.0, 36.0, 9.0, 9.0, 9.0)
+    """Robust schedule of that network (as that of the headings)."""
+    anchor_apart_sigmas: float = 10.0
+    """Two surveyed points turn and scale such photos if they lie so many sigmas apart (chosen)."""
+    anchor_most: int = 60
+    """So many observations of the ground take part in the search for their common similarity (chosen for its cost)."""
+    free_nadir_share: float = 0.05
+    """The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its
+    width: tilts of three degrees at a field of view of 60 (chosen)."""
+    free_most_pairs: int = 40_000
+    """Most pairs that are tried where nothing tells which photos overlap: 280 photos, some two minutes of CPU (chosen
+    for its cost)."""

@@ -168,7 +168,7 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
     tilt_floor = float(np.radians(config.tilt_floor_deg))
     count = len(records)
     hint, hint_sigma = focal_by_hint(records)
-    shape = _shape(matches, records, hint, hint_sigma)
+    shape = shape_of(matches, records, hint, hint_sigma)
     graph = similarities(matches, records, shape)
     metres, scale_known = first_scale(graph, records, lens_of, np.exp(shape.log_focal))
     component = components(graph, count)
@@ -179,7 +179,7 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
         if round_ == 0 or _differs(by_height, focal):
-            shape = _shape(matches, records, *_combine(hint, hint_sigma, by_height))
+            shape = shape_of(matches, records, *_combine(hint, hint_sigma, by_height))
             graph = similarities(matches, records, shape)
             focal = np.exp(shape.log_focal)
         relative = relative_scales(graph, records, heights, count)
@@ -205,7 +205,8 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
     )
 
 
-def _shape(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
+def shape_of(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
+    """Tilt of each segment and lens, with the priors of its tags; log_focal, log_focal_sigma: float64 (L,), priors."""
     config = active().initial
     tagged = np.isfinite(records.pitch)
     segments = int(records.segment.max()) + 1

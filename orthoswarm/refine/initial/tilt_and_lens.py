@@ -48,7 +48,7 @@ class Matches:
         """Collect the matches, evenly thinned where a pair has many."""
         most = active().initial.shape_most_matches
         z = [centred(f) for f in features]
-        picked = [p.match[_spaced(len(p.match), most)] for p in pairs]
+        picked = [p.match[spaced(len(p.match), most)] for p in pairs]
         start = np.concatenate([[0], np.cumsum([len(m) for m in picked], dtype=np.int64)])
         none = [np.zeros(0, np.complex128)]
         return cls(
@@ -79,7 +79,8 @@ class TiltAndLens:
     misfit: tuple[float, float]
 
 
-def _spaced(count: int, most: int) -> NDArray[np.intp]:
+def spaced(count: int, most: int) -> NDArray[np.intp]:
+    """At most so many of 0 to count - 1, evenly spaced."""
     if count <= most:
         return np.arange(count)
     return np.linspace(0, count - 1, most).astype(np.intp)
@@ -190,6 +191,15 @@ def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) ->
         spread=table[:, 3].real.copy(),
         residual=table[:, 4].real.copy(),
     )
+
+
+def level_pixels(z: Complex, photo: Ints, records: PhotoRecords, shape: TiltAndLens) -> Complex:
+    """Pixels z (M,) of photos (M,) in their level, undistorted pictures, complex (M,); the lens to first order."""
+    lens = records.lens[photo]
+    focal = np.exp(shape.log_focal)[lens]
+    z = z / (1.0 + shape.k1[lens] * np.abs(z / focal) ** 2)
+    ray = np.einsum("mij,mj->mi", shape.level[photo], np.stack([z.real, -z.imag, focal], axis=1))
+    return np.asarray(focal * (ray[:, 0] - 1j * ray[:, 1]) / ray[:, 2])
 
 
 def corner_radius(records: PhotoRecords) -> Array:

@@ -1,0 +1,230 @@
+"""Photos without recorded positions: a free network of planar similarities, placed by observations of the ground.
+
+Each photo is a similarity a z + t of its pixels onto the ground (complex numbers, see `planar_similarity`). Pairs of
+photos state a first / a second and that both show the centre of their matches at one place; surveyed points and the
+positions of other photos place the whole. With log a and t as unknowns every observation is analytic in them, so the
+Gauss-Newton steps are complex least squares.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import splu
+
+from orthoswarm.config import active
+from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph
+from orthoswarm.refine.initial.tilt_and_lens import spaced
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchors:
+    """What pixels of photos are known to show (M observations).
+
+    Attributes:
+        photo: int32 (M,). pixel: complex (M,), of the level picture, about its centre, y up. ground: complex (M,),
+            east + i north.
+        sigma_m: float64 (M,), of the ground point. sigma_px: float64 (M,), of the pixel.
+    """
+
+    photo: Ints
+    pixel: Complex
+    ground: Complex
+    sigma_m: Array
+    sigma_px: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeNetwork:
+    """N photos on the ground.
+
+    Attributes:
+        scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the
+            camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,). anchor_ok: bool (M,).
+    """
+
+    scale: Complex
+    centre: Complex
+    sigma_m: Array
+    placed: Flags
+    anchor_ok: Flags
+
+
+@dataclass(slots=True, kw_only=True)
+class _System:
+    """Rows of complex equations in units of one sigma: columns, values, right-hand side."""
+
+    size: int
+    row: list[NDArray[np.int64]] = field(default_factory=list)
+    column: list[NDArray[np.int64]] = field(default_factory=list)
+    value: list[Complex] = field(default_factory=list)
+    rhs: list[Complex] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, rhs: Complex, *terms: tuple[NDArray[np.integer], Complex | Array]) -> None:
+        """Add one row for each element of rhs; terms are columns and values."""
+        at = self.count + np.arange(len(rhs))
+        for column, value in terms:
+            self.row.append(at)
+            self.column.append(np.asarray(column, np.int64))
+            self.value.append(np.asarray(value, np.complex128))
+        self.rhs.append(np.asarray(rhs, np.complex128))
+        self.count += len(rhs)
+
+    def matrix(self) -> tuple[csc_matrix, Complex]:
+        """The sparse matrix and its right-hand side."""
+        at = np.concatenate(self.row), np.concatenate(self.column)
+        matrix = coo_matrix((np.concatenate(self.value), at), shape=(self.count, self.size))
+        return matrix.tocsc(), np.concatenate(self.rhs)
+
+
+def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anchors) -> FreeNetwork:
+    """Place photos by their pairs and anchors.
+
+    Args:
+        graph: pairs of level pictures. count: N photos. width: float64 (N,), columns of the pictures.
+        anchors: at least two different points are needed in each connected part; parts without them are not placed.
+    """
+    scale, centre = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
+    sigma, placed = np.full(count, np.inf), np.zeros(count, bool)
+    good = np.zeros(len(anchors.photo), bool)
+    for members in _parts(graph, count):
+        inside = np.isin(graph.first, members)
+        held = np.flatnonzero(np.isin(anchors.photo, members))
+        a, t = _chained(graph, inside, members, count)
+        datum = _datum(a, t, anchors, held)
+        if datum is None:
+            continue
+        turn, shift = datum
+        a, t = np.asarray(turn * a), np.asarray(turn * t + shift)
+        part = _adjusted(_pairs_of(graph, inside), members, _anchors_of(anchors, held), a=a, t=t, width=width)
+        scale[members], centre[members], sigma[members], good[held] = part
+        placed[members] = True
+    return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed, anchor_ok=good)
+
+
+def _parts(graph: PairGraph, count: int) -> list[Ints]:
+    """Photos connected by pairs, the largest part first; photos without a pair are left out."""
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_matrix((np.ones(len(graph)), (graph.first, graph.second)), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    groups = [np.flatnonzero(label == k).astype(np.int32) for k in np.unique(label)]
+    return sorted((g for g in groups if len(g) > 1), key=lambda g: (-len(g), g[0]))
+
+
+def _pairs_of(graph: PairGraph, inside: Flags) -> PairGraph:
+    names = ("first", "second", "factor", "centre_first", "centre_second", "count", "spread", "residual")
+    return PairGraph(**{name: getattr(graph, name)[inside] for name in names})
+
+
+def _anchors_of(anchors: Anchors, held: NDArray[np.intp]) -> Anchors:
+    return Anchors(
+        photo=anchors.photo[held],
+        pixel=anchors.pixel[held],
+        ground=anchors.ground[held],
+        sigma_m=anchors.sigma_m[held],
+        sigma_px=anchors.sigma_px[held],
+    )
+
+
+def _chained(graph: PairGraph, inside: Flags, members: Ints, count: int) -> tuple[Complex, Complex]:
+    """Similarities (N,) of a part's photos onto the pixels of one of them, along the pairs with most matches."""
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+    pairs = np.flatnonzero(inside)
+    cost = 1.0 / graph.count[pairs]
+    shape = (count, count)
+    number = {(int(graph.first[e]), int(graph.second[e])): int(e) for e in pairs}
+    tree = minimum_spanning_tree(coo_matrix((cost, (graph.first[pairs], graph.second[pairs])), shape=shape).tocsr())
+    root = int(np.bincount(np.r_[graph.first[pairs], graph.second[pairs]], minlength=count).argmax())
+    order, before = breadth_first_order(tree, root, directed=False)
+    a, t = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
+    a[root] = 1.0
+    for k in order[1:]:
+        j = int(before[k])
+        forward = (j, int(k)) in number
+        e = number[(j, int(k)) if forward else (int(k), j)]
+        f, c, d = graph.factor[e], graph.centre_first[e], graph.centre_second[e]
+        if forward:  # z of k = f z of j + constant
+            a[k] = a[j] / f
+            t[k] = t[j] + a[j] * c - a[k] * d
+        else:
+            a[k] = a[j] * f
+            t[k] = t[j] + a[j] * d - a[k] * c
+    return a, t
+
+
+def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> tuple[complex, complex] | None:
+    """The similarity onto the ground that most anchors of a part agree on, by pairs of them; None without two."""
+    held = held[spaced(len(held), active().initial.anchor_most)]
+    shown = a[anchors.photo[held]] * anchors.pixel[held] + t[anchors.photo[held]]
+    ground, sigma = anchors.ground[held], anchors.sigma_m[held]
+    best: tuple[float, complex, complex] | None = None
+    for i in range(len(held)):
+        for j in range(i + 1, len(held)):
+            apart = ground[j] - ground[i]
+            if abs(apart) <= active().initial.anchor_apart_sigmas * np.hypot(sigma[i], sigma[j]):
+                continue
+            if abs(shown[j] - shown[i]) < 1e-12:
+                continue
+            turn = complex(apart / (shown[j] - shown[i]))
+            shift = complex(ground[i] - turn * shown[i])
+            away = float(np.median(np.abs(turn * shown + shift - ground) / sigma))
+            if best is None or away < best[0]:
+                best = away, turn, shift
+    return None if best is None else (best[1], best[2])
+
+
+def _adjusted(
+    graph: PairGraph, members: Ints, anchors: Anchors, *, a: Complex, t: Complex, width: Array
+) -> tuple[Complex, Complex, Array, Flags]:
+    """The robust adjustment of a part: a, t and the sigma of t of its members, and which anchors agree."""
+    config, n, pairs = active().initial, len(members), len(graph)
+    at = np.full(len(a), -1)
+    at[members] = np.arange(n)
+    ends = at[graph.first], at[graph.second], at[anchors.photo]
+    log_a, t, share = np.log(a[members]), t[members].copy(), config.free_pair_share * width[members]
+    for c in config.free_schedule:
+        matrix, rhs = _rows(graph, anchors, ends, log_a=log_a, t=t, share=share)
+        squared = np.abs(rhs) ** 2
+        together = squared[:pairs] + squared[pairs : 2 * pairs]  # a wrong pair is wrong in both
+        weight = (1.0 + np.r_[together, together, squared[2 * pairs :]] / c) ** -2
+        factor = splu((matrix.conj().T @ diags(weight) @ matrix).tocsc())
+        step = factor.solve(matrix.conj().T @ (weight * rhs))
+        log_a, t = log_a + step[:n], t + step[n:]
+    variance = np.diag(factor.solve(np.eye(2 * n, dtype=np.complex128)))[n:].real
+    good = squared[2 * pairs :] < config.network_gate_sigmas**2
+    return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0)), good
+
+
+def _rows(
+    graph: PairGraph, anchors: Anchors, ends: tuple[Ints, Ints, Ints], *, log_a: Complex, t: Complex, share: Array
+) -> tuple[csc_matrix, Complex]:
+    """Equations of a step: ratios of the pairs, then where they meet, then the anchors; columns log a, then t.
+
+    ends: first and second photo of the pairs, and the photos of the anchors. share: float64 (n,), pixels, sigma of the
+    place of a pair's matches in each photo.
+    """
+    i, j, k = ends
+    a, n = np.exp(log_a), len(t)
+    size = np.abs(a)
+    ratio = log_a[i] - log_a[j] - np.log(graph.factor)
+    ratio = ratio.real + 1j * np.angle(np.exp(1j * ratio.imag))
+    ratio_sigma = np.hypot(graph.turn_sigma, active().initial.free_scale_sigma)
+    meet = a[i] * graph.centre_first + t[i] - a[j] * graph.centre_second - t[j]
+    meet_sigma = np.hypot(share[i] * size[i], share[j] * size[j])
+    anchor = a[k] * anchors.pixel + t[k] - anchors.ground
+    anchor_sigma = np.hypot(anchors.sigma_m, anchors.sigma_px * size[k])
+    rows = _System(size=2 * n)
+    rows.add(-ratio / ratio_sigma, (i, 1.0 / ratio_sigma), (j, -1.0 / ratio_sigma))
+    rows.add(
+        -meet / meet_sigma,
+        (i, a[i] * graph.centre_first / meet_sigma),
+        (n + i, 1.0 / meet_sigma),
+        (j, -a[j] * graph.centre_second / meet_sigma),
+        (n + j, -1.0 / meet_sigma),
+    )
+    rows.add(-anchor / anchor_sigma, (k, a[k] * anchors.pixel / anchor_sigma), (n + k, 1.0 / anchor_sigma))
+    return rows.matrix()

@@ -1,0 +1,169 @@
+"""Photos without a recorded position (kites, old cameras, lost tags), placed by surveyed points that they show.
+
+The pictures tell how the photos lie to each other (`free_network`), surveyed points and the positions of other photos
+where on the ground. What comes out is a recorded position and heading with a sigma, as a receiver's would be: the
+refiner then adjusts these photos like all others.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.task_runner import Run
+from orthoswarm.refine.flight.sparse_start import read_photo_records
+from orthoswarm.refine.initial.free_network import Anchors, FreeNetwork, solve_free_network
+from orthoswarm.refine.initial.initial_orientation import shape_of
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray
+from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
+from orthoswarm.refine.initial.relative_scale import focal_by_hint
+from orthoswarm.refine.initial.tilt_and_lens import Matches, level_pixels, similarities
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+
+def place_unpositioned(
+    photos: Sequence[Frame],
+    positioned: Sequence[Frame],
+    points: Sequence[Checkpoint],
+    *,
+    read_gray: ReadGray,
+    run: Run,
+    progress: Progress | None = None,
+) -> list[Frame]:
+    """Give photos the positions that surveyed points and other photos tell.
+
+    Args:
+        photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time.
+        positioned: photos with positions, which may show the same ground.
+        points: surveyed, with their marks in photos of either kind.
+        read_gray: returns a photo's grey values, uint8 (rows, columns), at any size; may raise PictureError.
+        run: executes the tasks. progress: called with stage, number done, total.
+
+    Returns:
+        Those of `photos` that could be placed, with position, its sigma, and heading.
+    """
+    grid = _grid(positioned, points)
+    if not photos or grid is None:
+        return []
+    middle = _middle(positioned, points)
+    origin = grid.to_grid(*middle)
+    frames = [*(replace(f, fix=replace(f.fix, lat_deg=middle[0], lon_deg=middle[1])) for f in photos), *positioned]
+    records = read_photo_records(frames, grid, origin)
+    builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
+    builder.detect_all()
+    builder.try_pairs(candidate_pairs(len(photos), len(frames)))
+    pairs = builder.pairs()
+    if not pairs:
+        return []
+    matches = Matches.of(pairs, builder.features)
+    shape = shape_of(matches, records, *focal_by_hint(records))
+    graph = similarities(matches, records, shape)
+    anchors = _anchors(frames, records, points, grid=grid, origin=origin, known=len(photos))
+    anchors = replace(anchors, pixel=level_pixels(anchors.pixel, anchors.photo, records, shape))
+    network = solve_free_network(graph, len(frames), records.width, anchors)
+    return _placed(photos, network, grid=grid, origin=origin)
+
+
+def candidate_pairs(without: int, count: int) -> Ints:
+    """Pairs to try, int32 (n, 2), of photos of which the first `without` have no position.
+
+    All pairs with a photo without position, as nothing tells which overlap; beyond `free_most_pairs` those nearest in
+    order.
+    """
+    first, second = np.triu_indices(count, 1)
+    wanted = first < without
+    pairs = np.stack([first[wanted], second[wanted]], axis=1)
+    most = active().initial.free_most_pairs
+    if len(pairs) > most:
+        order = np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[:most]
+        pairs = pairs[np.sort(order)]
+    return pairs.astype(np.int32)
+
+
+def _grid(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> LocalGrid | None:
+    """The grid of the photos with positions and of the surveyed points; None without any."""
+    lat = [*(f.fix.lat_deg for f in positioned), *(p.surveyed[1] for p in points)]
+    lon = [*(f.fix.lon_deg for f in positioned), *(p.surveyed[0] for p in points)]
+    return LocalGrid(area_epsg(lat, lon)) if lat else None
+
+
+def _middle(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> tuple[float, float]:
+    """Latitude and longitude of one of the points or photos in the middle."""
+    places = np.array(
+        [*((f.fix.lat_deg, f.fix.lon_deg) for f in positioned), *((p.surveyed[1], p.surveyed[0]) for p in points)]
+    )
+    away = ((places - np.median(places, axis=0)) ** 2).sum(axis=1)
+    lat, lon = places[int(np.argmin(away))]
+    return float(lat), float(lon)
+
+
+def _anchors(
+    frames: Sequence[Frame],
+    records: PhotoRecords,
+    points: Sequence[Checkpoint],
+    *,
+    grid: LocalGrid,
+    origin: Array,
+    known: int,
+) -> Anchors:
+    """Marks of surveyed points, in pixels as taken, and positions of the photos from number `known` on.
+
+    Raises:
+        InputError: a mark lies outside its photo, or its name belongs to several photos.
+    """
+    config = active()
+    number = {f.image: k for k, f in enumerate(frames)}
+    rows: list[tuple[int, complex, complex, float, float]] = []
+    for point in points:
+        ground = complex(*(grid.to_grid(point.surveyed[1], point.surveyed[0]) - origin))
+        for mark in point.marks:
+            name = photo_named(number, mark.image)
+            if name is None:
+                continue
+            frame = frames[number[name]]
+            mark.check_inside(frame.width, frame.height)
+            pixel = complex(mark.column - 0.5 * (frame.width - 1), -(mark.row - 0.5 * (frame.height - 1)))
+            sigma_px = config.initial.free_pair_share * frame.width
+            rows.append((number[name], pixel, ground, point.sigma_m or config.control.survey_sigma_m, sigma_px))
+    sigma = records.gps_sigma()
+    for k in range(known, len(frames)):  # below the camera is the middle of the level picture
+        sigma_px = config.initial.free_nadir_share * frames[k].width
+        rows.append((k, 0j, complex(records.position[k]), float(sigma[k]), sigma_px))
+    photo, pixel_, ground_, sigma_m, sigma_px_ = zip(*rows) if rows else ((),) * 5
+    return Anchors(
+        photo=np.array(photo, np.int32),
+        pixel=np.array(pixel_, np.complex128),
+        ground=np.array(ground_, np.complex128),
+        sigma_m=np.array(sigma_m, float),
+        sigma_px=np.array(sigma_px_, float),
+    )
+
+
+def _placed(photos: Sequence[Frame], network: FreeNetwork, *, grid: LocalGrid, origin: Array) -> list[Frame]:
+    """The placed photos with a fix from the network."""
+    out = []
+    for k, frame in enumerate(photos):
+        if not network.placed[k]:
+            continue
+        centre = network.centre[k]
+        lat, lon = (float(v) for v in grid.to_geographic(origin + np.array([centre.real, centre.imag])))
+        yaw = float(-np.angle(network.scale[k]) + grid.convergence_rad(lat, lon))
+        leaning = active().initial.free_nadir_share * frame.width * abs(network.scale[k])
+        fix = replace(
+            frame.fix,
+            lat_deg=lat,
+            lon_deg=lon,
+            yaw_rad=yaw,
+            position_sigma_m=float(np.hypot(network.sigma_m[k], leaning)),
+        )
+        origin_of = {**frame.origin, "position": "surveyed points", "angles": "surveyed points"}
+        out.append(replace(frame, fix=fix, origin=origin_of))
+    return out
