@@ -72,11 +72,11 @@ def measure(inputs: Path, twin: Path, out: Path) -> dict[str, float]:
         check=True,
     )
     truth = twin / "truth"
-    told = subprocess.run(
+    result = subprocess.run(
         [*orthoswarm, "evaluate", str(out / "orthoimage.tif"), "--reference", str(truth / "reference.tif"), "--json"],
         check=True, capture_output=True, text=True,
     )  # fmt: skip
-    figures: dict[str, float] = json.loads(told.stdout)
+    figures: dict[str, float] = json.loads(result.stdout)
     return figures
 
 

@@ -43,7 +43,7 @@ Course = Callable[[int, int], Picture]
 """Vehicle and number -> its picture."""
 
 
-def alike() -> Course:
+def same_course() -> Course:
     """A dozen pictures with the detail of a town seen from 100 m, again and again, along straight lines."""
     import cv2
 
@@ -251,7 +251,7 @@ def main() -> None:
                 course = legs(count, int(args.rate * args.seconds) + 2, basemap)
                 command += ["--basemap", str(basemap)]
             else:
-                course = alike()
+                course = same_course()
             process = subprocess.Popen(
                 [*command, "--port", "0"], stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
             )

@@ -401,6 +401,6 @@ class MavsdkBackend(Backend):
         in_air = vehicle.in_air and vehicle.armed
         wrong = unflyable(mission.items if mission else (), vehicle.autopilot, in_air=in_air)
         if mission is None or wrong:
-            raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not hand out its mission'}")
+            raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not send its mission'}")
         vehicle.detector.knows_mission(mission)
         return vehicle.pilot.start(in_air=in_air, armed=vehicle.armed, check=False)

@@ -17,7 +17,7 @@ VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "coverage": "say which ground of an area was seen well, what was missed, and why",
-    "inspect": "say what photos, videos and logs hold and what is suspicious about them",
+    "inspect": "say what photos, videos and logs contain, and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
     "sim": "run simulated vehicles that speak MAVLink",
@@ -28,7 +28,7 @@ VERBS = {
     "evaluate": "measure an orthoimage against a reference, and poses against truth",
     "bench": "measure accuracy and cost on sets with truth, and how cost grows with vehicles and pictures",
     "weights": "list, import and check the weights of learned matchers",
-    "doctor": "say what this machine has (codecs, weights, cores, disk) and what a missing thing costs",
+    "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
 
 _ROOMS = {

@@ -145,7 +145,7 @@ class Daemon:
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
             "tones": self.tones.balance, "export": self.exports.write,
-            "redraw": lambda job, tell: publisher.draw_again(self.background, tell),
+            "redraw": lambda job, report: publisher.draw_again(self.background, report),
         }  # fmt: skip
         self.jobs = Jobs(
             self.journal, self.events, handlers, settings.workers, lambda job: self.coarse.give_up(job.vehicle)
@@ -183,10 +183,10 @@ class Daemon:
                 v.pictures,
                 take=self.add_picture,
                 pose_at=self.poses.at,
-                tell=self._say,
+                notify=self._say,
                 cache=folder / "videos",
                 link_log=self._link_log,
-                settled=self._card_read,
+                on_settled=self._card_read,
             )
             for v in settings.vehicles
             if v.pictures
@@ -194,7 +194,12 @@ class Daemon:
         fleet = None if self.links is None else self.links.fleet
         self.buses = [
             CanReader(
-                v.id, v.can, poses=self.poses.of(v.id), tell=self._say, fleet=fleet, system=v.system or system_of(v.id)
+                v.id,
+                v.can,
+                poses=self.poses.of(v.id),
+                notify=self._say,
+                fleet=fleet,
+                system=v.system or system_of(v.id),
             )
             for v in settings.vehicles
             if v.can
@@ -245,7 +250,7 @@ class Daemon:
         end = time.monotonic() + _SOURCES_S
         stuck = [source.vehicle for source in self.sources if not source.close(max(0.0, end - time.monotonic()))]
         if stuck:
-            _log.info("the streams of %s are silent; they are left alone", ", ".join(stuck))
+            _log.info("the streams of %s did not end in time and are abandoned", ", ".join(stuck))
 
     def __enter__(self) -> "Daemon":
         self.start()
@@ -478,7 +483,7 @@ class Daemon:
         for source in self.sources:
             if source.without_pose:
                 text = f"{source.without_pose} pictures of {source.vehicle} have no pose"
-                found.append(f"{text}; put the flight's log beside them")
+                found.append(f"{text}; put the flight's log next to them")
         return [text for text in found if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:

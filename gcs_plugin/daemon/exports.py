@@ -50,13 +50,13 @@ class Exports:
         self._layers, self._console, self._workers = layers, console, workers
         self._area, self._vehicles, self._facts, self._cells = area, vehicles, facts, cells
 
-    def write(self, job: Job, tell: Callable[[float, str], None]) -> Change:
+    def write(self, job: Job, report: Callable[[float, str], None]) -> Change:
         """The handler of an `export` job.
 
         Raises:
             InputError: there is no map yet.
         """
-        tell(0.05, "writing")
+        report(0.05, "writing")
         area = self._area()
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
@@ -111,7 +111,7 @@ class Exports:
     def _task(self, area: Area) -> ExportTask:
         """The export task of the workspace, without layers and formats."""
         rows = self._journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
-        kept, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
+        folder, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
         solutions = self._journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
         coarse = self._journal.rows(
             "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
@@ -125,8 +125,8 @@ class Exports:
             gsd_m=area.gsd_m,
             frames=[frame_of_row(row, self._store) for row in rows],
             reasons={(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-            coarse=[kept / row["path"] for row in coarse],
-            solutions=[kept / row["path"] for row in solutions],
+            coarse=[folder / row["path"] for row in coarse],
+            solutions=[folder / row["path"] for row in solutions],
             basemap=self._settings.basemap,
             fov_rad=None if fov_deg is None else math.radians(fov_deg),
         )

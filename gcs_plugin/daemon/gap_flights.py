@@ -47,7 +47,7 @@ class GapFlights:
             rows.append({
                 "id": row["id"], "battery": row["battery"],
                 "minutes": None if seconds is None else round(seconds / 60.0, 1),
-                "busy": "its takeoff is due; cancel it first" if row["id"] in due else _busy(row),
+                "busy": "it is about to take off; cancel that first" if row["id"] in due else _busy(row),
                 "in_air": self._plans.dem is None and _may_go_on(row),
                 "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"], "home": row["home"],
             })  # fmt: skip
@@ -133,14 +133,14 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -
     if not isinstance(wanted, dict) or not wanted:
         raise InputError('vehicles is missing; send for example {"v1": null, "v2": 12}')
     chosen = {}
-    for vehicle, given in wanted.items():
+    for vehicle, requested_min in wanted.items():
         row = known.get(vehicle)
         if row is None:
             raise InputError(f"{vehicle} is not on the links; see /api/coverage/vehicles")
         goes_on = row["in_air"] and vehicle in in_air
         if row["busy"] and not goes_on:
             raise OrthoSwarmError(f"{vehicle} gets no other flight: {row['busy']}")
-        minutes = row["minutes"] if given is None else given
+        minutes = row["minutes"] if requested_min is None else requested_min
         if minutes is None:
             raise InputError(f"how long {vehicle} can fly is not known; send its minutes, no figure is assumed")
         if isinstance(minutes, bool) or not isinstance(minutes, int | float) or not 0.0 < minutes <= _LONGEST_MIN:

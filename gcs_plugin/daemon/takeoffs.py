@@ -146,14 +146,14 @@ class Takeoffs:
         except InputError:
             raise
         except OrthoSwarmError as error:
-            raise OrthoSwarmError(f"{error}; nobody was started") from None
+            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
         wrong = []
         for row in rows:
             allowed = override.get(row["vehicle"], ())
             red = [i for i in row["items"] if i["state"] == "red" and i["name"] not in allowed]
             wrong += [f"{row['vehicle']}: {item['name']}: {item['reason']}" for item in red]
         if wrong:
-            raise OrthoSwarmError(f"{'; '.join(wrong)}; nobody was started")
+            raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
         back = {name: vehicle for vehicle, name in (names or {}).items()}
         return {back.get(row["vehicle"], row["vehicle"]): self._links.system_of(row["vehicle"]) for row in rows}
 

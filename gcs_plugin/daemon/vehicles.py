@@ -63,7 +63,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True)
-class _Kept:
+class _VehicleRecord:
     """The daemon's own data about a vehicle, besides the fleet's."""
 
     id: str
@@ -100,7 +100,7 @@ class VehicleLinks:
         self._missions = MissionJournal(journal)
         self._titles = {v.id: v.name for v in settings.vehicles}
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
-        self._kept: dict[int, _Kept] = {}
+        self._records: dict[int, _VehicleRecord] = {}
         self._poses = Poses() if poses is None else poses
         self._stop = threading.Event()
         self.latest: list[dict[str, Any]] = []
@@ -130,13 +130,14 @@ class VehicleLinks:
                 thread.join(5.0)
         self.fleet.close()
 
-    # -- asked by others ------------------------------------------------------------------------------------------
+    # -- queries ------------------------------------------------------------------------------------------
 
     def name_of(self, system: int) -> str:
         """The id of a vehicle with a MAVLink system id; no two have the same."""
         name = number_name(system)
-        taken = self._names.get(system) is None and name in self._names.values()  # by a vehicle of another system id
-        return f"system-{system}" if taken else self._names.get(system, name)
+        if system not in self._names and name in self._names.values():  # the name of another system id
+            return f"system-{system}"
+        return self._names.get(system, name)
 
     def system_of(self, vehicle: str) -> int:
         """The MAVLink system id of a vehicle, by its id or that number.
@@ -339,40 +340,22 @@ class VehicleLinks:
             raise OrthoSwarmError(dialogue.outcome.text)
         return dialogue.outcome.text
 
-    def unlike(self, system: int, mission: "Mission") -> str | None:
-        """How a vehicle's stored mission differs from the given one, None if it does not.
-
-        Raises:
-            OrthoSwarmError: the vehicle does not send it.
-        """
-        from gcs_plugin.mission.comparison import difference
-
-        reads: list[MissionDownload] = []
-
-        def begin(fleet: "Fleet") -> "Exchange":
-            reads.append(fleet.download(system))
-            return reads[0]
-
-        self.command(begin)
-        found = difference(mission, reads[0].items or [])
-        return None if found is None else found.text
-
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
-    def _keep(self, system: int) -> _Kept:
-        if system not in self._kept:
+    def _record(self, system: int) -> _VehicleRecord:
+        if system not in self._records:
             name = self.name_of(system)
-            self._kept[system] = _Kept(id=name, poses=self._poses.of(name))
-        return self._kept[system]
+            self._records[system] = _VehicleRecord(id=name, poses=self._poses.of(name))
+        return self._records[system]
 
     def _message(self, vehicle: "Vehicle", message: Any, utc: float) -> None:
-        kept = self._keep(vehicle.system)
-        kept.poses.feed(message, utc)
+        record = self._record(vehicle.system)
+        record.poses.feed(message, utc)
 
     def _event(self, event: "FleetEvent") -> None:
         name = self.name_of(event.system)
         vehicle = self.fleet.vehicles[event.system]
-        kept = self._keep(event.system)
+        record = self._record(event.system)
         try:
             if event.kind == "found":
                 self._missions.found(vehicle, name)
@@ -386,12 +369,12 @@ class VehicleLinks:
                 self._jobs.wake()
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
-        kept.lost_since = time.monotonic() if event.kind == "lost" else None
+        record.lost_since = time.monotonic() if event.kind == "lost" else None
         text, pair = self._words(event), [self.name_of(system) for system in event.pair or ()]
         about: dict[str, Any] = {"vehicle": name, "kind": event.kind, "text": text, "time": event.time_s, "pair": pair}
         if event.kind == "text":
             said = {"text": vehicle.texts[-1], "severity": event.severity, "time": round(event.time_s, 1)}
-            kept.texts.append(said)
+            record.texts.append(said)
             about |= {"said": said["text"], "severity": said["severity"]}
         else:
             _log.info("%s", text)
@@ -430,7 +413,7 @@ class VehicleLinks:
         """
         self.latest = self.rows()
         for row in self.latest:
-            sent = self._kept[row["system"]].sent
+            sent = self._records[row["system"]].sent
             now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
@@ -439,28 +422,28 @@ class VehicleLinks:
 
     def _give_up_silent(self) -> None:
         """Refine the incomplete sortie of a vehicle that has been silent for long during its mission."""
-        for system, kept in list(self._kept.items()):
+        for system, record in list(self._records.items()):
             vehicle = self.fleet.vehicles[system]
-            since = kept.lost_since
+            since = record.lost_since
             if since is None or time.monotonic() - since < self._settings.lost_after_s or not _under_way(vehicle):
                 continue
-            kept.lost_since = None
-            if self._missions.give_up(kept.id):
-                _log.info("%s has been silent for long; what it sent is refined", kept.id)
+            record.lost_since = None
+            if self._missions.give_up(record.id):
+                _log.info("%s has been silent for long; what it sent is refined", record.id)
                 self._jobs.wake()
 
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
-        kept = self._keep(vehicle.system)
-        row = vehicle.summary(now) | {"id": kept.id, "name": self._titles.get(kept.id, "")}
+        record = self._record(vehicle.system)
+        row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
         row["alarm"] = self.fleet.separation.text(vehicle.system, self.name_of)
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))
-            if not kept.trail or kept.trail[-1] != point:
-                kept.trail.append(point)
-                del kept.trail[:-_TRAIL]
+            if not record.trail or record.trail[-1] != point:
+                record.trail.append(point)
+                del record.trail[:-_TRAIL]
         row["fence"] = self._fences.of(vehicle.system)
-        row["trail"], row["texts"] = kept.trail[-_TRAIL:], list(kept.texts)
+        row["trail"], row["texts"] = record.trail[-_TRAIL:], list(record.texts)
         return row
 
 

@@ -201,7 +201,7 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
         if value is None and key not in ("altitude_m", "fov_min_deg"):
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST_NUMBER:
-            raise InputError(f"{key} is missing or no number that makes sense; send one")
+            raise InputError(f"{key} is missing or not a valid number; send one")
         values[key] = float(value)
     for key, choices in _CHOICES.items():
         if key in body:

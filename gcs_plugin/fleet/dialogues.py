@@ -101,11 +101,11 @@ class Dialogues:
         vehicle = self._vehicles.get(system)
         if vehicle is None or not messages:
             return False
-        taken = False
+        accepted = False
         for route in vehicle.routes.towards(self._clock(), everywhere=everywhere):
             for message in messages:
-                taken |= self._hub.send(route.side, route.peer, message, expires)
-        return taken
+                accepted |= self._hub.send(route.side, route.peer, message, expires)
+        return accepted
 
     def _drive(self, job: "Exchange", messages: "Sequence[Message]") -> None:
         """Send a dialogue's messages, and report to it which ones a link accepted.

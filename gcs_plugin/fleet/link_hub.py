@@ -147,10 +147,10 @@ class Hub:
             packer.signing.timestamp = side.signing.next_timestamp(utc)
         raw = message.pack(packer)
         packer.seq = (packer.seq + 1) & 0xFF
-        taken = side.link.send(peer, raw, expires)
+        accepted = side.link.send(peer, raw, expires)
         if self._tlog is not None:
             self._tlog.write(utc, raw)
-        return taken
+        return accepted
 
     def _receive(self, side: Side, source: Any, events: int) -> None:
         now, utc = self._clock(), self._wall()

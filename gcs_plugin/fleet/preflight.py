@@ -190,7 +190,7 @@ def _gps(vehicle: "Vehicle") -> Item:
     if vehicle.gps_fix < 3:
         return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
     if vehicle.lat_deg is None:
-        return Item("gps", Level.RED, "it has not said where it is")
+        return Item("gps", Level.RED, "it has not reported its position")
     if count < _SATELLITES[0]:
         return Item("gps", Level.RED, f"{count} satellites, {_SATELLITES[0]} are needed")
     level = Level.OK if count >= _SATELLITES[1] else Level.WARNING
@@ -209,7 +209,7 @@ def _home(vehicle: "Vehicle") -> Item:
     if vehicle.home is None:
         return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
     if vehicle.lat_deg is None or vehicle.lon_deg is None:
-        return Item("home", Level.WARNING, "set, but the vehicle does not say where it is")
+        return Item("home", Level.WARNING, "set, but the vehicle does not report its position")
     away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *vehicle.home[:2])
     if away > _HOME_M and not vehicle.flying:
         return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
@@ -243,7 +243,7 @@ def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float) 
 def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
     held = wanted.stored or vehicle.mission
     if held is None:
-        return Item("mission", Level.RED, "what it holds is not known; upload its mission, or let it be read")
+        return Item("mission", Level.RED, "its mission has not been read yet; upload it, or wait until it is read")
     wrong = unflyable(held.items, vehicle.autopilot, in_air=vehicle.flying)
     if wrong:
         return Item("mission", Level.RED, wrong)

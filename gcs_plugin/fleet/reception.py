@@ -96,11 +96,11 @@ class Reception:
         if packet.component == vehicle.address.component:
             route = self._route(vehicle, side, peer, now)
             route.counted(lost)
-            beside = kind in _REPEATED and vehicle.routes.stale(route, now)
+            repeated = kind in _REPEATED and vehicle.routes.stale(route, now)
             self._autopilot_says(
-                vehicle, route, kind, message=packet.message, now=now, stale=beside or (late and kind in _STATES)
+                vehicle, route, kind, message=packet.message, now=now, stale=repeated or (late and kind in _STATES)
             )
-            if beside:
+            if repeated:
                 return
         elif kind in _PHOTOS:
             vehicle.update(packet.message)
@@ -270,7 +270,7 @@ class Reception:
             self._taken_over(vehicle, now)
         if vehicle.claimants and not before:
             who = ", ".join(vehicle.claimants)
-            self._event("conflict", vehicle, f"is several vehicles with one system id ({who}); give each its own")
+            self._event("conflict", vehicle, f"is the system id of several vehicles ({who}); give each its own")
         elif before and not vehicle.claimants:
             self._event("single", vehicle, "is one vehicle again")
         for route in vehicle.routes.unasked(now):

@@ -87,12 +87,10 @@ class Framer:
     """Splits a stream, received in pieces of any size, into packets.
 
     Attributes:
-        dropped_bytes: bytes that belonged to no valid packet.
         bad_checksums: packets dropped for a wrong checksum.
         unknown: packets of message ids that the dialect does not have.
     """
 
-    dropped_bytes: int = 0
     bad_checksums: int = 0
     unknown: int = 0
     _rest: bytes = b""
@@ -110,9 +108,7 @@ class Framer:
             marker = data[at]
             if marker not in (V2_MARKER, V1_MARKER):
                 following = [i for i in (data.find(V2_MARKER, at), data.find(V1_MARKER, at)) if i >= 0]
-                skip = min(following, default=end)
-                self.dropped_bytes += skip - at
-                at = skip
+                at = min(following, default=end)
                 continue
             if end - at < 3:
                 break
@@ -124,7 +120,6 @@ class Framer:
             packet = self._check(data[at : at + size])
             if packet is None and not (at + size == end or data[at + size] in (V2_MARKER, V1_MARKER)):
                 at += 1  # not a packet at all: the marker was a byte of something else
-                self.dropped_bytes += 1
                 continue
             if packet is not None:
                 packets.append(packet)

@@ -32,7 +32,7 @@ class Client:
         try:
             return json.loads(self.fetch(path, body))
         except ValueError:
-            raise RuntimeError(f"what answers at {self.url} is not a daemon; say connect") from None
+            raise RuntimeError(f"what answers at {self.url} is not a daemon; use 'orthoswarm connect'") from None
 
     def fetch(self, path: str, body: dict[str, Any] | None = None) -> bytes:
         """The answer of a route as it is.
@@ -54,7 +54,8 @@ class Client:
             raise RuntimeError(_detail(error)) from None
         except (OSError, ValueError) as error:
             raise RuntimeError(
-                f"the daemon at {self.url} does not answer ({error}); say serve to start one, or connect to another"
+                f"the daemon at {self.url} does not answer ({error}); start one with 'orthoswarm serve', "
+                "or connect to another"
             ) from None
 
 

@@ -133,9 +133,9 @@ class OrthoSwarmModule(mp_module.MPModule):  # type: ignore[misc]
         """`serve [WORKSPACE] [FLAGS of orthoswarm serve]`."""
         if self.child is not None and self.child.running:
             return [f"orthoswarm: a daemon runs already: {self.child.url}/"]
-        given = bool(words) and not words[0].startswith("-")
-        workspace = Path(words[0] if given else "workspace")
-        self.child = child = Child(workspace, words[1:] if given else words)
+        named = bool(words) and not words[0].startswith("-")
+        workspace = Path(words[0] if named else "workspace")
+        self.child = child = Child(workspace, words[1:] if named else words)
         self.commands.client.url, self.commands.client.token = child.url, child.token
         return [f"the daemon runs: {child.url}/", *self._feed([f"127.0.0.1:{child.port}"])]
 

@@ -70,7 +70,7 @@ class MissionDownload(Exchange):
             why = ", another ground station is using it" if self._refused == DENIED else ""
             self._end(
                 False,
-                f"vehicle {self.vehicle.system} did not hand out its mission{why}; check the link",
+                f"vehicle {self.vehicle.system} did not send its mission{why}; check the link",
                 Verdict.UNKNOWN,
             )
             return []

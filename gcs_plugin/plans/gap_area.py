@@ -102,12 +102,12 @@ def gap_area(gaps: Sequence[ReadGap], no_fly: Sequence[Ring], foot: Footprint, f
         notes.append(f"{hidden:.0f} square metres of the gaps lie in no-fly zones and are not flown")
     parts = [p for p in shapely.get_parts(merged.difference(forbidden)) if p.geom_type == "Polygon"]
     least = _SMALLEST * foot.width_m * foot.height_m
-    kept = [p for p in parts if p.area >= least]
-    if len(kept) < len(parts):
-        notes.append(f"{len(parts) - len(kept)} gaps smaller than {least:.1f} square metres are not flown")
-    if not kept:
+    flown = [p for p in parts if p.area >= least]
+    if len(flown) < len(parts):
+        notes.append(f"{len(parts) - len(flown)} gaps smaller than {least:.1f} square metres are not flown")
+    if not flown:
         raise InputError("; ".join(["no gap is left to fly", *notes]))
-    return GapTarget(Area(grid, shapely.MultiPolygon(kept), shapely.MultiPolygon(_parts(forbidden))), tuple(notes))
+    return GapTarget(Area(grid, shapely.MultiPolygon(flown), shapely.MultiPolygon(_parts(forbidden))), tuple(notes))
 
 
 def _parts(geometry: Geometry) -> list[Geometry]:

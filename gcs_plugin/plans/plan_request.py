@@ -101,7 +101,9 @@ class PlanRequest:
 
     def _motion(self) -> Motion:
         if not 0.0 <= self.wind_m_s < math.inf or not math.isfinite(self.wind_from_deg):
-            raise InputError(f"a wind of {self.wind_m_s:g} m/s from {self.wind_from_deg:g} degrees is none; give both")
+            raise InputError(
+                f"a wind of {self.wind_m_s:g} m/s from {self.wind_from_deg:g} degrees is not valid; give both"
+            )
         to = math.radians(self.wind_from_deg + 180.0)
         wind = (self.wind_m_s * math.sin(to), self.wind_m_s * math.cos(to)) if self.wind_m_s else (0.0, 0.0)
         autopilot = min(map(autopilot_config, self.autopilots), key=lambda times: times.acceleration_m_s2)

@@ -91,8 +91,3 @@ class Channel(Generic[Cargo]):
         """Hand each packet that has arrived to a function."""
         for cargo in self.take(now):
             deliver(cargo)
-
-    @property
-    def next_arrival(self) -> float:
-        """When the next packet arrives, infinity if none is under way."""
-        return self._queue[0][0] if self._queue else float("inf")

@@ -82,7 +82,7 @@ class SimVehicle:
     _due: list[tuple[float, int]] = field(default_factory=list, init=False)
     _greeted: bool = field(default=False, init=False)
     _photos_sent: int = field(default=0, init=False)
-    _told: tuple[bool, int] = field(default=(False, 0), init=False)
+    _reported_state: tuple[bool, int] = field(default=(False, 0), init=False)
     _why_at: float = field(default=0.0, init=False)
     _long_texts: int = field(default=0, init=False)
     _tx_room: float = field(default=_TX_BUFFER, init=False)
@@ -274,11 +274,6 @@ class SimVehicle:
             self._tx_room -= sum(_bytes(message) for message in messages)
             self._tx_at = now
 
-    @property
-    def next_due(self) -> float:
-        """Time of its next message, as far as known."""
-        return min(self._due[0][0] if self._due else math.inf, self._stepped + STEP_S)
-
     def _stream(self, kind: int, hz: float) -> None:
         self._rates[kind] = hz
         self._due = [entry for entry in self._due if entry[1] != kind]
@@ -319,7 +314,7 @@ class SimVehicle:
     def _change(self) -> list[Message]:
         """ArduPilot sends a heartbeat at once when it arms, disarms or changes its mode."""
         state = (self.flight.armed, self.flight.mode)
-        changed, self._told = self._told != state, state
+        changed, self._reported_state = self._reported_state != state, state
         return [self._heartbeat()] if changed and self.autopilot is Autopilot.ARDUPILOT else []
 
     def _photo(self, exposure: Exposure) -> list[Message]:

@@ -81,15 +81,15 @@ class CommandRoutes:
         if vehicle == ALL and verb not in _ALL_VERBS:
             raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
         body = await json_body(request)
-        links, given = self._links(), self._given(body)
-        task = self._known_task(given.id, (vehicle, verb))
+        links, issue = self._links(), self._issue(body)
+        task = self._known_task(issue.id, (vehicle, verb))
         if task is None:
-            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, links, vehicle, verb, given, body))
-            self._known[given.id] = (vehicle, verb), task
+            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, links, vehicle, verb, issue, body))
+            self._known[issue.id] = (vehicle, verb), task
             while len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
         rows = await asyncio.shield(task)
-        return JsonAnswer({"id": given.id, "results": rows} if vehicle == ALL else rows[0])
+        return JsonAnswer({"id": issue.id, "results": rows} if vehicle == ALL else rows[0])
 
     def _known_task(self, number: str, what: tuple[str, str]) -> "asyncio.Task[Rows] | None":
         known = self._known.get(number)
@@ -101,7 +101,7 @@ class CommandRoutes:
             return None  # nothing was sent, for example because the plan was wrong: the id can be used again
         return known[1]
 
-    def _given(self, body: Mapping[str, Any]) -> Issue:
+    def _issue(self, body: Mapping[str, Any]) -> Issue:
         number, at = body.get("id"), body.get("given_s")
         if number is None:
             number = new_id()
@@ -114,26 +114,26 @@ class CommandRoutes:
         return Issue(number, float(at))
 
     def _carry_out(
-        self, links: VehicleLinks, vehicle: str, verb: str, given: Issue, body: dict[str, Any]
+        self, links: VehicleLinks, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]
     ) -> Rows:  # fmt: skip
         """Execute a command and publish its outcome; runs in a thread."""
         names = _names(links) if vehicle == ALL else [vehicle]
-        late = _late(given)
+        late = _late(issue)
         if late is not None:
-            rows = [CommandResult(given.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
+            rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
         elif verb == "upload":
-            rows = [self._upload(links, vehicle, given, body)]
+            rows = [self._upload(links, vehicle, issue, body)]
         else:
             override = _override(body, vehicle)
-            began = links.clock() - max(0.0, given.age_s)
-            rows = links.commands(verb, names, given_s=began, command_id=given.id, override=override)
+            began = links.clock() - max(0.0, issue.age_s)
+            rows = links.commands(verb, names, given_s=began, command_id=issue.id, override=override)
         for row in rows:
             self._daemon.events.publish("command", **row)
         return rows
 
-    def _upload(self, links: VehicleLinks, vehicle: str, given: Issue, body: dict[str, Any]) -> dict[str, Any]:
+    def _upload(self, links: VehicleLinks, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
         def result(outcome: Verdict, reason: str) -> dict[str, Any]:
-            return CommandResult(given.id, vehicle, "upload", outcome, reason).document()
+            return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
 
         try:
             system = links.system_of(vehicle)
@@ -170,10 +170,10 @@ class CommandRoutes:
         waits cancels its takeoff, a `start` starts it at once.
         """
         body = await json_body(request)
-        takeoffs, given = self._takeoffs(), self._given(body)
+        takeoffs, issue = self._takeoffs(), self._issue(body)
         sortie, names = names_of(body)
         override = _override(body, ALL)
-        begin = partial(_begin, takeoffs, given, number, sortie=sortie, names=names, override=override)
+        begin = partial(_begin, takeoffs, issue, number, sortie=sortie, names=names, override=override)
         seconds = await in_thread(self._threads, begin)
         return JsonAnswer({"plan": number, "sortie": sortie, "takeoffs_in_s": seconds}, status_code=202)
 
@@ -190,22 +190,22 @@ class CommandRoutes:
 
 def _begin(
     takeoffs: Takeoffs,
-    given: Issue,
+    issue: Issue,
     number: str,
     *,
     sortie: int,
     names: dict[str, str],
     override: Mapping[str, Collection[str]],
 ) -> dict[str, float]:
-    late = _late(given)
+    late = _late(issue)
     if late is not None:
-        raise OrthoSwarmError(f"{late}; nobody was started")
+        raise OrthoSwarmError(f"{late}; no vehicle was started")
     return takeoffs.begin(number, sortie, names, override)
 
 
-def _late(given: Issue) -> str | None:
+def _late(issue: Issue) -> str | None:
     """Why a command has expired or lies in the future, None if it is valid."""
-    age = given.age_s
+    age = issue.age_s
     if age > COMMAND_S:
         return f"it was given {age:.0f} s ago, too long to be executed now; look at the vehicle and give it again"
     if age < -_AHEAD_S:

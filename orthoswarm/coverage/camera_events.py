@@ -78,8 +78,8 @@ def missing_by_events(
             continue
         waiting = [_not_arrived(event, timed) for event in without]
         found += [picture for picture in waiting if picture is not None]
-        taken = [replace(p.view, time_s=e.time_s) for p, e in zip(waiting, without, strict=True) if p is not None]
-        holes = missing_pictures([*timed, *taken], files)
+        matched = [replace(p.view, time_s=e.time_s) for p, e in zip(waiting, without, strict=True) if p is not None]
+        holes = missing_pictures([*timed, *matched], files)
         found += [
             h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=active().coverage.sure)
             for h in holes
@@ -110,8 +110,8 @@ def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[Camera
     at = np.array([e.time_s for e in events])
     slack = active().coverage.match_share * float(np.median(np.diff(at)))
     nearest = np.abs(at[None, :] - times[:, None]).argmin(1)
-    taken = {int(k) for k, t in zip(nearest, times, strict=True) if abs(at[k] - t) <= slack}
-    return [event for k, event in enumerate(events) if k not in taken]
+    matched = {int(k) for k, t in zip(nearest, times, strict=True) if abs(at[k] - t) <= slack}
+    return [event for k, event in enumerate(events) if k not in matched]
 
 
 def _not_arrived(event: CameraEvent, timed: Sequence[View]) -> MissingPicture | None:

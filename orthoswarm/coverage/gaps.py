@@ -18,7 +18,7 @@ Geometry = Any
 Array = NDArray[np.float64]
 _CAUSES = tuple(Cause)
 _NONE = 255
-_TOLD_FIRST = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE, Flaw.OBLIQUE, Flaw.EDGE)
+_BY_IMPORTANCE = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE, Flaw.OBLIQUE, Flaw.EDGE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +203,6 @@ def _polygons(cover: CoverageGrid, explained: _Explained, vehicles: Sequence[str
 def _worst_flaw(best: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The flaw of each cell that is reported: of several, one that affects the complete picture comes first."""
     worst = np.zeros(best.shape, np.uint8)
-    for flaw in _TOLD_FIRST:
+    for flaw in _BY_IMPORTANCE:
         worst[(worst == 0) & (best != UNSEEN) & ((best & int(flaw)) > 0)] = int(flaw)
     return worst

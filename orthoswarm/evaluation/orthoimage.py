@@ -30,13 +30,13 @@ from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 
 
-def find_mask(reference: Path, given: str | None) -> Path | None:
+def find_mask(reference: Path, mask: str | None) -> Path | None:
     """The mask to use: the user's; without one, a twin's mask of level ground in the folder of its reference.
 
     Roofs and crowns lean in every orthoimage that is rectified on the ground, so they say nothing about its position.
     """
-    if given is not None:
-        return None if given == "none" else Path(given)
+    if mask is not None:
+        return None if mask == "none" else Path(mask)
     twin_mask = reference.with_name("ground_mask.tif")
     return twin_mask if twin_mask.exists() else None
 

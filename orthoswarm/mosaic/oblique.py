@@ -47,7 +47,7 @@ def stray_warning(reasons: dict[str, str]) -> list[str]:
     if not reasons:
         return []
     many = f"{len(reasons)} pictures look" if len(reasons) > 1 else "1 picture looks"
-    return [f"{many} far aside among others that look straight down; left out of the map ({min(reasons)} first)"]
+    return [f"{many} strongly tilted among others that look straight down; left out of the map ({min(reasons)} first)"]
 
 
 def weakly_held_warning(placed: Sequence[PlacedFrame], reported: Sequence[PlacedFrame] = ()) -> list[str]:
@@ -61,6 +61,6 @@ def weakly_held_warning(placed: Sequence[PlacedFrame], reported: Sequence[Placed
         return []
     many = f"{len(weak)} pictures have" if len(weak) > 1 else "1 picture has"
     return [
-        f"{many} too little in common with the others to be placed well: used only where no other picture looks "
-        f"({weak[0]} first)"
+        f"{many} too little in common with the others to be placed well: drawn only where no other picture shows "
+        f"the ground ({weak[0]} first)"
     ]

@@ -19,7 +19,7 @@ from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, stretches
 from orthoswarm.planning.lines.visiting_order import shorten
-from orthoswarm.planning.sorties.assignment import Crew, Options, Work
+from orthoswarm.planning.sorties.assignment import Options, Swarm, Work
 from orthoswarm.planning.sorties.deconfliction import Separation, Slot
 from orthoswarm.planning.sorties.flight_heights import FlightHeights, LevelHeights
 from orthoswarm.planning.sorties.flight_path import Flight
@@ -97,11 +97,11 @@ def plan_area(
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
     router = Router(make_obstacles(area.no_fly, clearance))
-    crew = Crew(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
+    swarm = Swarm(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
     progress("lines")
     best = _best_work(
         area,
-        crew,
+        swarm,
         foot,
         method=method,
         motion=options.motion,
@@ -109,7 +109,7 @@ def plan_area(
         reach_m=min(foot.reach_m, 2.0 * clearance),
     )
     progress("separation")
-    slots = crew.schedule(best)
+    slots = swarm.schedule(best)
     progress("coverage")
     left = over.missed(area.ground, slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
@@ -126,25 +126,25 @@ def plan_area(
 
 
 def _best_work(
-    area: Area, crew: Crew, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
+    area: Area, swarm: Swarm, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
 ) -> Work:
     """The fairest and shortest work among the method's candidates."""
     field = Field(area.ground, router.obstacles)
     best: Work | None = None
     most = 0
     for candidate in candidates(
-        field, crew.vehicles, foot, method=method, turn_m=motion.turn_m, router=router, reach_m=reach_m
+        field, swarm.vehicles, foot, method=method, turn_m=motion.turn_m, router=router, reach_m=reach_m
     ):
         most = max(most, candidate.stretches)
-        if candidate.stretches >= crew.vehicles:
-            work = crew.share(candidate.legs, method != "columns")
+        if candidate.stretches >= swarm.vehicles:
+            work = swarm.share(candidate.legs, method != "columns")
             best = work if best is None or work.score < active().planning.better_share * best.score else best
     if best is not None:
         return best
     if not most:
         raise InputError("all of the area lies within the clearance of no-fly zones; reduce the clearance")
     raise InputError(
-        f"{crew.vehicles} vehicles are more than this area has lines for; "
+        f"{swarm.vehicles} vehicles are more than this area has lines for; "
         f"use {most} or fewer, or fly lower so that lines lie closer"
     )
 
@@ -185,10 +185,10 @@ def plan_gaps(
     if not len(legs):
         raise InputError("all of the gaps lie within the clearance of no-fly zones; reduce the clearance")
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
-    crew = Crew(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
-    work = crew.share(shorten(legs, router, None if crew.starts is None else crew.starts[0]), True)
+    swarm = Swarm(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
+    work = swarm.share(shorten(legs, router, None if swarm.starts is None else swarm.starts[0]), True)
     progress("separation")
-    slots = crew.schedule(work)
+    slots = swarm.schedule(work)
     progress("coverage")
     left = over.missed(area.ground, slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
@@ -264,10 +264,10 @@ def plan_lines(
             f"{vehicles} vehicles are more than the {most} straight stretches; use at most {most} vehicles"
         )
     progress("lines")
-    crew = Crew(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
-    work = crew.share(legs, reorder=False)
+    swarm = Swarm(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
+    work = swarm.share(legs, reorder=False)
     progress("separation")
-    slots = crew.schedule(work)
+    slots = swarm.schedule(work)
     warnings = _warnings(slots, work, foot, options)
     return _plan("lines", slots, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
 

@@ -53,7 +53,7 @@ class GreyPictures:
         """See `read_rgb`; the grey values are stored."""
         picture = read_rgb(path)
         if _factor(picture.shape[1], picture.shape[0]) == 1 and not self._file(path).exists():
-            self._keep(path, _luma(picture))
+            self._store(path, _luma(picture))
         return picture
 
     def gray(self, frame: Frame) -> Bytes:
@@ -62,17 +62,17 @@ class GreyPictures:
         Raises:
             PictureError: see `read_gray`.
         """
-        picture = self._kept(frame.path)
+        picture = self._stored(frame.path)
         if picture is None:
             factor = _factor(frame.width, frame.height)
             picture = _luma(read_rgb(frame.path)) if factor == 1 else read_gray(frame.path, factor)
-            self._keep(frame.path, picture)
+            self._store(frame.path, picture)
         return picture
 
     def _file(self, path: Path) -> Path:
         return self.folder / blake2b(os.fsencode(path), digest_size=16).hexdigest()
 
-    def _kept(self, path: Path) -> Bytes | None:
+    def _stored(self, path: Path) -> Bytes | None:
         """The stored picture; None if it is not stored."""
         try:
             with self._file(path).open("rb", buffering=0) as file:
@@ -81,7 +81,7 @@ class GreyPictures:
         except (OSError, ValueError):
             return None
 
-    def _keep(self, path: Path, picture: Bytes) -> None:
+    def _store(self, path: Path, picture: Bytes) -> None:
         file = self._file(path)
         part = file.with_suffix(f".{os.getpid()}")
         try:

@@ -43,7 +43,7 @@ ORTHOIMAGE = "orthoimage.tif"
 _STAGES = (
     ("realtime.tif", "Real time", "as recorded, no matching"),
     ("coarse.tif", "Coarse", "pictures adjusted to each other"),
-    (ORTHOIMAGE, "Fine", "settled on the pre-disaster map"),
+    (ORTHOIMAGE, "Fine", "registered onto the pre-disaster map"),
 )
 _FINE_M, _PART_PX = 1.2, 640
 _EDGE = (255, 214, 0)
@@ -308,7 +308,7 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     offset = report.get("map_offset_m")
     if offset is not None:
         away, sigma = math.hypot(offset["east"], offset["north"]), offset["sigma"]
-        text += f". The map itself lies {away:.1f} m from where the receivers say, who know it to {sigma:.1f} m"
+        text += f". The map itself lies {away:.1f} m from where the receivers say, which are good to {sigma:.1f} m"
         if offset["doubted"]:
             return {"kind": "doubt", "text": text + ": one of the two is wrong, see below."}
     checked = report.get("checkpoints")

@@ -32,17 +32,17 @@ def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain) -> list[tuple[
     for i in index.tolist():
         near = index[tree.query_ball_point(position[i], c.most_base * height[i])]
         base = np.linalg.norm(position[near] - position[i], axis=1) / height[i]
-        alike = sight[near] @ sight[i] >= np.cos(np.radians(c.most_turn_deg))
-        fit = alike & (base >= c.least_base) & (near != i)
+        same_direction = sight[near] @ sight[i] >= np.cos(np.radians(c.most_turn_deg))
+        fit = same_direction & (base >= c.least_base) & (near != i)
         near, base = near[fit], base[fit]
         order = np.lexsort((near, np.round(np.abs(np.log(base / c.best_base)), 6)))
-        taken = 0
+        used = 0
         for j in near[order].tolist():
-            if taken == c.partners:
+            if used == c.partners:
                 break
             if _overlap(frames[i].camera, frames[j].camera, terrain) >= c.least_overlap:
                 pairs.add((min(i, j), max(i, j)))
-                taken += 1
+                used += 1
     return sorted(pairs)
 
 

@@ -109,7 +109,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     sorted_in: set[Path] = set()
     inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
     named = [path for path in absolute if not path.is_dir()]
-    files = [*inside, *((path, False) for path in named), *((path, True) for path in _beside(named))]
+    files = [*inside, *((path, False) for path in named), *((path, True) for path in _with_side_files(named))]
     real_folder = lru_cache(maxsize=None)(os.path.realpath)
     links = [(file.is_symlink(), file, walked) for file, walked in files]
     for is_link, file, walked in sorted(links, key=lambda entry: entry[0]):  # the file itself before links to it
@@ -146,7 +146,7 @@ def _walk(top: Path, outside: set[str]) -> list[Path]:
     return found
 
 
-def _beside(named: list[Path]) -> list[Path]:
+def _with_side_files(named: list[Path]) -> list[Path]:
     """Files next to videos and photos that describe their poses."""
     videos = {(path.parent, path.stem.lower()) for path in named if path.suffix.lower() in VIDEO_SUFFIXES}
     photos = {path.parent for path in named if path.suffix.lower() in PICTURE_SUFFIXES}

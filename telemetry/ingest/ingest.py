@@ -180,13 +180,13 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
     bands = {photo.band for photo in photos}
     if len(bands) < 2:
         return list(photos)
-    kept = next((band for band in _BANDS if band in {b.lower() for b in bands}), min(bands).lower())
+    mapped_band = next((band for band in _BANDS if band in {b.lower() for b in bands}), min(bands).lower())
     for photo in photos:
-        if photo.band.lower() != kept:
-            what = "the colour pictures" if not kept else f"band {kept}"
+        if photo.band.lower() != mapped_band:
+            what = "the colour pictures" if not mapped_band else f"band {mapped_band}"
             reason = f"a picture of one spectral band ({photo.band or 'colour'}); of each exposure {what} is mapped"
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
-    return [photo for photo in photos if photo.band.lower() == kept]
+    return [photo for photo in photos if photo.band.lower() == mapped_band]
 
 
 def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
@@ -196,7 +196,7 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
         if photo.lat_deg is not None and photo.lon_deg is not None:
             placed.append(photo)
         else:
-            reason = "the picture has no position; put a geo.txt beside it or name a log, too"
+            reason = "the picture has no position; put a geo.txt next to it, or give its log as well"
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
             result.unpositioned.append(frame_without_position(photo, vehicle, found.name(photo.path)))
     return placed
@@ -228,16 +228,16 @@ def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str
             photo.time_s, photo.origin["time"] = row.time_s, kind
         if row.fov_deg is not None and 2.0 < row.fov_deg < 150.0:
             photo.fov_hint_rad, photo.origin["fov_hint"] = math.radians(row.fov_deg), kind
-        given: Angles = (row.yaw_deg, row.pitch_deg, row.roll_deg)
-        if any(angle is not None for angle in given):
+        angles: Angles = (row.yaw_deg, row.pitch_deg, row.roll_deg)
+        if any(angle is not None for angle in angles):
             own = photo.camera_deg
             photo.camera_deg = (
-                own[0] if given[0] is None else given[0],
-                own[1] if given[1] is None else given[1],
-                own[2] if given[2] is None else given[2],
+                own[0] if angles[0] is None else angles[0],
+                own[1] if angles[1] is None else angles[1],
+                own[2] if angles[2] is None else angles[2],
             )
             photo.origin["angles"] = kind
-            photo.yaw_is_stated |= given[0] is not None
+            photo.yaw_is_stated |= angles[0] is not None
     return vehicle
 
 

@@ -108,11 +108,11 @@ def _of_samples(vehicle: str, samples: Sequence[Sample], shown: int) -> dict[str
 
 def _thinned(ground: NDArray[np.float64], step_m: float = 3.0) -> NDArray[np.float64]:
     """Thin positions to a least distance; the legs of a dense track are those of its thinned one."""
-    kept: list[int] = []
+    spaced: list[int] = []
     for i, point in enumerate(ground):
-        if not kept or np.hypot(*(point - ground[kept[-1]])) >= step_m:
-            kept.append(i)
-    return ground[kept] if kept else np.zeros((0, 2))
+        if not spaced or np.hypot(*(point - ground[spaced[-1]])) >= step_m:
+            spaced.append(i)
+    return ground[spaced] if spaced else np.zeros((0, 2))
 
 
 def _flown(ground: NDArray[np.float64], times: Sequence[float]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from telemetry.videos.extraction import extract
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
 
-NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT beside it or name a log, too"
+NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
 
 
 def read_videos(
@@ -33,10 +33,10 @@ def read_videos(
     result: Survey,
 ) -> None:
     """Read the videos of a folder, each with the SRT of its name; SRT files without a video are only reported."""
-    beside = {path.stem.lower(): path for path in folder.subtitles}
+    subtitle_files = {path.stem.lower(): path for path in folder.subtitles}
     for path in folder.videos:
         name = found.name(path)
-        subtitles = beside.pop(path.stem.lower(), None)
+        subtitles = subtitle_files.pop(path.stem.lower(), None)
         scanned = read_or_reason(scan, path)
         if isinstance(scanned, Unreadable):
             result.rejected.append(Rejection(name, str(scanned), found.videos[path]))
@@ -71,7 +71,7 @@ def read_videos(
             )
         else:
             _look(found.videos[path], scanned, poses, source)
-    for path in beside.values():
+    for path in subtitle_files.values():
         _lone_subtitles(path, found.name(path), result)
 
 
@@ -148,7 +148,7 @@ def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     if cues is None:
         return
     source.findings += [Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items()]
-    source.findings.append(Finding("no-video", f"{path.name} has no video of its name beside it", note=True))
+    source.findings.append(Finding("no-video", f"{path.name} has no video of the same name next to it", note=True))
     source.counts["samples"] = len(cues.cues)
     source.tracks[path.stem] = [cue.sample for cue in cues.cues if cue.sample is not None]
     source.shown[path.stem] = 0

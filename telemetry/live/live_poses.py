@@ -135,7 +135,7 @@ class LivePoses:
 
     Attributes:
         vehicle: id.
-        latest: the newest value of every field, from any source. last_event: the newest camera event.
+        latest: the newest value of every field, from any source.
     """
 
     def __init__(
@@ -143,7 +143,6 @@ class LivePoses:
     ) -> None:
         self.vehicle = vehicle
         self.latest = Sample(vehicle=vehicle)
-        self.last_event: CameraEvent | None = None
         self._max_gap_s = max_gap_s
         self._clock = clock
         self._mavlink = MavlinkPoses()
@@ -260,7 +259,6 @@ class LivePoses:
         elif around.origin.get("angles", MAVLINK) != MAVLINK:
             own.yaw_deg = own.pitch_deg = own.roll_deg = None
         event.sample = own.merge(around.sample)
-        self.last_event = event
         return event
 
 

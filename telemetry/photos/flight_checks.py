@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.frame import Frame
 from telemetry.photos.photo_tags import PhotoTags
-from telemetry.samples.course import Straight, courses_deg, local_metres, straight_legs
+from telemetry.samples.course import Straight, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicl
         _distortion(photos),
         _accurate_positions(frames),
         *_times(frames, ground),
-        _astray(frames, ground),
+        _outlying_positions(frames, ground),
         _standing(ground),
         _missing_numbers(frames),
         _spacing(frames, ground, legs),
@@ -116,7 +116,7 @@ def number_of(image: str) -> int | None:
     return int(match[1]) if match else None
 
 
-def _astray(frames: Sequence[Frame], ground: Array) -> Finding | None:
+def _outlying_positions(frames: Sequence[Frame], ground: Array) -> Finding | None:
     """Pictures far from both neighbours, which are near each other: their position is wrong."""
     if len(ground) < 3:
         return None
@@ -190,15 +190,10 @@ def _one_height(frames: Sequence[Frame]) -> Finding | None:
     if len(heights) < 3 or len(tilt) < 3 or np.ptp(heights) > 0.02 * np.median(heights) or max(tilt) > 2.0:
         return None
     text = (
-        f"all pictures look straight down from {float(np.median(heights)):.1f} m: the field of view cannot be told "
-        "from the height, only the scale of both together"
+        f"all pictures look straight down from {float(np.median(heights)):.1f} m: the field of view cannot be "
+        "separated from the height; only their combined scale is known"
     )
     return Finding("focal-and-height", text, note=True)
-
-
-def courses_of(frames: Sequence[Frame]) -> Array:
-    """Course over ground (N,) of frames in degrees, NaN in turns."""
-    return courses_deg(track_of(frames))
 
 
 def _low(frames: Sequence[Frame]) -> Finding | None:

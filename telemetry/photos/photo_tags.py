@@ -177,13 +177,13 @@ _RELATIVE_ALTITUDES = (
 
 def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     exact = parse_time(found.get("drone-dji:UTCAtExposure", ""))
-    taken = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
-    if taken is None:
+    exposed = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
+    if exposed is None:
         written = parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
         if written is not None:
-            taken = written[0], "XMP time" if written[1] else f"XMP time {ZONE_UNKNOWN}"
-    if taken is not None:
-        photo.time_s, photo.origin["time"] = taken
+            exposed = written[0], "XMP time" if written[1] else f"XMP time {ZONE_UNKNOWN}"
+    if exposed is not None:
+        photo.time_s, photo.origin["time"] = exposed
 
 
 def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:

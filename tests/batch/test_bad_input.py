@@ -168,7 +168,7 @@ def test_oblique_frames_do_not_spoil_the_others(scene, basemap, tmp_path, mosaic
     code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
     assert code == 0
     assert "away from straight down" in rows["DJI_0004.JPG"]["reason"]
-    assert any("far aside" in w and "left out of the map" in w for w in report["warnings"])
+    assert any("strongly tilted" in w and "left out of the map" in w for w in report["warnings"])
     level = [i for i in range(16) if i not in (4, 11, 13)]
     names = [f"DJI_{i:04d}.JPG" for i in level]
     found = errors(scene, rows, [shots[i] for i in level], names)

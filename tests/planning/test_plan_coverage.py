@@ -288,7 +288,7 @@ def test_starts_are_given_to_the_vehicles_in_turn_and_each_works_near_its_own():
         (2, (9e5, 0), "km"),
     ],
 )
-def test_impossible_crews_are_refused(vehicles, start, word):
+def test_impossible_swarms_are_refused(vehicles, start, word):
     options = Options(starts=[start_at(*start)] if start else [])
     with pytest.raises(InputError, match=word):
         plan_area(

@@ -65,7 +65,7 @@ def test_a_vehicle_that_becomes_ready_turns_green_item_by_item(make_world, autop
     state, why = levels(world)
     assert tuple(state) == ITEMS
     assert [state[name] for name in ("gps", "ekf", "pre-arm", "mission")] == [Level.RED] * 4
-    assert "no 3D fix" in why["gps"] and "position filter" in why["ekf"] and "not known" in why["mission"]
+    assert "no 3D fix" in why["gps"] and "position filter" in why["ekf"] and "not been read" in why["mission"]
     assert ("GPS 1: Bad fix" if autopilot is AP else "Waiting for estimator") in why["pre-arm"]
     world.wait(12.0)
     state, why = levels(world)

@@ -138,7 +138,7 @@ def test_one_that_cannot_take_off_holds_the_others_and_it_is_said(open_links, fo
     ready(links, 3)
     said = []
     takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
-    with pytest.raises(OrthoSwarmError, match="nobody was started"):
+    with pytest.raises(OrthoSwarmError, match="no vehicle was started"):
         takeoffs.begin("plan-1")
     upload_all(links, folder)
     assert {row["state"] for row in takeoffs.preflight("plan-1")} <= {"ok", "warning"}

@@ -27,7 +27,7 @@ class Traffic:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
         self._heard: dict[int, tuple[float, dict[str, Any]]] = {}
-        self._told: list[dict[str, Any]] = []
+        self._published: list[dict[str, Any]] = []
 
     def heard(self, _vehicle: Any, message: Any, _utc: float) -> None:
         """Process an ADSB_VEHICLE; one without a valid position is ignored."""
@@ -62,5 +62,5 @@ class Traffic:
     def changed(self) -> bool:
         """Whether the rows differ from those at the last call."""
         rows = self.rows()
-        changed, self._told = rows != self._told, rows
+        changed, self._published = rows != self._published, rows
         return changed

@@ -31,9 +31,9 @@ class PictureNames:
         Each picture belongs to the event nearest in time, within half of the usual time between events. The shift is
         0 while fewer than three pictures have arrived, and None if the differences of the numbers vary.
         """
-        arrived, taken = list(pictures), sorted(events, key=lambda event: event[1])
+        arrived, exposed = list(pictures), sorted(events, key=lambda event: event[1])
         images = {image for image, _ in arrived}
-        times = np.array([time_s for _, time_s in taken])
+        times = np.array([time_s for _, time_s in exposed])
         if len(times) < 2:
             return PictureNames(images)
         slack_s = 0.5 * float(np.median(np.diff(times)))
@@ -42,7 +42,7 @@ class PictureNames:
             nearest = int(np.abs(times - time_s).argmin())
             number = number_of(image)
             if number is not None and abs(times[nearest] - time_s) <= slack_s:
-                shifts[number - taken[nearest][0]] += 1
+                shifts[number - exposed[nearest][0]] += 1
         if shifts.total() < _LEAST:
             return PictureNames(images)
         shift, count = shifts.most_common(1)[0]
@@ -55,10 +55,10 @@ class PictureNames:
         pictures = [path for path in files if path.lower().endswith(_PICTURES)]
         if self.images:
             forms = {_form(image) for image in self.images}
-            alike = [path for path in pictures if _form(path) in forms]
-            if pictures and not alike:
+            same_form = [path for path in pictures if _form(path) in forms]
+            if pictures and not same_form:
                 return "", "its files have other names than the pictures that have arrived"
-            pictures = alike
+            pictures = same_form
         found = [path for path in pictures if number_of(path) == number + self.shift]
         same = [path for path in found if path.rpartition("/")[0] in self._folders(files)]
         found = same or found

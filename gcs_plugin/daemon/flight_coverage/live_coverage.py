@@ -307,9 +307,9 @@ class LiveCoverage:
             self._result = self._found(here)
         self.seconds = time.monotonic() - began
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
-        told = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
+        published = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
         document = self._result.document
-        self._events.publish("coverage", gaps=len(document["gaps"]), **{key: document[key] for key in told})
+        self._events.publish("coverage", gaps=len(document["gaps"]), **{key: document[key] for key in published})
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid

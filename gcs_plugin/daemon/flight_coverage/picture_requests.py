@@ -178,10 +178,10 @@ class PictureRequests:
         elif request is not None and job.refused:
             request.state, request.reason, request.read = "refused", job.refused, None
         elif request is not None and isinstance(job, FileRead):
-            self._keep(request, job.content)
+            self._store_arrived(request, job.content)
         self._changed()
 
-    def _keep(self, request: _Request, content: bytes) -> None:
+    def _store_arrived(self, request: _Request, content: bytes) -> None:
         try:
             self._store(request.wanted, request.path.rpartition("/")[2], content)
         except InputError as error:

@@ -60,7 +60,7 @@ class CanReader:
         bus: str,
         *,
         poses: LivePoses,
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         fleet: "Fleet | None",
         system: int | None,
     ) -> None:
@@ -69,7 +69,7 @@ class CanReader:
         Args:
             vehicle: id. bus: for example "socketcan:can0", or "mavlink" for the one behind the vehicle's link.
             poses: of the vehicle; receives the bus's poses.
-            tell: called with messages for the user.
+            notify: called with messages for the user.
             fleet: the links; None without any. system: the vehicle's MAVLink system id, None without.
 
         Raises:
@@ -78,7 +78,7 @@ class CanReader:
         from telemetry.live.dronecan_bus import CanSource
 
         self.vehicle = vehicle
-        self._bus, self._tell, self._state, self._said = bus, tell, "waiting", ""
+        self._bus, self._notify, self._state, self._said = bus, notify, "waiting", ""
         self._source = CanSource(poses)
         self._heard, self._count = float("-inf"), 0
         run = self._read
@@ -123,7 +123,7 @@ class CanReader:
     def _fail(self, reason: str) -> None:
         """Report a problem once; the connection is retried all the time."""
         if reason != self._said:
-            self._tell(f"the CAN bus of {self.vehicle}: {reason}")
+            self._notify(f"the CAN bus of {self.vehicle}: {reason}")
         self._state = self._said = reason
 
 

@@ -39,33 +39,33 @@ class Source:
         where: stream or folder.
         take: stores a picture.
         pose_at: returns the vehicle's pose at a time from its link and bus, for pictures without their own.
-        tell: called with messages for the user.
+        notify: called with messages for the user.
         cache: folder for pictures of videos and for the states of folders.
-        settled: called with the vehicle when its folder has stopped changing after new pictures.
+        on_settled: called with the vehicle when its folder has stopped changing after new pictures.
         link_log: writes a vehicle's packets into a .tlog; returns False if there are none.
     """
 
     def __init__(
-        self, vehicle: str, where: str, *, take: Take, pose_at: PoseAt, tell: Callable[[str], None], cache: Path,
-        link_log: LinkLog = lambda vehicle, out: False, settled: Callable[[str], None] = lambda vehicle: None,
+        self, vehicle: str, where: str, *, take: Take, pose_at: PoseAt, notify: Callable[[str], None], cache: Path,
+        link_log: LinkLog = lambda vehicle, out: False, on_settled: Callable[[str], None] = lambda vehicle: None,
     ) -> None:  # fmt: skip
         self.vehicle, self.where = vehicle, where
-        self._take, self._pose_at, self._tell = take, pose_at, tell
+        self._take, self._pose_at, self._notify = take, pose_at, notify
         self._stop = threading.Event()
         self._state, self.taken, self._without_pose = "waiting", 0, 0
         self._reader: FolderReader | None = None
         if not is_stream(where):
-            desk = PictureIntake(
+            intake = PictureIntake(
                 vehicle=vehicle,
-                keep=self._keep,
+                keep=self._store,
                 pose_at=partial(pose_at, vehicle),
                 link_log=partial(link_log, vehicle),
-                tell=tell,
-                settled=partial(settled, vehicle),
+                notify=notify,
+                on_settled=partial(on_settled, vehicle),
                 cache=cache,
                 stop=self._stop,
             )
-            self._reader = FolderReader(Path(where), desk)
+            self._reader = FolderReader(Path(where), intake)
         run = self._stream if self._reader is None else self._reader.run
         self._thread = threading.Thread(target=self._guarded, args=(run,), name=STREAM_THREAD + vehicle, daemon=True)
 
@@ -121,7 +121,7 @@ class Source:
         def state(text: str) -> None:
             before, self._state = self._state, text.split(":")[0]
             if self._state != before:  # every attempt fails while a camera sends nothing on the ground
-                self._tell(f"the pictures of {self.vehicle}: {self._state}")
+                self._notify(f"the pictures of {self.vehicle}: {self._state}")
 
         for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
             self._offer(picture, partial(encode_jpeg, picture.rgb))
@@ -130,8 +130,8 @@ class Source:
         """Store a picture with its own pose, gaps filled from the vehicle's link and bus."""
         name, time_s, origin = f"live-{picture.time_s:.3f}.jpg", picture.time_s, picture.origin
         own = picture.sample if picture.sample is not None else Sample()
-        given = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
-        origins = dict.fromkeys((key for key, value in given.items() if value is not None), origin)
+        recorded = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
+        origins = dict.fromkeys((key for key, value in recorded.items() if value is not None), origin)
         if not own.has_position or own.yaw_deg is None or own.height_m is None:
             linked = self._pose_at(self.vehicle, time_s)
             if linked is not None:
@@ -142,9 +142,9 @@ class Source:
             return
         if picture.damaged:
             values["damaged"] = True
-        self._keep(PostedPose(self.vehicle, name, time_s, values, origins), data())
+        self._store(PostedPose(self.vehicle, name, time_s, values, origins), data())
 
-    def _keep(self, pose: PostedPose, data: bytes) -> None:
+    def _store(self, pose: PostedPose, data: bytes) -> None:
         """Store a picture; if the disk is full, wait until there is room."""
         while not self._stop.is_set():
             try:
@@ -152,7 +152,7 @@ class Source:
                 self.taken += new
                 return
             except StorageError as error:
-                self._tell(str(error))
+                self._notify(str(error))
                 self._stop.wait(2.0)
             except OrthoSwarmError as error:
                 _log.warning("%s of %s: %s", pose.image, self.vehicle, error)

@@ -52,14 +52,14 @@ class _File:
     Attributes:
         stamp: size and modification time. since: when first seen in this state. done: True once it needs no more work.
         again_at: time of the next check of an incomplete file.
-        told: True once the user was told that it makes no progress.
+        stall_reported: True once the user was informed that it makes no progress.
     """
 
     stamp: Stamp
     since: float
     done: bool = False
     again_at: float = 0.0
-    told: bool = False
+    stall_reported: bool = False
 
 
 @dataclass(slots=True, kw_only=True)
@@ -71,8 +71,8 @@ class PictureIntake:
         keep: stores a picture; returns when it is safe.
         pose_at: returns the vehicle's pose at a time (UTC) from its link.
         link_log: writes the vehicle's packets so far to a .tlog; returns False if there are none.
-        tell: called with messages for the user.
-        settled: called when the folder has stopped changing after new pictures.
+        notify: called with messages for the user.
+        on_settled: called when the folder has stopped changing after new pictures.
         cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
         stop: set to end.
     """
@@ -81,8 +81,8 @@ class PictureIntake:
     keep: Keep
     pose_at: PoseAt
     link_log: LinkLog
-    tell: Callable[[str], None]
-    settled: Callable[[], None]
+    notify: Callable[[str], None]
+    on_settled: Callable[[], None]
     cache: Path
     stop: threading.Event
 
@@ -92,23 +92,23 @@ class FolderReader:
 
     Args:
         folder: to watch, including subfolders; it may appear and disappear.
-        desk: see PictureIntake.
+        intake: see PictureIntake.
 
     Attributes:
         state: in words. poseless: files that wait for a pose.
     """
 
-    def __init__(self, folder: Path, desk: PictureIntake) -> None:
+    def __init__(self, folder: Path, intake: PictureIntake) -> None:
         from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
         from telemetry.ingest.discovery import LOG_SUFFIXES, VIDEO_SUFFIXES
 
-        self.folder, self._intake = folder, desk
+        self.folder, self._intake = folder, intake
         self.state = "waiting"
         self.poseless: set[Path] = set()
-        self._pictures, self._videos, self._logs = PICTURE_SUFFIXES, VIDEO_SUFFIXES, LOG_SUFFIXES
+        self._pictures, self._videos = PICTURE_SUFFIXES, VIDEO_SUFFIXES
         self._wanted = PICTURE_SUFFIXES | VIDEO_SUFFIXES | LOG_SUFFIXES | {".srt", ".txt", ".csv"}
         self._files: dict[Path, _File] = {}
-        self._taken = FolderState(desk.cache, desk.vehicle, folder)
+        self._folder_state = FolderState(intake.cache, intake.vehicle, folder)
         self._tried: object = None
         self._again_at, self._again_s = 0.0, _AGAIN_S[0]
         self._fresh_at: float | None = None
@@ -122,7 +122,7 @@ class FolderReader:
             wait = max(_POLL_S, min(5.0, (time.monotonic() - began) / _SCAN_SHARE if not self._busy() else 0.0))
 
     def _busy(self) -> bool:
-        return any(not file.done and not file.told for file in self._files.values())
+        return any(not file.done and not file.stall_reported for file in self._files.values())
 
     # -- scanning -------------------------------------------------------------------------------------------------
 
@@ -137,7 +137,7 @@ class FolderReader:
             here.append(path)
             known = self._files.get(path)
             if known is None or known.stamp != stamp:  # new, or still being written
-                done = known is None and self._taken.same(self._name(path), stamp)
+                done = known is None and self._folder_state.same(self._name(path), stamp)
                 self._files[path] = _File(stamp, now, done)
         photos = [p for p in here if p.suffix.lower() in self._pictures and self._settled(p, now, _POLL_S)]
         for batch in self._batches(photos):
@@ -150,7 +150,7 @@ class FolderReader:
         self._pair(here, now)
         if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
             self._fresh_at = None
-            self._intake.settled()
+            self._intake.on_settled()
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; unreadable ones are left for the next scan."""
@@ -196,15 +196,15 @@ class FolderReader:
         """Handle an incomplete file; after a while the user is told, once."""
         file = self._files[path]
         file.again_at = now + _UNCHANGED_S
-        if now - file.since > _STALLED_S and not file.told:
-            file.told = True
-            self._intake.tell(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
+        if now - file.since > _STALLED_S and not file.stall_reported:
+            file.stall_reported = True
+            self._intake.notify(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
 
     # -- storing -----------------------------------------------------------------------------------------------
 
     def _take_photos(self, paths: Sequence[Path], now: float) -> None:
         """Store the complete photos of one scan together, as wrong angles are found by comparing neighbours."""
-        whole: dict[Path, tuple[bytes, str]] = {}
+        complete: dict[Path, tuple[bytes, str]] = {}
         for path in paths:
             try:
                 data = path.read_bytes()
@@ -215,29 +215,29 @@ class FolderReader:
                 self._wait_for(path, now)
                 continue
             digest = digest_of(data)
-            if self._taken.holds(self._name(path), digest):  # modification time changed, or on another card
+            if self._folder_state.holds(self._name(path), digest):  # modification time changed, or on another card
                 self._done(path, digest)
             else:
-                whole[path] = data, digest
-        if not whole:
+                complete[path] = data, digest
+        if not complete:
             return
-        asked = [*whole, *self._tables(whole)]
+        asked = [*complete, *self._tables(complete)]
         found = self._load(asked)
         if found is None:
-            asked = list(whole)
+            asked = list(complete)
             found = self._load(asked)
-        mine = {os.path.normpath(path.absolute()): path for path in whole}
+        mine = {os.path.normpath(path.absolute()): path for path in complete}
         for frame in found.frames if found else []:
             if self._intake.stop.is_set():
                 return
             photo = mine.get(os.path.normpath(frame.path))
             if photo is not None:
-                data, digest = whole.pop(photo)
-                self._keep(frame, self._taken.name(self._name(photo), digest), data)
+                data, digest = complete.pop(photo)
+                self._keep(frame, self._folder_state.name(self._name(photo), digest), data)
                 self._done(photo, digest)
         root = os.path.commonpath([path.parent.absolute() for path in asked])  # the root of relative names
         self._without(
-            {os.path.normpath(os.path.join(root, r.image)): r for r in found.rejected} if found else {}, whole
+            {os.path.normpath(os.path.join(root, r.image)): r for r in found.rejected} if found else {}, complete
         )
 
     def _without(self, rejected: "dict[str, Rejection]", left: dict[Path, tuple[bytes, str]]) -> None:
@@ -251,7 +251,7 @@ class FolderReader:
                 )
                 continue
             linked = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
-            name = self._taken.name(self._name(path), digest)
+            name = self._folder_state.name(self._name(path), digest)
             posted = linked_pose(self._intake.vehicle, name, rejection.time_s, linked)
             if posted is None:
                 self.poseless.add(path)
@@ -269,18 +269,18 @@ class FolderReader:
         except OSError:
             self._wait_for(path, now)
             return
-        if self._taken.holds(self._name(path), digest):
+        if self._folder_state.holds(self._name(path), digest):
             self._done(path, digest)
             return
-        beside = [p for p in self._files if p.suffix.lower() == ".srt" and p.with_suffix("") == path.with_suffix("")]
-        found = self._load([path, *beside])
+        subtitles = [p for p in self._files if p.suffix.lower() == ".srt" and p.with_suffix("") == path.with_suffix("")]
+        found = self._load([path, *subtitles])
         if found is None or not path.exists():
             self._files[path].done = found is None and path.exists()
             return
         self._keep_video(path, found, digest)
 
     def _keep_video(self, path: Path, found: "Ingest", digest: str) -> None:
-        name = self._taken.name(self._name(path), digest)
+        name = self._folder_state.name(self._name(path), digest)
         for frame in found.frames:
             if self._intake.stop.is_set():
                 return
@@ -313,7 +313,7 @@ class FolderReader:
         self.poseless.discard(path)
         self._fresh_at = time.monotonic()
         if not self._intake.stop.is_set():
-            self._taken.add(self._name(path), file.stamp, digest)
+            self._folder_state.add(self._name(path), file.stamp, digest)
 
     def _load(self, paths: Sequence[Path]) -> "Ingest | None":
         import telemetry
@@ -346,20 +346,20 @@ class FolderReader:
         self._again_s = min(_AGAIN_S[1], 2.0 * self._again_s)
         self._intake.cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="pairing-", dir=self._intake.cache) as name:
-            desk = Path(name)
+            copies = Path(name)
             for path in [*waiting, *sides]:
-                _stand_in(path, desk / path.relative_to(self.folder))
-            self._intake.link_log(desk / "link.tlog")
-            found = self._load([desk])
+                _stand_in(path, copies / path.relative_to(self.folder))
+            self._intake.link_log(copies / "link.tlog")
+            found = self._load([copies])
             if found is not None:
-                self._take_paired(waiting, found, desk)
+                self._take_paired(waiting, found, copies)
         if self.poseless and state[0] == tuple(waiting):
             count = len(self.poseless)
-            self._intake.tell(
-                f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log beside them"
+            self._intake.notify(
+                f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log next to them"
             )
 
-    def _take_paired(self, waiting: Sequence[Path], found: "Ingest", desk: Path) -> None:
+    def _take_paired(self, waiting: Sequence[Path], found: "Ingest", intake: Path) -> None:
         frames: dict[str, list[Frame]] = {}
         for frame in found.frames:
             frames.setdefault(frame.image.partition("#")[0], []).append(frame)
@@ -371,7 +371,7 @@ class FolderReader:
                 elif mine:
                     data = path.read_bytes()
                     digest = digest_of(data)
-                    self._keep(mine[0], self._taken.name(self._name(path), digest), data)
+                    self._keep(mine[0], self._folder_state.name(self._name(path), digest), data)
                     self._done(path, digest)
 
 

@@ -21,7 +21,7 @@ from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStopped
 
 _MOST_ATTEMPTS: Final = 3
 _MOST_RESTARTS: Final = 20
-_KEPT: Final = 1000
+_MOST_LISTED: Final = 1000
 _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
@@ -168,7 +168,7 @@ class Jobs:
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
         """Queue a job; returns an equal waiting one if there is one."""
         job = self._journal.write(new_job(kind, vehicle, sortie, detail))
-        self._tell(job)
+        self._publish(job)
         with self._condition:
             self._condition.notify_all()
         return job
@@ -194,7 +194,7 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """The latest jobs, oldest first."""
-        rows = self._journal.rows("SELECT * FROM jobs ORDER BY id DESC LIMIT ?", (_KEPT,))
+        rows = self._journal.rows("SELECT * FROM jobs ORDER BY id DESC LIMIT ?", (_MOST_LISTED,))
         with self._condition:
             running = dict(self._running)
         return [running.get(row["id"]) or Job.of(row) for row in reversed(rows)]
@@ -255,11 +255,11 @@ class Jobs:
                 (job.started, job.attempts, job.id),
             )
         )
-        self._tell(job)
+        self._publish(job)
 
         def progress(share: float, message: str) -> None:
             job.progress, job.message = share, message
-            self._tell(job)
+            self._publish(job)
 
         try:
             outcome = self._outcome(job, progress)
@@ -271,7 +271,7 @@ class Jobs:
                 self._running.pop(job.id, None)
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
-        self._tell(ended)
+        self._publish(ended)
         for listener in self._after:
             try:
                 listener(ended)
@@ -315,7 +315,7 @@ class Jobs:
                     return False
                 self._condition.wait(_JOURNAL_AGAIN_S)
 
-    def _tell(self, job: Job) -> None:
+    def _publish(self, job: Job) -> None:
         self._events.publish("job", **job.document())
 
 

@@ -52,13 +52,13 @@ class JointRefinement:
     _working: bool = False
     _aside: bool = False
 
-    def solve(self, job: Job, tell: ReportProgress) -> Change:
+    def solve(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `together`."""
         target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         began = time.monotonic()
         self._working, self._aside = True, False
         try:
-            if not self._solve(job, tell, target):
+            if not self._solve(job, report, target):
                 target.unlink(missing_ok=True)
         except OrthoSwarmError:
             target.unlink(missing_ok=True)
@@ -76,7 +76,7 @@ class JointRefinement:
             self._aside = True
             self.workers.abandon()
 
-    def _solve(self, job: Job, tell: ReportProgress, target: Path) -> bool:
+    def _solve(self, job: Job, report: ReportProgress, target: Path) -> bool:
         """Solve and publish; False if nothing changes."""
         row = solution_row(self.journal, job)
         if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
@@ -86,7 +86,7 @@ class JointRefinement:
         others = [self.publisher.solutions / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
         if not others:
             return _note(job, "it has no neighbours")
-        tell(0.05, f"refining again together with {len(others)} neighbour{'s' * (len(others) > 1)}")
+        report(0.05, f"refining again together with {len(others)} neighbour{'s' * (len(others) > 1)}")
         area = self.publisher.area()
         task = JointTask(
             before=self.publisher.solutions / row["path"],
@@ -110,7 +110,7 @@ class JointRefinement:
             now = solution_row(self.journal, job)
             if now is None or now["path"] != row["path"]:
                 return _note(job, "it was refined again meanwhile")
-            tell(0.7, "drawing")
+            report(0.7, "drawing")
             self._print(job, target, solved, detail)
         self.publisher.retire(self.publisher.solutions / row["path"])
         self.on_published("fine", job)

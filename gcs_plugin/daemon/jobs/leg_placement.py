@@ -55,13 +55,13 @@ class LegPlacement:
     _working: str | None = None
     _aside: bool = False
 
-    def make(self, job: Job, tell: ReportProgress) -> Change:
+    def make(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `coarse`."""
         target = self.publisher.solutions / f"{new_name('coarse')}.pickle"
         self._working, self._aside = str(job.vehicle), False
         began = time.monotonic()
         try:
-            change = self._after(job, tell, target) if "after" in job.detail else self._legs(job, tell, target)
+            change = self._after(job, report, target) if "after" in job.detail else self._legs(job, report, target)
         except OrthoSwarmError as error:
             target.unlink(missing_ok=True)
             if self._aside:
@@ -85,7 +85,7 @@ class LegPlacement:
 
     # -- in flight ------------------------------------------------------------------------------------------------
 
-    def _legs(self, job: Job, tell: ReportProgress, target: Path) -> Change:
+    def _legs(self, job: Job, report: ReportProgress, target: Path) -> Change:
         vehicle, area = str(job.vehicle), self.publisher.area()
         if self._is_refined(job):
             job.detail["note"] = "it is refined already"
@@ -94,7 +94,7 @@ class LegPlacement:
         frames, count = newest_legs(frames, area.epsg, over=bool(job.detail.get("over")))
         if not frames:
             raise OrthoSwarmError("no leg is over yet")
-        tell(0.1, f"{len(frames)} pictures, {count} legs")
+        report(0.1, f"{len(frames)} pictures, {count} legs")
         before = self._row(job)
         small = {f.image: thumbnails[f.image] for f in frames if f.image in thumbnails}
         task = SolveTask(
@@ -113,7 +113,7 @@ class LegPlacement:
         mine = {frame.image for frame in frames}
         earlier = [] if before is None else json.loads(before["detail"])["legs"]
         legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]
-        return self._publish(job, tell, target, solved, [*legs, *solved.legs])
+        return self._publish(job, report, target, solved, [*legs, *solved.legs])
 
     def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
         """Drawn sorties nearby, whose exposure is fixed."""
@@ -137,7 +137,7 @@ class LegPlacement:
 
     # -- after a refinement ---------------------------------------------------------------------------------------
 
-    def _after(self, job: Job, tell: ReportProgress, target: Path) -> Change:
+    def _after(self, job: Job, report: ReportProgress, target: Path) -> Change:
         """Place the complete sortie on the coarse layer, from the start values of its refinement."""
         row = self.journal.one(
             "SELECT path, detail FROM solutions WHERE vehicle = ? AND sortie = ?",
@@ -145,11 +145,11 @@ class LegPlacement:
         )
         if row is None or json.loads(row["detail"])["layer"] != "fine":
             return lambda db: None
-        tell(0.1, "the coarse layer beside the refined one")
+        report(0.1, "the coarse layer beside the refined one")
         solved = self.workers.run(
             coarse_after, (self.publisher.solutions / row["path"], self.publisher.area().origin, target)
         )
-        return self._publish(job, tell, target, solved, json.loads(row["detail"])["legs"])
+        return self._publish(job, report, target, solved, json.loads(row["detail"])["legs"])
 
     # -- both -----------------------------------------------------------------------------------------------------
 
@@ -159,7 +159,7 @@ class LegPlacement:
         )
 
     def _publish(
-        self, job: Job, tell: ReportProgress, target: Path, solved: SortieResult, legs: list[dict[str, Any]]
+        self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, legs: list[dict[str, Any]]
     ) -> Change:
         vehicle = packed(str(job.vehicle))
         old = self._row(job)
@@ -188,7 +188,7 @@ class LegPlacement:
             return both
 
         with self.publisher.turn("coarse"):
-            tell(0.7, "drawing")
+            report(0.7, "drawing")
             if self._aside or ("after" not in job.detail and self._is_refined(job)):
                 raise OrthoSwarmError("a refinement takes its place")
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(

@@ -76,7 +76,7 @@ class Publisher:
             return not self.shown(layer)
         try:
             if not trusted:
-                raise OrthoSwarmError("it may have lost its last pixels in the power cut")
+                raise OrthoSwarmError("its last pixels may have been lost in the power cut")
             self.layers[layer].replace(Canvas.open(self.folder / generation))
         except (OrthoSwarmError, OSError) as error:
             _log.warning("the layer %s is drawn again: %s", layer, error)
@@ -115,7 +115,7 @@ class Publisher:
         )
         return refined
 
-    def draw_again(self, workers: WorkerPool, tell: Callable[[float, str], None]) -> Change:
+    def draw_again(self, workers: WorkerPool, report: Callable[[float, str], None]) -> Change:
         """Draw the lost layers from the solution files; returns the change that records it."""
         todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
         for n, (layer, (vehicle, sortie)) in enumerate(todo):
@@ -123,7 +123,7 @@ class Publisher:
                 row = self.shown(layer).get((vehicle, sortie))
                 if row is None:
                     continue  # refined, or drawn again, meanwhile
-                tell(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
+                report(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
                 whose = (unpacked(vehicle), sortie)
                 self.publish(
                     layer, workers, whose, target=row[0], changed=row[1], change=lambda rejected: lambda db: None

@@ -52,20 +52,20 @@ class SortieRefinement:
     make_way: Callable[[str, str | None], None] = lambda vehicle, layer: None
     stopped: Callable[[], bool] = lambda: False
 
-    def refine(self, job: Job, tell: ReportProgress) -> Change:
+    def refine(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `refine`."""
         vehicle = str(job.vehicle)
         began = time.monotonic()
-        tell(0.02, "waiting for the last pictures")
+        report(0.02, "waiting for the last pictures")
         self.make_way(vehicle, None)
         if job.detail.get("trigger") == "complete":
             self._wait_quiet(job)
         self.wait_drawn(job)
         if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
             return _nothing_came(job)
-        tell(0.03, "waiting for a free worker process")
+        report(0.03, "waiting for a free worker process")
         with self.workers.reserved():
-            before, target, frames, solved = self._solve(job, tell)
+            before, target, frames, solved = self._solve(job, report)
         if before is not None:
             job.detail["beside"] = len(solved.stages)
             if not solved.stages and not solved.dropped:
@@ -75,11 +75,11 @@ class SortieRefinement:
             "frames": frames, "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
             "warnings": solved.warnings,
         }  # fmt: skip
-        self._show(job, tell, target, solved, before)
+        self._show(job, report, target, solved, before)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
         return lambda db: None
 
-    def _solve(self, job: Job, tell: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
+    def _solve(self, job: Job, report: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
         """Solve the pictures that have arrived, in the reserved process.
 
         Returns:
@@ -89,8 +89,10 @@ class SortieRefinement:
         job.detail["refine_started_s"] = time.time()  # pictures that arrive later are late
         area = self.publisher.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
-        before = self._beside(job, len(frames))
-        tell(0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others")
+        before = self._refined_before(job, len(frames))
+        report(
+            0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others"
+        )
         target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         task = SolveTask(
             frames=frames,
@@ -104,13 +106,13 @@ class SortieRefinement:
         )
         return before, target, len(frames), self.workers.run(solve if before is None else register_late, task)
 
-    def _show(self, job: Job, tell: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:
+    def _show(self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:
         """Draw and publish what was solved."""
         vehicle, layer = str(job.vehicle), "fine" if self.basemap is not None else "coarse"
         job.detail["layer"] = layer
         self.make_way(vehicle, layer)
         with self.publisher.turn(layer):
-            tell(0.7, "drawing")
+            report(0.7, "drawing")
             shown = self.publisher.shown(layer).get((packed(vehicle), job.sortie or 0))
             changed = solved.changed
             if before is None and shown is not None:  # its old ground changes, too
@@ -154,7 +156,7 @@ class SortieRefinement:
                 return
             time.sleep(0.05)
 
-    def _beside(self, job: Job, count: int) -> Any:
+    def _refined_before(self, job: Job, count: int) -> Any:
         """The refinement to which late pictures are registered; None if all are to be refined."""
         if job.detail.get("trigger") != "late":
             return None

@@ -123,13 +123,13 @@ class ToneBalance:
     _working: bool = False
     _aside: bool = False
 
-    def balance(self, job: Job, tell: ReportProgress) -> Change:
+    def balance(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `tones`."""
         began = time.monotonic()
         self._working, self._aside = True, False
         targets: list[Path] = []
         try:
-            self._balance(job, tell, targets)
+            self._balance(job, report, targets)
         except OrthoSwarmError:
             if self._aside:
                 raise Preempted from None
@@ -147,20 +147,20 @@ class ToneBalance:
             self._aside = True
             self.workers.abandon()
 
-    def _balance(self, job: Job, tell: ReportProgress, targets: list[Path]) -> None:
+    def _balance(self, job: Job, report: ReportProgress, targets: list[Path]) -> None:
         refined = {(r["vehicle"], r["sortie"]) for r in self.journal.rows("SELECT vehicle, sortie FROM solutions")}
         shown = {key: row for key, row in self.publisher.shown(self.layer).items() if key in refined}
         if len({vehicle for vehicle, _ in shown}) < 2:
             job.detail["note"] = "there is one vehicle only"
             return
-        tell(0.05, f"balancing the tones of {len(shown)} flights")
+        report(0.05, f"balancing the tones of {len(shown)} flights")
         targets += [self.publisher.solutions / f"{new_name('solution')}.pickle" for _ in shown]
         task = ToneTask(solutions=[path for path, _ in shown.values()], targets=list(targets))
         changes, pictures, cpu_s = self.workers.run(balance_tones, task)
         job.detail |= {"frames": pictures, "tones_changed": round(max(changes), 4), "solve_cpu_s": cpu_s, "drawn": 0}
         todo = [(key, target) for key, target in zip(shown, task.targets, strict=True) if target.exists()]
         for n, (key, target) in enumerate(todo):
-            tell(0.2 + 0.8 * n / len(todo), f"drawing {unpacked(key[0])}")
+            report(0.2 + 0.8 * n / len(todo), f"drawing {unpacked(key[0])}")
             if self._draw(key, shown[key], target):
                 targets.remove(target)
                 job.detail["drawn"] += 1

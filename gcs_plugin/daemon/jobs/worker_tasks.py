@@ -127,12 +127,12 @@ def register_late(task: SolveTask) -> SortieResult:
     placed, dropped = register_late_pictures(
         [f for f in task.frames if f.image not in known], refined, task.epsg, read_frame
     )
-    whole = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
+    complete = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)
-    sortie = SolutionFile(whole, thumbnails, gains)
+    gains = gains_of(complete, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)
+    sortie = SolutionFile(complete, thumbnails, gains)
     sortie.write(task.target)
-    new = replace(whole, placed=placed, dropped=dropped, legs=[])
+    new = replace(complete, placed=placed, dropped=dropped, legs=[])
     return watch.solved(new, [], sortie, visible_ground(placed, sortie.terrain))
 
 
@@ -221,11 +221,11 @@ def place(task: SolveTask) -> SortieResult:
     before = SolutionFile(replace(solution, placed=[])) if task.before is None else read_solution(task.before)
     earlier = [p for p in before.solution.placed if p.frame.image not in mine]
     moved = [p for p in before.solution.placed if p.frame.image in mine]
-    whole = replace(solution, placed=[*earlier, *solution.placed])
+    complete = replace(solution, placed=[*earlier, *solution.placed])
     stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(whole, thumbnails, [read_solution(path) for path in task.neighbours], stays)
-    sortie = SolutionFile(whole, thumbnails, gains)
+    gains = gains_of(complete, thumbnails, [read_solution(path) for path in task.neighbours], stays)
+    sortie = SolutionFile(complete, thumbnails, gains)
     sortie.write(task.target)
     changed = visible_ground([*solution.placed, *moved], sortie.terrain)
     return watch.solved(solution, _in_units(task.frames), sortie, changed)

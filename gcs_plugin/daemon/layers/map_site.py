@@ -159,7 +159,7 @@ class MapSite:
 
     def _move_away(self) -> None:
         """Drop the map's location: the next frame sets it, and all frames are drawn again."""
-        _log.warning("the map was begun at a wrong position; it is begun again where most pictures lie")
+        _log.warning("the map was started at a wrong position; it is started again where most pictures lie")
 
         def change(db: sqlite3.Connection) -> None:
             db.execute("UPDATE frames SET drawn = 0")

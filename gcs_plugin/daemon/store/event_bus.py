@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from typing import Any, Final
 
-_KEPT: Final = 2000
+_MOST_WAITING: Final = 2000
 
 
 class Subscription:
@@ -17,12 +17,12 @@ class Subscription:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._bell = loop, asyncio.Event()
-        self._waiting: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._waiting: deque[dict[str, Any]] = deque(maxlen=_MOST_WAITING)
         self._missed = False
 
     def put(self, event: dict[str, Any]) -> None:
         """Add an event; any thread."""
-        if len(self._waiting) == _KEPT:
+        if len(self._waiting) == _MOST_WAITING:
             self._missed = True
         self._waiting.append(event)
         with contextlib.suppress(RuntimeError):  # the event loop has ended

@@ -76,7 +76,7 @@ def distrust_after_power_cut(journal: Journal) -> bool:
 
     journal.write(change)
     if not clean:
-        _log.warning("the machine went down without warning; the real-time layer is drawn again")
+        _log.warning("the machine was switched off without a shutdown; the real-time layer is drawn again")
     return bool(clean)
 
 

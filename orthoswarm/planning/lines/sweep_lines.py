@@ -164,11 +164,11 @@ def candidate_angles(ground: Geometry, spacing_m: float) -> Array:
     found += list(np.radians(np.arange(0, 180, 15)))
     # Lines run across the sweep, so a line along an edge means a sweep turned by a right angle: both are worth a try.
     both = np.array([*found, *[(a + 0.5 * np.pi) % np.pi for a in found]])
-    kept: list[float] = []
+    distinct: list[float] = []
     for a in both:
-        if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > np.radians(1.0) for k in kept):
-            kept.append(float(a))
-    return np.array(kept)
+        if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > np.radians(1.0) for k in distinct):
+            distinct.append(float(a))
+    return np.array(distinct)
 
 
 def direction_cost(field: Field, angle_rad: float, spacing_m: float, turn_m: float) -> tuple[float, int]:

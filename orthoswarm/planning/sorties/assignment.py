@@ -134,7 +134,7 @@ class Work:
         return self.longest_s * (1.0 + price)
 
 
-class Crew:
+class Swarm:
     """Vehicles that take off somewhere and share legs.
 
     Attributes:
@@ -165,8 +165,8 @@ class Crew:
             if router.inside(places).any():
                 raise InputError("a start lies in a no-fly zone; move it out")
             self.starts = places[np.arange(vehicles) % len(places)]
-        given = options.endurances_s or [options.endurance_s]
-        self._endurances_s = np.array([given[k % len(given)] for k in range(vehicles)], np.float64)
+        endurances_s = options.endurances_s or [options.endurance_s]
+        self._endurances_s = np.array([endurances_s[k % len(endurances_s)] for k in range(vehicles)], np.float64)
         self._limits = self._flight_limits()
 
     def _flight_limits(self) -> Limits:

@@ -335,7 +335,7 @@ def _onto_map(
         flight.adjustment = before
         flight.warnings.append(
             f"on the map its field of view would be {now_deg:.0f} degrees, by its own pictures it is {alone_deg:.0f}: "
-            "the place found on the map is not believed"
+            "the place found on the map is rejected"
         )
         return True
     state.map_shift = found.fit.correction

@@ -137,7 +137,7 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     go = f"/api/plans/{plan['id']}/start"
     upload(served, later, plan["id"])
     refused = served.command(go)
-    assert refused.status_code == 409 and "nobody was started" in refused.json()["detail"]
+    assert refused.status_code == 409 and "no vehicle was started" in refused.json()["detail"]
     assert ({"v1", "v2"} - {later}).pop() in refused.json()["detail"] and later not in refused.json()["detail"]
     for vehicle in starts:
         upload(served, vehicle, plan["id"])

@@ -80,7 +80,7 @@ def test_an_area_is_drawn_and_planned(page):
     assert page.locator(".assignments li").count() == 2
     page.click("text=Upload missions")
     page.wait_for_selector(".notice[data-level=bad]")
-    assert "Nobody flies v1, v2" in page.inner_text(".notices")  # nobody was heard
+    assert "No vehicle flies v1, v2" in page.inner_text(".notices")  # nobody was heard
     page.wait_for_timeout(2500)
     page.click(".notice button")  # it stays until it is dismissed
     page.wait_for_selector(".notice", state="detached")

@@ -239,7 +239,7 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
 
 def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
     said = []
-    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), tell=said.append, fleet=None, system=None)
+    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), notify=said.append, fleet=None, system=None)
     reader.start()
     time.sleep(5.0)  # more than two attempts
     state = reader.document()

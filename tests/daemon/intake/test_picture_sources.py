@@ -72,7 +72,7 @@ def test_a_stream_without_pictures_is_told_once(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as camera:
         where = f"tcp://127.0.0.1:{camera.getsockname()[1]}"
         source = Source(
-            "v1", where, take=lambda *_: (1, True), pose_at=lambda *_: None, tell=said.append, cache=tmp_path
+            "v1", where, take=lambda *_: (1, True), pose_at=lambda *_: None, notify=said.append, cache=tmp_path
         )
         source.start()
         camera.settimeout(60.0)

@@ -45,12 +45,12 @@ def until(is_so):
         time.sleep(0.01)
 
 
-def nothing(job, tell):
+def nothing(job, report):
     return lambda db: None
 
 
 def test_the_end_of_a_job_is_written_when_the_disk_has_room_again(journal):
-    def fill(job, tell):
+    def fill(job, report):
         journal.full.set()
         return lambda db: None
 
@@ -72,7 +72,7 @@ def test_the_end_of_a_job_is_written_when_the_disk_has_room_again(journal):
 
 
 def test_a_failure_is_written_when_the_disk_has_room_again(journal):
-    def fail(job, tell):
+    def fail(job, report):
         journal.full.set()
         raise OrthoSwarmError("no pictures")
 
@@ -89,7 +89,7 @@ def test_a_failure_is_written_when_the_disk_has_room_again(journal):
 def test_only_a_lost_worker_is_tried_again_whatever_the_message_says(journal):
     tries = []
 
-    def handler(job, tell):
+    def handler(job, report):
         tries.append(job.vehicle)
         if job.vehicle == "v1":
             raise WorkerStoppedError("gone")
@@ -107,7 +107,7 @@ def test_a_refinement_begins_while_others_wait_and_the_background_is_busy(journa
     """One slot, a background job and two refinements that wait for pictures: the third one begins all the same."""
     go, began = threading.Event(), []
 
-    def handler(job, tell):
+    def handler(job, report):
         began.append(job.vehicle)
         assert go.wait(LIMIT_S)
         return lambda db: None
@@ -126,12 +126,12 @@ def test_a_refinement_begins_while_others_wait_and_the_background_is_busy(journa
 def test_an_export_waits_for_a_refinement_and_so_holds_its_result(journal):
     go, order = threading.Event(), []
 
-    def refine(job, tell):
+    def refine(job, report):
         assert go.wait(LIMIT_S)
         order.append("refine")
         return lambda db: None
 
-    def export(job, tell):
+    def export(job, report):
         order.append("export")
         return lambda db: None
 

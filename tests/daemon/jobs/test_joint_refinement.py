@@ -139,13 +139,13 @@ def ended(jobs, count):
 def test_neighbours_wait_until_no_refinement_waits_or_runs(journal):
     going, order, beside = threading.Event(), [], []
 
-    def refine(job, tell):
+    def refine(job, report):
         assert going.wait(60)
         time.sleep(0.1)  # there is a thread that could take the other job
         order.append(job.kind)
         return lambda db: None
 
-    def together(job, tell):
+    def together(job, report):
         beside.append([other.kind for other in jobs.all() if other.state == "running"])
         order.append(job.kind)
         return lambda db: None

@@ -123,7 +123,7 @@ def finished(jobs, count, limit_s=120.0):
 def test_refinement_goes_before_what_is_in_the_background(journal):
     order = []
 
-    def handler(job, tell):
+    def handler(job, report):
         order.append((job.kind, job.vehicle))
         time.sleep(0.02)
         return lambda db: None
@@ -145,7 +145,7 @@ def test_refinement_goes_before_what_is_in_the_background(journal):
 def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
     started, stop = threading.Event(), threading.Event()
 
-    def handler(job, tell):
+    def handler(job, report):
         started.set()
         assert stop.wait(60)
         raise OSError("its process was taken away")
@@ -164,7 +164,7 @@ def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
 def test_work_that_gave_way_is_done_again(journal):
     tries = []
 
-    def handler(job, tell):
+    def handler(job, report):
         tries.append(job.attempts)
         if len(tries) == 1:
             raise Preempted

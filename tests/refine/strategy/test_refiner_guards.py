@@ -148,10 +148,10 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
     state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
     assert not state.on_map and not len(state.matches.point)
     assert fov_deg(state.flight) == pytest.approx(70.0, abs=0.5)
-    assert any("not believed" in warning for warning in state.flight.warnings)
+    assert any("is rejected" in warning for warning in state.flight.warnings)
     monkeypatch.setattr(vehicle_passes, "orient_on_map", orient_on_map)
     state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
-    assert state.on_map and not any("not believed" in warning for warning in state.flight.warnings)
+    assert state.on_map and not any("is rejected" in warning for warning in state.flight.warnings)
 
 
 def legs_and_matches(seed=0):

@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
             )
             found = load(args.inputs, progress=progress, options=options)
             require_frames(found)
-            taken: set[Path] = set()
-            written = [write(frame, args.out, taken) for frame in found.frames]
+            used_names: set[Path] = set()
+            written = [write(frame, args.out, used_names) for frame in found.frames]
             progress("writing pictures", len(written), len(written))
     except OSError as error:
         raise OrthoSwarmError(
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
+def write(frame: "Frame", out: Path, used_names: set[Path]) -> Path:
     """Write one frame's picture with its pose; returns the file, whose unique name is added to those in use.
 
     Raises:
@@ -107,10 +107,10 @@ def write(frame: "Frame", out: Path, taken: set[Path]) -> Path:
     name = _safe(Path(stem).stem + (f"_{number}" if number else ""))
     target = folder / f"{name}.jpg"
     again = 1
-    while _key(target) in taken:  # two files of the same name, in folders of one vehicle or with other suffixes
+    while _key(target) in used_names:  # two files of the same name, in folders of one vehicle or with other suffixes
         again += 1
         target = folder / f"{name}-{again}.jpg"
-    taken.add(_key(target))
+    used_names.add(_key(target))
     data = frame.path.read_bytes()
     if data[:2] != b"\xff\xd8":
         data = encode_jpeg(read_rgb(frame.path))
@@ -127,5 +127,5 @@ def _key(path: Path) -> Path:
 
 def _safe(name: str) -> str:
     """A file name that is valid on every system."""
-    kept = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(" .")
-    return kept or "_"
+    safe = "".join(c if c.isalnum() or c in "-_. " else "_" for c in name).strip(" .")
+    return safe or "_"

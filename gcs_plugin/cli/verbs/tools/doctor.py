@@ -15,7 +15,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("."),
         metavar="DIR",
-        help="folder whose disk is looked at (default: here)",
+        help="folder whose disk is checked (default: here)",
     )
     add("--json", action="store_true", help="one JSON document on stdout")
 

@@ -144,7 +144,7 @@ def _spec(args: argparse.Namespace) -> Any:
     from orthoswarm.twin.presets import spec
     from orthoswarm.twin.site import with_heading
 
-    given = {
+    values = {
         "disaster": args.disaster, "lens_k": _pair(args.lens, "--lens"), "relief_m": args.relief, "every": args.every,
         "lean": args.lean, "lean_deg": args.lean_deg, "lat_deg": args.lat, "lon_deg": args.lon,
         "map_gsd_m": args.map_gsd, "quality": args.quality, "rays": args.rays, "follow_ground": args.follow_ground,
@@ -152,8 +152,8 @@ def _spec(args: argparse.Namespace) -> Any:
     if args.ground is not None:
         if args.surface is None:
             raise InputError("--ground needs --surface DSM.tif, too")
-        given["ground"] = (str(args.ground), str(args.surface), str(args.dtm or ""))
-    base = spec(args.preset, seed=args.seed, noise=args.noise, **_known(given))
+        values["ground"] = (str(args.ground), str(args.surface), str(args.dtm or ""))
+    base = spec(args.preset, seed=args.seed, noise=args.noise, **_known(values))
     plan = replace(base.plan, **_known({
         "columns": args.columns, "rows": args.rows, "photos": args.photos, "legs": args.legs,
         "spacing_m": args.spacing_m, "leg_spacing_m": args.leg_spacing_m, "height_m": args.height_m,
@@ -171,10 +171,10 @@ def _spec(args: argparse.Namespace) -> Any:
         "attitude_deg": args.wobble_deg, "drift_m": args.true_drift_m,
         "mount_yaw_deg": args.mount_yaw_deg, "mount_pitch_deg": args.mount_pitch_deg,
     }))  # fmt: skip
-    whole = with_heading(replace(base, plan=plan, noise=noise, motion=motion))
+    complete = with_heading(replace(base, plan=plan, noise=noise, motion=motion))
     if args.heading_deg is not None:
-        whole = replace(whole, plan=replace(whole.plan, heading_rad=math.radians(args.heading_deg)))
-    return whole
+        complete = replace(complete, plan=replace(complete.plan, heading_rad=math.radians(args.heading_deg)))
+    return complete
 
 
 def _known(values: dict[str, Any]) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--rate", type=float, default=2.0, metavar="HZ", help="pictures a second of the vehicle's clock (default 2)")
     add("--above", type=float, default=20.0, metavar="M", help="least height over takeoff for pictures (default 20)")
     add("--on-trigger", action="store_true", help="take pictures only when the autopilot reports an exposure")
-    add("--level", action="store_true", help="hold the camera level, as a gimbal that the autopilot knows nothing of")
+    add("--level", action="store_true", help="hold the camera level, like a gimbal that the autopilot does not know of")
     add("--fast", action="store_true", help="one ray a pixel: four times faster, edges less smooth")
     add("--json", action="store_true", help="at the end one JSON document on stdout")
 

@@ -27,7 +27,7 @@ _VERBS = {
     "list": "show the vehicles",
     "upload": "put missions into vehicles and read them back",
     "start": "let vehicles fly their missions from the beginning (mode, arm, start)",
-    "pause": "let vehicles stay where they are",
+    "pause": "hold vehicles where they are",
     "resume": "let vehicles go on with their missions",
     "rtl": "let vehicles fly home and land",
     "land": "let vehicles land where they are",
@@ -85,7 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
             verb.add_argument("--watch", action="store_true", help="follow the missions until each has ended")
             verb.add_argument(
                 "--ready", type=float, default=60.0, metavar="S",
-                help="wait at most so long until all vehicles' own checks pass (default 60)",
+                help="wait at most this long until all vehicles' own checks pass (default 60)",
             )  # fmt: skip
             verb.add_argument(
                 "--override", action="append", default=[], metavar="ITEM",
@@ -93,7 +93,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
             )  # fmt: skip
         if name in ("start", "watch"):
             verb.add_argument(
-                "--seconds", type=float, default=7200.0, metavar="S", help="follow at most so long (default 7200)"
+                "--seconds", type=float, default=7200.0, metavar="S", help="follow at most this long (default 7200)"
             )
 
 
@@ -116,9 +116,14 @@ def _common(parser: argparse.ArgumentParser) -> None:
         help=f"link to vehicles, several allowed ({_DEFAULT_LINK})",
     )
     add("--vehicle", action="append", default=[], metavar="ID", help="system ids: 3, v3, or 1,2,5 (default: all heard)")
-    add("--wait", type=float, default=_WAIT_S, metavar="S", help=f"look for vehicles at most so long ({_WAIT_S:g})")
+    add("--wait", type=float, default=_WAIT_S, metavar="S", help=f"wait for vehicles at most this long ({_WAIT_S:g})")
     add("--json", action="store_true", help="one JSON document on stdout")
-    add("--backend", default="pymavlink", choices=["pymavlink", "mavsdk"], help="who talks to them (pymavlink)")
+    add(
+        "--backend",
+        default="pymavlink",
+        choices=["pymavlink", "mavsdk"],
+        help="library for MAVLink (pymavlink)",
+    )
     add("--tlog", type=Path, metavar="FILE", help="append all packets to a telemetry log")
     add(
         "--signing-key",
@@ -303,7 +308,7 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
     if missing and args.action == "start":
         names = ", ".join(map(str, missing))
         raise InputError(
-            f"vehicle {names} was not heard, so nobody was started; check its link, or leave it out with --vehicle"
+            f"vehicle {names} was not heard, so no vehicle was started; check its link, or leave it out with --vehicle"
         )
     heard = [s for s in systems if s in found]
     airspace = None
@@ -312,10 +317,10 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         if isinstance(checked, dict):
             return _report(args, checked, {})
         airspace = checked
-    given = time.monotonic()
+    given_s = time.monotonic()
     text = "was not heard; check its link and system id"
     orders = {
-        s: Order(verb=args.action, system=s, given_s=given).end(f"vehicle {s} {text}", Verdict.NOT_SENT)
+        s: Order(verb=args.action, system=s, given_s=given_s).end(f"vehicle {s} {text}", Verdict.NOT_SENT)
         for s in missing
     }
     for order in orders.values():
@@ -424,18 +429,18 @@ def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
 
 def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], good: bool) -> int:
     """Print events until all missions have ended; with --json all at once at the end."""
-    told: list[FleetEvent] = []
+    reported: list[FleetEvent] = []
     print(f"following {', '.join(f'v{s}' for s in systems)}; Ctrl-C ends it, not the flights", file=sys.stderr)
 
     def tell(event: "FleetEvent") -> None:
-        told.append(event)
+        reported.append(event)
         if not args.json:
             print(event.text, flush=True)
 
     ended = backend.watch(systems, args.seconds, tell)
-    complete = {event.system for event in told if event.kind == "complete"}
+    complete = {event.system for event in reported if event.kind == "complete"}
     if args.json:
-        events = [{"kind": e.kind, "vehicle": f"v{e.system}", "time_s": e.time_s, "text": e.text} for e in told]
+        events = [{"kind": e.kind, "vehicle": f"v{e.system}", "time_s": e.time_s, "text": e.text} for e in reported]
         vehicles = [v for v in backend.summaries() if v["system"] in systems]
         print(json.dumps({"ended": ended, "vehicles": vehicles, "events": events}))
     return 0 if good and ended and complete >= set(systems) else 1

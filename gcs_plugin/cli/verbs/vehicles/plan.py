@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
-    autopilot_help = "whose dialect and times of flight; give it again for vehicles in turn (default ardupilot)"
+    autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
     add("--autopilot", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")

@@ -16,7 +16,7 @@ ADDRESS_FILE: Final = "address"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
-        "Starts without links, basemap or configuration; what a workspace holds is gone on with.\n"
+        "Starts without links, basemap or configuration; an existing workspace is continued.\n"
         "LINK is udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.\n"
         "Give --source twice for a vehicle's pictures and its CAN bus (can:socketcan:can0, can:slcan:/dev/ttyACM0,\n"
         "can:udp_multicast:239.74.163.2, or can:mavlink for the bus behind the vehicle's own link).\n\n"
@@ -25,7 +25,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--link", action="append", default=[], metavar="URL", help="MAVLink link; give it again for more")
     add("--basemap", type=Path, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
-    add("--workspace", type=Path, default=Path("workspace"), metavar="DIR", help="what is kept (default: workspace)")
+    add(
+        "--workspace",
+        type=Path,
+        default=Path("workspace"),
+        metavar="DIR",
+        help="folder of pictures, maps and settings (default: workspace)",
+    )
     add("--port", type=int, metavar="P", help="of HTTP (default 8650; 0 takes any free one)")
     add("--bind", metavar="ADDRESS", help="address of HTTP (default 127.0.0.1; any other needs the token)")
     add("--token-file", type=Path, metavar="FILE", help="where the token is, or goes (default: in the workspace)")
@@ -42,7 +48,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--tak", action="append", default=[], metavar="URL", help="send vehicles and finds there: udp://239.2.3.1:6969")
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
-    add("--end-with-input", action="store_true", help="end when standard input ends, so with the program that holds it")
+    add(
+        "--end-with-input",
+        action="store_true",
+        help="end when standard input is closed, so together with the program that started it",
+    )
     add("--init", action="store_true", help="write a commented orthoswarm.toml into the workspace and end")
 
 

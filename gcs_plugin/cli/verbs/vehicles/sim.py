@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--spacing", type=float, default=5.0, metavar="M", help="distance between neighbours (default 5)")
     add("--speed", type=float, default=1.0, metavar="X", help="vehicle seconds in a second (default 1)")
     add("--seconds", type=float, default=float("inf"), metavar="S", help="end after so many vehicle seconds")
-    add("--ready", type=float, default=0.0, metavar="S", help="seconds until they let themselves be armed")
+    add("--ready", type=float, default=0.0, metavar="S", help="seconds until they can be armed")
     add("--gps-sigma", type=float, default=0.0, metavar="M", help="wandering error of their receivers")
     add("--seed", type=int, default=0, metavar="N", help="equal seeds give equal errors and faults")
     faults = parser.add_argument_group("faults, on each link and both ways")

@@ -13,7 +13,7 @@ export const setToken = (text) => sessionStorage.setItem(KEY, text.trim());
 const headers = () => (token() ? { Authorization: `Bearer ${token()}` } : {});
 
 // kind: "http" the daemon answered no (status), "time" it did not answer in time, "network" it could not be reached.
-export class ApiError extends Error {
+class ApiError extends Error {
   constructor(message, kind, status = 0) {
     super(message);
     Object.assign(this, { kind, status });

@@ -3,7 +3,7 @@
 import { token } from "/static/core/api.js";
 import { changed, state } from "/static/core/store.js";
 
-export const LATE_S = 2;
+const LATE_S = 2;
 export const LOST_S = 5;
 const RECONNECT_S = 8;
 const CHECK_MS = 500;

@@ -8,7 +8,7 @@ import { t } from "/static/core/strings.js";
 const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, land: 9_000, start: 60_000, upload: 190_000 };
 const MOST = 300;
 const OUTCOMES = new Set(["done", "refused", "not_sent", "unknown"]);
-export const ALL = "all";
+const ALL = "all";
 
 let numbers = 0;
 const newId = () => `page-${Date.now().toString(36)}-${(++numbers).toString(36)}-${crypto.getRandomValues(new Uint32Array(1))[0].toString(36)}`;

@@ -5,7 +5,7 @@ import { t } from "/static/core/strings.js";
 import { ageText, percent } from "/static/core/units.js";
 import { state } from "/static/core/store.js";
 
-export const STALE_S = 2;
+const STALE_S = 2;
 export const LOST_S = 5;
 const LOW = 0.25;
 const EMPTY = 0.12;

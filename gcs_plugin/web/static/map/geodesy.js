@@ -5,7 +5,7 @@ const E2 = 0.00669437999014;
 const RAD = Math.PI / 180;
 
 // Metres a degree of longitude and latitude at a latitude.
-export function scaleAt(lat) {
+function scaleAt(lat) {
   const w = 1 - E2 * Math.sin(lat * RAD) ** 2;
   return [(RAD * A * Math.cos(lat * RAD)) / Math.sqrt(w), (RAD * A * (1 - E2)) / w ** 1.5];
 }

@@ -8,7 +8,7 @@ import { t } from "/static/core/strings.js";
 import { boundsOf, FIRST_OVERLAY, FLIGHT_LAYERS, fit, inView, isMoved, isReady, map } from "/static/map/map.js";
 
 const FLOWN = ["realtime", "coarse", "fine"];
-export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
+const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 const address = (name) => tileRequest(`/tiles/${name}/{z}/{x}/{y}.webp`).url.replaceAll("%7B", "{").replaceAll("%7D", "}");
 export const rasterSource = (name) => ({ type: "raster", tiles: [address(name)], tileSize: 256, maxzoom: 22 });
 export const rasterLayer = (name) => ({ id: name, type: "raster", source: name, paint: { "raster-fade-duration": 0 } });
@@ -19,7 +19,7 @@ const stale = new Set();
 const rows = new Map();
 let fitted = "";
 
-export function setOpacity(name, share) {
+function setOpacity(name, share) {
   shares.set(name, share);
   if (!map.getLayer(name)) return;
   map.setPaintProperty(name, "raster-opacity", share);
@@ -27,7 +27,7 @@ export function setOpacity(name, share) {
 }
 
 // News of a layer's content. Tiles carry ETags, so asking again costs little; once a second is enough for the eye.
-export function setVersion(name, version) {
+function setVersion(name, version) {
   if (versions.get(name) === version) return;
   const first = !versions.has(name);
   versions.set(name, version);
