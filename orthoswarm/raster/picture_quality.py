@@ -41,9 +41,9 @@ def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
     plane: NDArray[Any] = picture if picture.ndim == 2 else picture[..., 1]
     if min(plane.shape) < LEAST_SIDE_PX:
         raise ValueError(f"a picture of {plane.shape[1]} x {plane.shape[0]} pixels is too small to be judged")
-    fine, broad, mean, square, flat, bright = _sample(plane)
+    fine, coarse, mean, square, flat, bright = _sample(plane)
     return PictureQuality(
-        sharpness=float(fine / broad) if broad > 0.0 else 0.0,
+        sharpness=float(fine / coarse) if coarse > 0.0 else 0.0,
         contrast=float(np.sqrt(max(0.0, square - mean * mean))),
         flat_share=float(flat),
         saturated_share=float(bright),
@@ -54,7 +54,7 @@ def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
 def _sample(plane):  # type: ignore[no-untyped-def]
     """Sums over the blocks of a lattice: difference energies over 1 and 4 pixels, mean, mean square, shares."""
     rows, columns = plane.shape
-    fine = broad = np.int64(0)
+    fine = coarse = np.int64(0)
     total = square = flat = bright = np.int64(0)
     blocks = _ROWS * _COLUMNS
     for j in range(_ROWS):
@@ -70,7 +70,7 @@ def _sample(plane):  # type: ignore[no-untyped-def]
                     d = value - np.int64(plane[r, c + 4])
                     e = value - np.int64(plane[r + 4, c])
                     fine += a * a + b * b
-                    broad += d * d + e * e
+                    coarse += d * d + e * e
                     total += value
                     square += value * value
                     low, high = min(low, value), max(high, value)
@@ -79,4 +79,4 @@ def _sample(plane):  # type: ignore[no-untyped-def]
             if low == high and low < 250:
                 flat += 1
     pixels = blocks * _BLOCK_PX * _BLOCK_PX
-    return fine * 1.0, broad * 1.0, total / pixels, square / pixels, flat / blocks, bright / pixels
+    return fine * 1.0, coarse * 1.0, total / pixels, square / pixels, flat / blocks, bright / pixels

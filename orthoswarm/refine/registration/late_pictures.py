@@ -169,14 +169,14 @@ def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Seque
         return guess
     source = np.repeat(np.arange(len(near)), [len(uv) for uv, _ in seen])[agree]
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
-    beside = float(np.median([p.sigma_m for p in near]))
+    neighbour_sigma_m = float(np.median([p.sigma_m for p in near]))
     leaning = config.corner_height_m * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
     own = (
         active().bundle.stated_sigma_factor
         * float(np.sqrt(len(near)))
         * centre_sigma(camera, uv[agree], ground[agree], scale)
     )
-    return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([beside, leaning, own])))
+    return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([neighbour_sigma_m, leaning, own])))
 
 
 def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> float:

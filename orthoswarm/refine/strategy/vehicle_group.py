@@ -51,7 +51,7 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
 
 
-def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None) -> tuple[Terrain | None, list[str]]:
+def common_terrain(states: Sequence[VehicleState], dem: LocalDem | None = None) -> tuple[Terrain | None, list[str]]:
     """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
 
     A given height model is shifted to their level; where the points contradict it, a warning says so.
@@ -70,13 +70,13 @@ def common_terrain(states: Sequence[VehicleState], given: LocalDem | None = None
     fit, off = None, 0.0
     how = FitSettings.for_drawing(on_map=any(s.on_map for s in states))
     drawn_nodes = active().surface.drawn_nodes
-    if given is not None:
-        fit, off = fit_over_dem(given, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
+    if dem is not None:
+        fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
     tops = np.concatenate([surface_points(s) for s in states])
     cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
     drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
-    return drawn, _dem_warnings(given, fit is None, off, states) if given is not None else []
+    return drawn, _dem_warnings(dem, fit is None, off, states) if dem is not None else []
 
 
 def map_distortion_sigma(states: Sequence[VehicleState]) -> float:
@@ -121,9 +121,9 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     return Terrain(float(low[0]), float(low[1]), step, z)
 
 
-def _dem_warnings(given: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
+def _dem_warnings(dem: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:
     """Warnings about a given height model."""
-    name = given.model.path.name
+    name = dem.model.path.name
     if unused:
         return [
             f"{name} contradicts the pictures (their ground differs from it by {off_m:.1f} m in the median), so the "
@@ -140,7 +140,7 @@ def _dem_warnings(given: LocalDem, unused: bool, off_m: float, states: Sequence[
             f"the ground differs from {name} by {off_m:.1f} m in the median: it is coarse, old or displaced; the "
             "pictures are followed where they differ from it"
         )
-    if given.model.cover < active().strategy.dem_covers_share:
-        share = given.model.cover
+    if dem.model.cover < active().strategy.dem_covers_share:
+        share = dem.model.cover
         out.append(f"{name} has heights on {share:.0%} of the area; elsewhere the ground is found from the pictures")
     return out
