@@ -9,7 +9,6 @@ against the twin's truth.
 
 import argparse
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -25,7 +24,7 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
     import av
 
     from orthoswarm.raster.picture_file import read_rgb
-    from telemetry.samples.sample import Sample
+    from telemetry.samples.sample_frame import sample_of
     from telemetry.write.sei_writer import add_sei
 
     plain = target.with_suffix(".plain.mp4")
@@ -41,25 +40,7 @@ def encode(frames: list[Frame], target: Path, codec: str, crf: int) -> None:
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
 
-    def degrees(value: float | None) -> float | None:
-        return None if value is None else math.degrees(value)
-
-    def pose(number: int) -> Sample:
-        frame, fix = frames[number], frames[number].fix
-        return Sample(
-            time_s=frame.time_s,
-            lat_deg=fix.lat_deg,
-            lon_deg=fix.lon_deg,
-            height_m=fix.height_m,
-            altitude_m=fix.altitude_m,
-            yaw_deg=degrees(fix.yaw_rad),
-            pitch_deg=degrees(fix.pitch_rad),
-            roll_deg=degrees(fix.roll_rad),
-            flight_yaw_deg=degrees(fix.flight_yaw_rad),
-            vehicle=frame.vehicle,
-        )
-
-    add_sei(plain, target, pose)
+    add_sei(plain, target, lambda number: sample_of(frames[number]))
     plain.unlink()
 
 

@@ -18,6 +18,7 @@ import httpx
 import numpy as np
 
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from tests.kit.mosaic_scene import EAST, NORTH, picture_of
 
@@ -28,6 +29,22 @@ SIZE = (160, 120)
 _CLIENT = httpx.Client(
     timeout=120, verify=False, trust_env=False, limits=httpx.Limits(max_connections=None, max_keepalive_connections=0)
 )
+
+
+class StoppedWorkers:
+    """A pool of workers whose process is taken away while it writes the file that `target` gives of its task."""
+
+    def __init__(self, target):
+        self._target, self.began, self.ends = target, threading.Event(), threading.Event()
+
+    def run(self, function, task):
+        self._target(task).write_bytes(b"half")
+        self.began.set()
+        assert self.ends.wait(60)
+        raise OrthoSwarmError("a worker process was stopped from outside")
+
+    def abandon(self):
+        self.ends.set()
 
 
 def camera_at(east=0.0, north=0.0, height=60.0, yaw_deg=0.0) -> Camera:
@@ -118,7 +135,7 @@ class Served:
             time.sleep(0.1)
 
 
-def _end_with_us() -> None:
+def end_with_us() -> None:
     """A test run that is killed leaves no daemon behind."""
     import ctypes
 
@@ -143,7 +160,7 @@ def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 120.
         stderr=subprocess.STDOUT,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
-        preexec_fn=_end_with_us if sys.platform == "linux" else None,
+        preexec_fn=end_with_us if sys.platform == "linux" else None,
     )
     said: list[str] = []
     lines: queue.SimpleQueue = queue.SimpleQueue()

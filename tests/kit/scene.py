@@ -51,7 +51,7 @@ class Scene:
             width=n,
             height=n,
         )
-        self.rgb = _texture(n, seed)
+        self.rgb = scene_texture(n, seed)
 
     def camera(self, shot: Shot) -> Camera:
         yaw = np.radians(shot.yaw) - self.grid.convergence_rad(self.lat, self.lon)
@@ -133,7 +133,7 @@ def legs(count: int = 3, photos: int = 8, step: float = 22.0, apart: float = 45.
     return out
 
 
-def _texture(n: int, seed: int):
+def scene_texture(n: int, seed: int):
     """Blotches of several sizes, and blocks with sharp edges, as roofs and fields have them."""
     rng = np.random.default_rng(seed)
     rgb = np.zeros((n, n, 3), np.float32)

@@ -9,7 +9,7 @@ from orthoswarm.matchers.matcher import UnavailableError
 from orthoswarm.matchers.patch_registration import apply, magsac, plausible, register, robust_shift
 from orthoswarm.matchers.roma import Roma, load
 from orthoswarm.model.errors import InputError
-from tests.kit.scene import _texture
+from tests.kit.scene import scene_texture
 
 REACH = 32
 ALL = ("xfeat", "disk", "aliked", "sift")
@@ -20,7 +20,7 @@ def ground():
     """Two unrelated grounds, grey float32 640 x 640."""
     import cv2
 
-    return [cv2.cvtColor(_texture(640, seed), cv2.COLOR_RGB2GRAY).astype(np.float32) for seed in (1, 2)]
+    return [cv2.cvtColor(scene_texture(640, seed), cv2.COLOR_RGB2GRAY).astype(np.float32) for seed in (1, 2)]
 
 
 def need(name):

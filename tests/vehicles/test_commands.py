@@ -16,7 +16,7 @@ from gcs_plugin.links.transports import TcpLink
 from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
 from gcs_plugin.mission.items import TAKEOFF, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import SimLink, VirtualClock, World
+from gcs_plugin.sim.memory_link import SimLink, VirtualClock
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet import END, kinds, sent_by
@@ -24,19 +24,6 @@ from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
-
-
-@pytest.fixture
-def make_world():
-    worlds = []
-
-    def make(*vehicles, up=None, down=None, **options):
-        worlds.append(World(vehicles, up or Faults(), down or Faults(), **options))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.fleet.close()
 
 
 def give(world, verb, system, given_s=None):

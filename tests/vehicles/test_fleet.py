@@ -17,7 +17,6 @@ from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -26,19 +25,6 @@ from tests.vehicles.test_sim import mission
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 END = MissionItem.do(RTL)
-
-
-@pytest.fixture
-def make_world():
-    worlds = []
-
-    def make(*vehicles, up=None, down=None, **options):
-        worlds.append(World(vehicles, up or Faults(), down or Faults(), **options))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.fleet.close()
 
 
 def sent_by(world):

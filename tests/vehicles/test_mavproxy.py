@@ -24,7 +24,7 @@ from gcs_plugin.links.packets import Framer
 from gcs_plugin.mavproxy.packet_feed import Feed
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from tests.kit.daemon_kit import GRID, Served, _end_with_us
+from tests.kit.daemon_kit import GRID, Served, end_with_us
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.sim_cameras import Cameras, square
 
@@ -45,7 +45,7 @@ class MavProxy:
         environment.pop("DISPLAY", None)
         self.process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            errors="replace", env=environment, preexec_fn=_end_with_us,
+            errors="replace", env=environment, preexec_fn=end_with_us,
         )  # fmt: skip
         self.words = folder / "words"
         self.lines: queue.Queue = queue.Queue()

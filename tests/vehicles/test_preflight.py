@@ -12,7 +12,6 @@ from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -23,19 +22,6 @@ from tests.vehicles.test_sim import mission
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 CHART = Chart(47.397742, 8.545594, 488.0)
-
-
-@pytest.fixture
-def make_world():
-    worlds = []
-
-    def make(*vehicles, **faults):
-        worlds.append(World(vehicles, **faults))
-        return worlds[-1]
-
-    yield make
-    for world in worlds:
-        world.fleet.close()
 
 
 def levels(world, wanted=Wanted()):  # noqa: B008

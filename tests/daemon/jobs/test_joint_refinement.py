@@ -17,8 +17,8 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, packed
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
-from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Solution
+from tests.kit.daemon_kit import StoppedWorkers
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 
 
@@ -115,7 +115,7 @@ def test_pictures_that_look_far_aside_are_left_out_of_the_refined_map(flights):
     )
     left = without_strays(found)
     assert set(left.dropped) == {"x.jpg", frames["v1"][5].image} and len(left.placed) == len(placed) - 1
-    assert len(left.warnings) == 2 and "far aside" in left.warnings[1]
+    assert len(left.warnings) == 2 and "strongly tilted" in left.warnings[1]
     assert without_strays(replace(found, placed=placed[:5])) == replace(found, placed=placed[:5])
 
 
@@ -172,22 +172,6 @@ class Rows:
         return [{"vehicle": packed(v), "sortie": 1, **self.one("", ())} for v in ("v1", "v2")]
 
 
-class StoppedWorkers:
-    """Workers whose process is taken away while it works."""
-
-    def __init__(self):
-        self.began, self.ends = threading.Event(), threading.Event()
-
-    def run(self, function, task):
-        task.target.write_bytes(b"half")
-        self.began.set()
-        assert self.ends.wait(60)
-        raise OrthoSwarmError("a worker process was stopped from outside")
-
-    def abandon(self):
-        self.ends.set()
-
-
 class Placed:
     """A publisher of an area."""
 
@@ -201,7 +185,7 @@ class Placed:
 
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
-    workers = StoppedWorkers()
+    workers = StoppedWorkers(lambda task: task.target)
     work = JointRefinement(
         journal=Rows(), publisher=Placed(tmp_path), workers=workers, basemap=tmp_path / "map.tif", least_px=0.1
     )

@@ -14,10 +14,10 @@ from gcs_plugin.daemon.jobs.tone_balance import ToneBalance, ToneTask, balance_t
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.journal import packed
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Solution, Terrain
 from orthoswarm.mosaic.render_passes import thumbnail
 from tests.kit import mosaic_scene as scene
+from tests.kit.daemon_kit import StoppedWorkers
 from tests.kit.made_up import after_job, complete, post
 
 TONES = {"west": 1.0, "middle": 0.85, "east": 0.75}
@@ -139,22 +139,6 @@ def solution_path(daemon, vehicle):
     return daemon.journal.one("SELECT path FROM solutions WHERE vehicle = ?", (packed(vehicle),))["path"]
 
 
-class StoppedWorkers:
-    """Workers whose process is taken away while it works."""
-
-    def __init__(self):
-        self.began, self.ends = threading.Event(), threading.Event()
-
-    def run(self, function, task):
-        task.targets[0].write_bytes(b"half")
-        self.began.set()
-        assert self.ends.wait(60)
-        raise OrthoSwarmError("a worker process was stopped from outside")
-
-    def abandon(self):
-        self.ends.set()
-
-
 class Shown:
     """A publisher of two refined sorties, and the journal that holds them."""
 
@@ -169,7 +153,7 @@ class Shown:
 
 
 def test_it_gives_way_to_a_refinement_and_leaves_nothing_behind(tmp_path):
-    workers, found = StoppedWorkers(), []
+    workers, found = StoppedWorkers(lambda task: task.targets[0]), []
     work = ToneBalance(journal=Shown(tmp_path), publisher=Shown(tmp_path), workers=workers, layer="fine")
 
     class AnyJob:

@@ -30,7 +30,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, utm_epsg
 from telemetry.live.live_stream import open_stream
 from telemetry.samples.sample import Sample
-from tests.kit.daemon_kit import _end_with_us, exported, serving
+from tests.kit.daemon_kit import end_with_us, exported, serving
 
 ADDRESSES = [a.strip() for a in os.environ.get("ORTHOSWARM_SITL", "").split(",") if a.strip()]
 HOME = (-35.363262, 149.165237, 584.0)  # ArduPilot's own default: far from the twin's city, south of the equator
@@ -91,7 +91,7 @@ class CameraProcess:
     def __init__(self, *arguments):
         self.process = subprocess.Popen(
             [sys.executable, "-m", "gcs_plugin.cli", "twin", "camera", "--json", *arguments],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_end_with_us,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=end_with_us,
         )  # fmt: skip
         self.said: list[str] = []
         self.told = threading.Condition()
