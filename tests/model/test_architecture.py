@@ -1,4 +1,4 @@
-"""docs/architecture.md names what is in the tree: each room has its sentence, each module that it names exists."""
+"""The documents name what is in the tree: rooms with a sentence each, modules, benchmarks, links that lead on."""
 
 import ast
 import re
@@ -64,3 +64,27 @@ def test_every_room_has_its_row(package):
 
 def test_the_pages_stay_two():
     assert len(TEXT.splitlines()) <= 140
+
+
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def _headings(path: Path) -> set[str]:
+    """The anchors of a document's headings, as GitHub makes them."""
+    lines = [
+        line.lstrip("#").strip().lower() for line in path.read_text(encoding="utf-8").splitlines() if line[:1] == "#"
+    ]
+    return {re.sub(r"[^\w\- ]", "", line).replace(" ", "-") for line in lines}
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_documents_name_what_exists(path):
+    text = path.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", text):
+        linked = path.parent / target if target else path
+        assert linked.exists(), f"there is no {target}"
+        assert not anchor or anchor in _headings(linked), f"{linked.name} has no heading for #{anchor}"
+    for module in re.findall(r"python -m (benchmarks[\w.]+)", text):
+        assert (ROOT / module.replace(".", "/")).with_suffix(".py").is_file(), f"there is no {module}"
+    for file in re.findall(r"`((?:orthoswarm|telemetry|gcs_plugin|benchmarks|docs)/[\w/.]+)`", text):
+        assert (ROOT / file).exists(), f"there is no {file}"
