@@ -117,7 +117,7 @@ def _stitched(job: Job) -> tuple[Path, int | None]:
 
     out = job.out / "laid.tif"  # the most favourable georeference that it could get
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
-    return out, (read_result(job.out / "said.json") or {}).get("used")
+    return out, (read_result(job.out / "outcome.json") or {}).get("used")
 
 
 def _pasted(job: Job) -> tuple[Path, int | None]:

@@ -20,11 +20,11 @@ from starlette.requests import ClientDisconnect
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, parse_pose
+from gcs_plugin.daemon.store.picture_store import MOST_PICTURE_BYTES
 from gcs_plugin.web.answers import JsonAnswer, in_thread
 from gcs_plugin.web.guard import TooLarge, bounded
 from orthoswarm.model.errors import InputError, StorageError
 
-MOST_PICTURE_BYTES: Final = 96_000_000
 _MOST_POSE_BYTES: Final = 16_000_000
 _SHORT_POSE: Final = 65_536
 _THREADS: Final = 12

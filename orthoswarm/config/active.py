@@ -28,6 +28,7 @@ from orthoswarm.config.refiner.registration import RegistrationConfig
 from orthoswarm.config.refiner.strategy import StrategyConfig
 from orthoswarm.config.refiner.surface import SurfaceConfig
 from orthoswarm.config.stereo import StereoConfig
+from orthoswarm.config.telemetry import IngestConfig, PairingConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -47,6 +48,8 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     late: LateConfig = field(default_factory=LateConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
+    ingest: IngestConfig = field(default_factory=IngestConfig)
+    pairing: PairingConfig = field(default_factory=PairingConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)

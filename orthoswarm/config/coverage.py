@@ -14,6 +14,8 @@ class CoverageConfig:
     oblique_deg: float = 45.0
     """Ground that is seen farther from straight down is seen obliquely, degrees (chosen); from
     `mosaic.most_off_nadir_deg` on it is not seen at all."""
+    lens_sigmas: float = 2.0
+    """Plans over gaps take the solved field of view less so many sigmas (chosen: 98 % of the lenses are wider)."""
     smallest_gap_m2: float = 4.0
     """Smaller gaps are only counted, square metres (chosen)."""
 

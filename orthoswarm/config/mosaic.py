@@ -40,7 +40,7 @@ class MosaicConfig:
     ground_level_sigma_m: float = 0.2
     """Sigma of the solved ground's median level, without its relief, metres (chosen)."""
     takeoff_level_limit_m: float = 3.0
-    """A level that lies farther from the refiner's zero is not believed, metres (chosen) ..."""
+    """A takeoff level farther from the refiner's zero is ignored, metres (chosen) ..."""
     takeoff_level_reliefs: float = 2.0
     """... and so many sigmas of the ground's heights: the refiner holds the ground's median at its zero, and the place
     of takeoff may lie anywhere in the relief."""

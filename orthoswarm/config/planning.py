@@ -1,6 +1,6 @@
 """Planning: lines over an area, their order, sorties, and heights over ground.
 
-Prices are shares of flying time or seconds; limits of what a user may ask for stand beside their error messages.
+Prices are shares of flying time or seconds; limits of a user's values are next to their error messages.
 """
 
 from dataclasses import dataclass
@@ -56,9 +56,9 @@ class PlanningConfig:
     many_legs: int = 400
     """From so many legs on no further directions are tried: they hardly differ (chosen for its time)."""
     denser: float = 1.25
-    """Lines are also laid closer, up to so many times their number, where that shares them better (chosen)."""
+    """Closer lines are tried, too, up to so many times their number, where they can be shared more evenly (chosen)."""
     hopeless: float = 1.08
-    """A direction that is so many times as long as the best is not worth mending (chosen)."""
+    """Gaps are not filled for a direction whose path is so many times as long as the best (chosen)."""
     detour_inside_m: float = 0.02
     """How far a detour may pass inside an obstacle, metres: its corners touch it (chosen: rounding)."""
     detour_most_corners: int = 300
@@ -98,6 +98,6 @@ class PlanningConfig:
     on_ground_m: float = 2.0
     """Up to this height over its takeoff a vehicle stands on the ground, metres (chosen)."""
     layer_price_s: float = 3.0
-    """What a flight height apart from the others is worth in seconds of delay, for each layer (chosen)."""
+    """Price of each further height layer, in seconds of delay (chosen)."""
     pad_distances: float = 1.5
     """Radius about a start, in separation distances, within which only time keeps vehicles apart (chosen)."""

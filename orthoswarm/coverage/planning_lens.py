@@ -12,10 +12,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.coverage.view import View
-
-_SIGMAS = 2.0
-_MAD_TO_SIGMA = 1.4826
+from orthoswarm.model.robust import mad_sigma
 
 
 def planning_fov_rad(
@@ -64,11 +63,11 @@ def _effective(views: Sequence[View], ground_z_m: float, heights_over_level_grou
         above = np.array([_above_ground_m(v, ground_z_m) for v in views])
         half_width = half_width[known] * above[known] / recorded[known]
         middle = float(np.median(half_width))
-        sigma = _MAD_TO_SIGMA * float(np.median(np.abs(half_width - middle)))
+        sigma = mad_sigma(half_width - middle)
     else:
         middle = float(np.median(half_width))
         sigma = middle * float(np.median([v.focal_sigma for v in views]))
-    return 2.0 * math.atan(max(middle - _SIGMAS * sigma, 0.0))
+    return 2.0 * math.atan(max(middle - active().coverage.lens_sigmas * sigma, 0.0))
 
 
 def _above_ground_m(view: View, ground_z_m: float) -> float:

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 NADIR_PITCH_RAD = -np.pi / 2
 _CAMERA_TO_BODY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 LEAST_RADIAL_SLOPE = 0.2
 """The lens model holds while d r_distorted / d r = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 stays above this: a polynomial
@@ -45,12 +45,12 @@ def rotation_from_angles(yaw_rad: ArrayLike, pitch_rad: ArrayLike, roll_rad: Arr
     ned[..., 0, 0], ned[..., 0, 1], ned[..., 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
     ned[..., 1, 0], ned[..., 1, 1], ned[..., 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
     ned[..., 2, 0], ned[..., 2, 1], ned[..., 2, 2] = -sp, cp * sr, cp * cr
-    return np.asarray(_NED_TO_ENU @ ned @ _CAMERA_TO_BODY, dtype=np.float64)
+    return np.asarray(NED_TO_ENU @ ned @ _CAMERA_TO_BODY, dtype=np.float64)
 
 
 def angles_from_rotation(rotation: ArrayLike) -> tuple[Array, Array, Array]:
     """GRID yaw, pitch, roll in radians of camera-to-ground rotations (..., 3, 3); inverse of the above."""
-    ned = _NED_TO_ENU.T @ np.asarray(rotation, float) @ _CAMERA_TO_BODY.T
+    ned = NED_TO_ENU.T @ np.asarray(rotation, float) @ _CAMERA_TO_BODY.T
     yaw = np.arctan2(ned[..., 1, 0], ned[..., 0, 0])
     pitch = np.arcsin(np.clip(-ned[..., 2, 0], -1.0, 1.0)) - np.pi / 2
     roll = np.arctan2(ned[..., 2, 1], ned[..., 2, 2])

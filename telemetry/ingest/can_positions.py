@@ -10,8 +10,6 @@ from telemetry.formats.log.log_data import FlightLog
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
-_SAME_VEHICLE_M = 20.0
-_LEAST_COMMON = 10
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
 
 
@@ -27,7 +25,7 @@ def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
     east = np.radians(track.values("lon_deg", times) - lon) * np.cos(np.radians(lat))
     distance = MEAN_RADIUS_M * np.hypot(north, east)
     common = distance[np.isfinite(distance)]
-    return float(np.median(common)) if len(common) >= _LEAST_COMMON else None
+    return float(np.median(common)) if len(common) >= active().ingest.bus_least_common else None
 
 
 def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
@@ -38,7 +36,7 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     accurate.
     """
     distance = apart_m(log, bus)
-    if distance is None or distance > _SAME_VEHICLE_M:
+    if distance is None or distance > active().ingest.bus_same_vehicle_m:
         return None
     track = bus.timeline()
     sigma_m = log.position_sigma_m or active().records.position_sigma_m

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthoswarm.config import active
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 from telemetry.formats.log.can_log import is_can_log
 from telemetry.formats.log.dataflash import has_dataflash_records
@@ -27,10 +28,6 @@ from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 _BUS = "DroneCAN"
-_LEAST_SHARE = 0.5
-_SAME_EXPOSURE_S = 1.0
-_FAR_M = 60.0
-_NAME_BONUS = 0.05
 
 
 @dataclass(slots=True, kw_only=True)
@@ -121,7 +118,10 @@ def _same_exposures(a: FlightLog, b: FlightLog) -> bool:
     for event in a.events:
         i = int(np.argmin(np.abs(times - (event.time_s or 0.0))))
         other = b.events[i]
-        if abs(times[i] - (event.time_s or 0.0)) > _SAME_EXPOSURE_S or _apart_m(event.sample, other.sample) > 3.0:
+        if (
+            abs(times[i] - (event.time_s or 0.0)) > active().ingest.log_same_exposure_s
+            or _apart_m(event.sample, other.sample) > 3.0
+        ):
             return False
     return True
 
@@ -151,24 +151,25 @@ def add_logs(
         findings: findings are appended here.
         workers: threads that read photos if their times do not decide which camera event they belong to.
     """
+    config = active().ingest
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):
         return
     tried = []
     for entry in near:
         pairing = _pair(photos, entry.log.events)
-        if len(pairing.pairs) >= max(1.0, _LEAST_SHARE * min(len(photos), len(entry.log.events))):
+        if len(pairing.pairs) >= max(1.0, config.log_least_share * min(len(photos), len(entry.log.events))):
             tried.append((_fit(photos, pairing, entry), _same_number(vehicle, entry.log), pairing, entry))
     if not tried:
         _use_timeline(photos, near, vehicle, findings)
         return
-    tried.sort(key=lambda row: -(row[0] + _NAME_BONUS * row[1]))
+    tried.sort(key=lambda row: -(row[0] + config.log_name_bonus * row[1]))
     fit, named, pairing, entry = tried[0]
     if pairing.doubtful:
         motion = picture_motion(photos, entry.log, entry.timeline, workers)
         pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing
     _use_events(photos, pairing, entry, vehicle, findings)
-    rivals = [other for rival, _, _, other in tried[1:] if rival > fit - _NAME_BONUS and not other.used]
+    rivals = [other for rival, _, _, other in tried[1:] if rival > fit - config.log_name_bonus and not other.used]
     if rivals and not named:
         text = (
             f"the photos fit {rivals[0].log.path.name} as well as {entry.log.path.name}, which is used; name only the "
@@ -207,6 +208,7 @@ def _use_events(
     photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
 ) -> None:
     """Assign photos the poses of their events."""
+    config = active().ingest
     entry.used = True
     log = entry.log
     far = 0
@@ -217,7 +219,10 @@ def _use_events(
         if not log.has_gimbal:
             pose = fixed_camera(pose)
         photo = photos[i]
-        if photo.lat_deg is not None and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > _FAR_M:
+        if (
+            photo.lat_deg is not None
+            and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > config.event_far_m
+        ):
             far += 1
         origin = f"{event.kind} ({entry.name})"
         if i in pairing.doubtful:
@@ -228,7 +233,10 @@ def _use_events(
         fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
     if far > 0.2 * len(pairing.pairs):
-        text = f"{plural(far, 'photo')} lie more than {_FAR_M:.0f} m from their camera events; the log may be another's"
+        text = (
+            f"{plural(far, 'photo')} lie more than {config.event_far_m:.0f} m from their camera events; the log may be "
+            "that of another flight"
+        )
         findings.append(Finding("pairing-distance", text, vehicle))
 
 

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from orthoswarm.config import active
 from telemetry.ingest.discovery import natural_key
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, plural
-
-_JUMP_S = 60.0
 
 
 def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
@@ -30,7 +29,11 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     times = np.array([p.time_s for p in by_name], dtype=np.float64)
     steps = np.diff(times)
     back = np.flatnonzero(steps < 0.0)
-    if len(back) > 3 or steps[back].min() > -_JUMP_S or _length_m(by_name) > 0.7 * _length_m(by_time):
+    if (
+        len(back) > 3
+        or steps[back].min() > -active().ingest.clock_jump_s
+        or _length_m(by_name) > 0.7 * _length_m(by_time)
+    ):
         return by_time
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     for at in back:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from telemetry.ingest.log_ingest import LogSource
 from telemetry.ingest.pairing.clock_offset import (
     offset_by_positions,
@@ -17,10 +18,6 @@ from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan
 
 Array = NDArray[np.float64]
-
-_RATE_HZ = 4.0
-_WIDTH = 320
-_LONGEST_S = 600.0
 
 
 def add_log(poses: Poses, found: VideoScan, logs: Sequence["LogSource"]) -> list[Finding]:
@@ -71,13 +68,14 @@ def _longest(entry: "LogSource") -> float:
 
 def picture_rates(found: VideoScan) -> tuple[Array, Array]:
     """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
+    config = active().ingest
     import cv2
 
     from telemetry.videos.extraction import decoded
     from telemetry.videos.picture_choice import luma
 
     rate = found.rate or 30.0
-    every = max(1, round(rate / _RATE_HZ))
+    every = max(1, round(rate / config.turning_rate_hz))
     times: list[float] = []
     rates: list[float] = []
     before: tuple[float, NDArray[np.uint8]] | None = None
@@ -86,10 +84,10 @@ def picture_rates(found: VideoScan) -> tuple[Array, Array]:
             continue
         note = found.pictures[index] if index is not None and index < len(found.pictures) else None
         t = note.video_s if note is not None and note.video_s is not None else number / rate
-        if t > _LONGEST_S:
+        if t > config.turning_longest_s:
             break
         gray = np.ascontiguousarray(luma(frame))
-        scale = min(1.0, _WIDTH / gray.shape[1])
+        scale = min(1.0, config.turning_width_px / gray.shape[1])
         small = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if before is not None:
             middle, turned = turning_of_pictures([before[1], small], np.array([before[0], t]))

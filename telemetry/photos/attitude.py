@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_tags import PhotoTags
@@ -24,8 +25,6 @@ RELATIVE_GIMBAL_MODELS = frozenset({"FC7203"})
 
 Measured on a flight of one: pictures turn with the sum of both (slope 1.1 on the gimbal's yaw), not with the flight
 yaw alone."""
-
-_NADIR_WITHIN_DEG = 45.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +83,9 @@ def _drop_unfilled(camera: Array, flight: Array, findings: list[Finding], vehicl
 def _repair_upside_down(camera: Array, findings: list[Finding], vehicle: str) -> None:
     """Replace a roll near 180 at nadir by the equivalent yaw turned by 180 (gimbals do not hang upside down)."""
     with np.errstate(invalid="ignore"):
-        flipped = (np.abs(wrap_deg(camera[:, 2] - 180.0)) < 30.0) & (camera[:, 1] < -90.0 + _NADIR_WITHIN_DEG)
+        flipped = (np.abs(wrap_deg(camera[:, 2] - 180.0)) < 30.0) & (
+            camera[:, 1] < -90.0 + active().ingest.nadir_within_deg
+        )
     if flipped.any():
         camera[flipped, 0] += 180.0
         camera[flipped, 2] = wrap_deg(camera[flipped, 2] - 180.0)

@@ -10,17 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import Straight, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 
 Array = NDArray[np.float64]
-
-_ASTRAY_M = 100.0
-_LOW_SHARE = 0.4
-"""A picture taken below this part of the usual height shows too little ground to be followed."""
-_FOV_GUESS_RAD = math.radians(70.0)
 
 
 def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
@@ -123,7 +119,12 @@ def _outlying_positions(frames: Sequence[Frame], ground: Array) -> Finding | Non
     step = np.hypot(*np.diff(ground, axis=0).T)
     across = np.hypot(*(ground[2:] - ground[:-2]).T)
     least = np.minimum(step[:-1], step[1:])
-    far = np.flatnonzero((least > _ASTRAY_M) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)) + 1
+    far = (
+        np.flatnonzero(
+            (least > active().ingest.outlying_position_m) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)
+        )
+        + 1
+    )
     if not len(far):
         return None
     away = float(least[far - 1].max())
@@ -166,7 +167,13 @@ def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -
     step = np.concatenate([np.hypot(*np.diff(ground[g.first : g.last + 1], axis=0).T) for g in legs])
     usual = float(np.median(step))
     first = frames[0]
-    footprint = 2.0 * height * math.tan(0.5 * (first.fov_hint_rad or _FOV_GUESS_RAD)) * first.height / first.width
+    footprint = (
+        2.0
+        * height
+        * math.tan(0.5 * (first.fov_hint_rad or math.radians(active().records.theta_hat_deg)))
+        * first.height
+        / first.width
+    )
     if usual < 0.1 * height:
         text = (
             f"pictures are {usual:.1f} m apart at {height:.0f} m height, a short base: neighbours see heights of the "
@@ -202,7 +209,7 @@ def _low(frames: Sequence[Frame]) -> Finding | None:
     if np.isnan(heights).mean() > 0.5:
         return None
     usual = float(np.nanmedian(heights))
-    low = np.flatnonzero(heights < _LOW_SHARE * usual)
+    low = np.flatnonzero(heights < active().ingest.low_share * usual)
     if not 0 < len(low) <= 0.2 * len(frames):
         return None
     text = (

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.config import active
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
@@ -23,7 +24,6 @@ Run = Callable[..., Iterator[Any]]
 """Maps a function over items, in order."""
 
 _FULL_FRAME_DIAGONAL_MM = 43.2666
-_MAX_HEIGHT_M = 12_000.0
 _CHUNK = 64
 
 
@@ -153,17 +153,18 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
 
 
 def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+    config = active().ingest
     photo.altitude_m = exif.gps_altitude(tags.gps)
     if photo.altitude_m is None:
         photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
-    if ground is not None and 0.0 < ground < _MAX_HEIGHT_M:
+    if ground is not None and 0.0 < ground < config.most_height_m:
         photo.height_m, photo.height_is_ground = ground, True
         photo.origin["height"] = "XMP AboveGroundAltitude"
         return
     others = sorted(name for name in found if name.endswith(":RelativeAltitude"))  # makers that follow DJI's names
     relative = xmp.number(found, *_RELATIVE_ALTITUDES, *others)
-    if relative is not None and abs(relative) < _MAX_HEIGHT_M:
+    if relative is not None and abs(relative) < config.most_height_m:
         photo.height_m = relative
         photo.origin["height"] = "XMP RelativeAltitude"
 

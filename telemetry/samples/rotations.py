@@ -3,11 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.camera import angles_from_rotation
+from orthoswarm.model.camera import NED_TO_ENU, angles_from_rotation
 
 Array = NDArray[np.float64]
 
-_NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Camera (x right, y down, z along the optical axis) in a frame whose x is the optical axis, y right, z down.
 _CAMERA_TO_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -44,13 +43,13 @@ def camera_angles_deg(forward_ned: Array) -> tuple[float, float, float]:
     This is the form of MISB sensor angles and of MAVLink gimbals: x along the optical axis, y to the picture's right,
     z towards its lower edge.
     """
-    yaw, pitch, roll = angles_from_rotation(_NED_TO_ENU @ forward_ned @ _CAMERA_TO_FORWARD)
+    yaw, pitch, roll = angles_from_rotation(NED_TO_ENU @ forward_ned @ _CAMERA_TO_FORWARD)
     return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
 
 
 def camera_frame_angles_deg(camera_ned: Array) -> tuple[float, float, float]:
     """Our yaw, pitch, roll in degrees of a camera-to-NED rotation whose z is the optical axis, x right, y down."""
-    yaw, pitch, roll = angles_from_rotation(_NED_TO_ENU @ camera_ned)
+    yaw, pitch, roll = angles_from_rotation(NED_TO_ENU @ camera_ned)
     return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
 
 

@@ -8,6 +8,9 @@ from orthoswarm.model.errors import OrthoSwarmError
 P = ParamSpec("P")
 T = TypeVar("T")
 
+MOST_TEXT_BYTES = 256 << 20
+"""Larger text files (tables of poses, lists of exposures, subtitles) are refused: they are read into memory."""
+
 
 class Unreadable(Exception):
     """A file cannot be read; the text is one sentence with the reason and what to do."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
@@ -22,7 +23,6 @@ from telemetry.videos.picture_poses import Pose, Poses
 from telemetry.videos.video_file import VideoScan, demux, open_video, parked, scan
 
 JPEG_QUALITY = 95
-_ZOOM_STEP = 0.03
 
 
 @dataclass(slots=True, kw_only=True)
@@ -315,7 +315,7 @@ class _LensKey:
         fov = None if sample is None else sample.fov_deg
         if fov is None:
             return self._base
-        if self._fov is None or abs(math.log(fov / self._fov)) > _ZOOM_STEP:
+        if self._fov is None or abs(math.log(fov / self._fov)) > active().ingest.zoom_step:
             self._fov = fov
         return f"{self._base} fov{self._fov:.1f}"
 

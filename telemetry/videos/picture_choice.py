@@ -6,15 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import MEAN_RADIUS_M
 from telemetry.samples.sample import Sample
-
-_HEIGHT_SHARE = 0.04
-"""Default spacing as a share of the height: overlaps stay above 95 %, which following points likes."""
-_DEFAULT_S = 0.5
-_EARLY, _LATE = 0.8, 1.2
-_MAX_CANDIDATES = 6
 
 
 @dataclass(slots=True, kw_only=True)
@@ -54,14 +49,15 @@ class Picker:
 
     def push(self, candidate: Candidate) -> Iterator[Candidate]:
         """Offer the next picture; yields the selected ones."""
+        config = active().ingest
         if self._last is None:
             self._last = candidate
             yield candidate
             return
         progress = self._progress(candidate, self._last)
-        if progress < _EARLY:
+        if progress < config.video_early:
             return
-        if progress <= _LATE and len(self._waiting) < _MAX_CANDIDATES:
+        if progress <= config.video_late and len(self._waiting) < config.video_candidates:
             self._waiting.append(candidate)
             return
         if not self._waiting:
@@ -87,15 +83,16 @@ class Picker:
 
     def _progress(self, new: Candidate, last: Candidate) -> float:
         """Distance of a picture from the last selected one, in units of the spacing."""
+        config = active().ingest
         seconds = abs(new.video_s - last.video_s)
         if self._every_s is not None and self._every_m is None:
             return seconds / max(self._every_s, 1e-6)
         metres = _distance_m(new.sample, last.sample)
         spacing = self._every_m
         if spacing is None and new.sample is not None and new.sample.height_m is not None:
-            spacing = _HEIGHT_SHARE * max(new.sample.height_m, 5.0)
+            spacing = config.video_height_share * max(new.sample.height_m, 5.0)
         if metres is None or spacing is None:
-            return seconds / (self._every_s or _DEFAULT_S)
+            return seconds / (self._every_s or config.video_every_s)
         by_time = seconds / self._every_s if self._every_s else 0.0
         return max(metres / max(spacing, 1e-6), by_time)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
@@ -19,8 +20,6 @@ from telemetry.samples.timeline import Timeline
 from telemetry.videos.video_file import VideoScan
 
 Array = NDArray[np.float64]
-
-_HELD_AT_ENDS_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,10 +270,11 @@ class Poses:
 
 def _held_timeline(samples: list[Sample]) -> Timeline:
     """A timeline extended at its ends by one usual interval (at most a second), as pictures lie between samples."""
+    config = active().ingest
     samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
     times = np.array([s.time_s for s in samples], dtype=np.float64)
-    usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S
-    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else config.held_at_ends_s
+    usual = min(max(usual, 1e-3), config.held_at_ends_s)
     before = replace(samples[0], time_s=float(times[0]) - usual)
     after = replace(samples[-1], time_s=float(times[-1]) + usual)
     return Timeline([before, *samples, after], max_gap_s=max(2.0, 4.0 * usual))

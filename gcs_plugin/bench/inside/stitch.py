@@ -1,6 +1,6 @@
 """Run in the environment of OpenCV 4: `Stitcher` in SCANS mode on all photos of a folder.
 
-Usage: stitch.py PHOTOS OUT THREADS. Writes OUT/picture.png and OUT/said.json with the number of pictures it joined.
+Usage: stitch.py PHOTOS OUT THREADS. Writes OUT/picture.png and OUT/outcome.json with the number of pictures it joined.
 """
 
 import json
@@ -27,7 +27,7 @@ def main() -> int:
         print(reasons.get(status, f"status {status}"), file=sys.stderr)
         return 1
     cv2.imwrite(str(out / "picture.png"), picture)
-    (out / "said.json").write_text(json.dumps({"used": len(stitcher.component())}))
+    (out / "outcome.json").write_text(json.dumps({"used": len(stitcher.component())}))
     return 0
 
 

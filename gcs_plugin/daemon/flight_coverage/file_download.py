@@ -8,9 +8,9 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import Final
 
+from gcs_plugin.daemon.store.picture_store import MOST_PICTURE_BYTES
 from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, file_crc32
 
-MOST_BYTES: Final = 96_000_000
 _MOST_FILES: Final = 100_000
 _DEPTH: Final = 2
 _RESET_AFTER: Final = 3
@@ -206,7 +206,7 @@ class FileRead(FtpJob):
                 self._refuse("it does not serve files" if answer.nak == Nak.UNKNOWN_COMMAND else "the file is gone")
             return
         size = int.from_bytes(answer.data[:4], "little")
-        if not 0 < size <= MOST_BYTES:
+        if not 0 < size <= MOST_PICTURE_BYTES:
             self._refuse(f"the file has {size} bytes")
             return
         self._session, self.busy = answer.session, 0

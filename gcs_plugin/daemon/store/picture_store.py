@@ -11,6 +11,8 @@ from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster import picture_file
 
+MOST_PICTURE_BYTES: Final = 96_000_000
+"""Larger files are refused, posted or read from a vehicle: twice the largest JPEG of a drone's camera (chosen)."""
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
 

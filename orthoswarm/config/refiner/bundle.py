@@ -61,7 +61,7 @@ class BundleConfig:
     map_floor_px: float = 0.058
     """Error that no residual shows, in pixels of the compared map (fitted as above)."""
     tied_covariance_share: float = 0.8
-    """Factor of the covariance where map ties hold a photo: corners are followed better than their sigma says (0.05 and
+    """Factor of the covariance where map ties determine a photo: corners are tracked better than their sigma (0.05 and
     not 0.35 px, with a drift between; fitted as above)."""
     scatter_least_ties: int = 40
     """With fewer ties the adjustment follows them, and their residuals are too small: their scatter is then at least

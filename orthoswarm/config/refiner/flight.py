@@ -183,7 +183,7 @@ class FlightConfig:
     held_lens_sigma: float = 0.003
     """Sigma of lens parameters found together (chosen; not measured)."""
 
-    # What pictures say of the records
+    # Findings: the records compared with the pictures
 
     flipped_yaw_deg: float = 150.0
     """A recorded yaw that differs by more is reported as turned by 180 degrees (chosen)."""
@@ -208,7 +208,7 @@ class FlightConfig:
     lag_m: float = 1.0
     """A lag of recorded positions that moves them by more is reported, metres (chosen)."""
     lag_least_speed_m_s: float = 0.3
-    """Slower photos say nothing of a lag, metres a second (chosen)."""
+    """A lag is not estimated from slower photos, metres a second (chosen)."""
     named_most: int = 3
     """Runs of photos, or vehicles, that a message names (chosen)."""
 

@@ -259,7 +259,7 @@ class RegistrationConfig:
 
     # Maps of far coarser pixels than the pictures, on which one shift of all vehicles is found
     coarse_map_gsd_m: float = 6.0
-    """Maps of larger pixels than this, metres, are not asked for tie points. On three sets (0.47 m a pixel) maps of 5 m
+    """On maps with larger pixels, metres, no tie points are searched. On three sets (0.47 m a pixel) maps of 5 m
     place pictures within 1.1 to 1.3 m by tie points, 1.1 to 1.7 m by one shift; of 10 m not at all by tie points ..."""
     coarse_map_pictures: float = 8.0
     """... unless they are smaller than so many of the pictures' pixels (chosen; not measured)."""

@@ -18,8 +18,8 @@ class StrategyConfig:
     full_lens_steps: int = 4
     """Steps at the last scale more where all parameters of a lens are solved (chosen; not measured)."""
     records_weighed_step: int = 3
-    """After this step, counted from 0, records are weighed by what the pictures say of them, and ground is fitted from
-    there on (chosen: the adjustment is near by then)."""
+    """After this step, counted from 0, records are weighted by their residuals, and the ground is fitted (chosen: the
+    adjustment has nearly converged by then)."""
     first_steps: int = 2
     """Steps, from the first, with the wide height prior of the next two fields (chosen) ..."""
     first_ground_sigma_m: float = 3.0
@@ -31,11 +31,11 @@ class StrategyConfig:
     ground_robust_c: float = 1.0
     """The robust scale in all later steps, squared sigmas (chosen; not measured)."""
     flow_pairs: int = 6
-    """So many pairs of pictures must have told the focal length by their flow before an adjustment is held against it
-    (chosen; not measured)."""
+    """Fewest pairs of pictures whose flow gives a focal length before an adjustment is compared with it (chosen; not
+    measured)."""
     runaway_share: float = 0.15
-    """A focal length that leaves what flow told by this share is another minimum and not believed, unless flow itself
-    is so unsure (next field; chosen)."""
+    """An adjustment whose focal length differs from that of the flow by this share has found another minimum and is
+    rejected, unless the flow itself is that uncertain (next field; chosen)."""
     runaway_sigmas: float = 5.0
     """... and by so many of its sigmas (chosen; not measured)."""
     solved_inliers: float = 0.7
@@ -43,10 +43,10 @@ class StrategyConfig:
     relief of 25 m ended elsewhere, with 0.00 to 0.40; the others have 0.93 to 0.98. Those four are right when matched
     in pairs."""
     narrowest_fov_deg: float = 33.0
-    """Horizontal fields of view, degrees, to which recorded heights are believed, a little wider than those that flow
-    is believed to show (chosen)."""
+    """Recorded heights are rejected if they lead to a horizontal field of view below this, degrees; a little below the
+    narrowest that is accepted from flow (chosen)."""
     widest_fov_deg: float = 137.0
-    """The same at the other end."""
+    """... or above this, degrees; a little above the widest that is accepted from flow (chosen)."""
 
     # Recorded heights that the pictures contradict
     rest_steps: int = 3
@@ -62,13 +62,13 @@ class StrategyConfig:
 
     # On the map
     map_fov_sigmas: float = 6.0
-    """A place on the map that moves the field of view by more sigmas than this is not believed (chosen; not
-    measured)."""
+    """A registration on the map that changes the field of view by more sigmas than this is rejected (chosen; not
+    measured) ..."""
     map_fov_deg: float = 4.0
     """... and by more than this, degrees (chosen; not measured)."""
     coherent_sigmas: float = 2.0
-    """Ties that agree on an offset of so many sigmas beside a picture show an error that the adjustment does not know
-    (chosen; not measured)."""
+    """Ties around a picture whose common offset exceeds so many sigmas show an error that the covariance does not
+    contain (chosen; not measured)."""
 
     # Neighbours
     neighbour_reach_heights: float = 1.5
@@ -83,7 +83,7 @@ class StrategyConfig:
     """Sigma of the focal length of followed pictures without a height, a share: relief and tilt tell it (15 flights:
     2.5 % rms)."""
     one_way_fov_sigma_deg: float = 5.0
-    """The same of photos on one straight way, degrees: tilt, height and lens stand for each other (11 such legs of a
+    """The same for photos on one straight line, degrees: tilt, height and lens cannot be separated (11 such legs of a
     suburb: 5.6 rms)."""
     decentred_share: float = 0.02
     """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share (measured:
@@ -110,8 +110,8 @@ class StrategyConfig:
     """More photos that must be matched in pairs wait for the refinement: they cost fifty times as much as those that
     can be followed."""
     held_drift_m: float = 3.0
-    """Sigma of a receiver's drift over one straight run, metres: tilt and drift stand for each other there. Without
-    this hold single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""
+    """Sigma of a receiver's drift over one straight run, metres: tilt and drift cannot be separated there. Without
+    this prior single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""
     held_drift_bend_m: float = 0.3
     """The same for the second difference of the drift's knots, metres (measured together)."""
     held_lag_s: float = 0.2

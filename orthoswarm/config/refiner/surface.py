@@ -242,7 +242,7 @@ class SurfaceConfig:
     """Differences from a model of this size are errors of the points' own surface, metres (chosen: such a surface errs
     by decimetres, most where points end)."""
     dem_noise_least_share: float = 0.25
-    """A model that seldom agrees is believed against differences of this share of `dem_noise_m` only (chosen)."""
+    """A model that seldom agrees is kept only against differences below this share of `dem_noise_m` (chosen)."""
     dem_noise_nodes: float = 2.0
     """Differences are averaged over a Gaussian of this sigma, nodes (chosen; not measured)."""
     dem_trusted_m: float = 0.15

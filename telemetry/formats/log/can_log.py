@@ -16,10 +16,10 @@ from telemetry.formats.log.dronecan_poses import DronecanPoses, NodePose
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
+from telemetry.samples.times import YEAR_2000_S
 
 SUFFIXES: Final = frozenset({".log", ".asc", ".blf", ".trc"})
 
-_EARLIEST_UTC_S: Final = 946_684_800.0
 _MOST_DAMAGE: Final = 1000
 _SILENT_S: Final = 2.0
 _UNSTATED: Final = float("inf")
@@ -71,7 +71,7 @@ def read_can_log(path: Path) -> FlightLog:
         raise NotALog("the CAN log holds no DroneCAN position or attitude (gnss.Fix2, ahrs.Solution, gimbal Status)")
     for bus, pose in reading.undated:
         pose.sample.time_s = bus.utc(pose.sample.time_s or 0.0)
-    poses = [(key, pose) for key, pose in reading.poses if (pose.sample.time_s or 0.0) > _EARLIEST_UTC_S]
+    poses = [(key, pose) for key, pose in reading.poses if (pose.sample.time_s or 0.0) > YEAR_2000_S]
     log = FlightLog(path=path, kind="DroneCAN", vehicle=path.stem)
     for kind in ("lat_deg", "flight_yaw_deg", "yaw_deg"):
         log.samples += _best([(key, pose) for key, pose in poses if getattr(pose.sample, kind) is not None])

@@ -17,10 +17,10 @@ import numpy as np
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
 from telemetry.formats.log.mavlink_poses import CameraEvent
 from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S
 
 _MARK = b"\xa3\x95"
 _FMT, _FMT_SIZE = 128, 89
-GPS_EPOCH_S, LEAP_S, WEEK_S = 315_964_800.0, 18.0, 604_800.0
 _CODES = {
     "a": "64s", "b": "b", "B": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d", "n": "4s", "N": "16s",
     "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "M": "B", "q": "q", "Q": "Q", "g": "e",
@@ -132,7 +132,7 @@ def _utc_minus_boot(rows: list[Row]) -> float | None:
     for row in rows:
         week, week_ms, boot_s = row.get("GWk", row.get("Week")), row.get("GMS", row.get("TimeMS")), _boot_s(row)
         if isinstance(week, int) and week > 1000 and week_ms is not None and boot_s is not None and _has_fix(row):
-            offsets.append(GPS_EPOCH_S + week * WEEK_S + week_ms * 1e-3 - LEAP_S - boot_s)
+            offsets.append(GPS_EPOCH_S + week * WEEK_S + week_ms * 1e-3 - GPS_MINUS_UTC_S - boot_s)
     # A fix is logged some time after its measurement, so the largest offsets are the best.
     return float(np.quantile(offsets, 0.9)) if offsets else None
 
@@ -213,6 +213,6 @@ def _event(row: Row, kind: str, clock: float | None) -> CameraEvent:
     boot_s = _boot_s(row)
     time_s = None if clock is None or boot_s is None else boot_s + clock
     if time_s is None and row.get("GPSWeek", 0) > 1000:
-        time_s = GPS_EPOCH_S + row["GPSWeek"] * WEEK_S + row["GPSTime"] * 1e-3 - LEAP_S
+        time_s = GPS_EPOCH_S + row["GPSWeek"] * WEEK_S + row["GPSTime"] * 1e-3 - GPS_MINUS_UTC_S
     number = row.get("Img", row.get("ImageNo"))
     return CameraEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)

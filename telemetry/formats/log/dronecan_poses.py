@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from telemetry.formats.log.mavlink_poses import euler_deg
 from telemetry.samples.rotations import camera_frame_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import GPS_MINUS_UTC_S, TAI_MINUS_UTC_S
 
 Array = NDArray[np.float64]
 
@@ -30,8 +31,6 @@ _MOST_FRAMES: Final = 64
 _LEAST_STEP_S: Final = 0.02
 _ATTITUDE_AGE_S: Final = 0.5
 _FIXES_FOR_CLOCK: Final = 50
-_TAI_MINUS_UTC_S: Final = 37.0
-_GPS_MINUS_UTC_S: Final = 18.0
 _RTK_FIXED_M, _RTK_FLOAT_M = 0.02, 0.3
 
 
@@ -222,7 +221,7 @@ def _gnss_utc_s(m: Any) -> float | None:
     if m.gnss_time_standard == m.GNSS_TIME_STANDARD_UTC:
         return float(seconds)
     if m.gnss_time_standard == m.GNSS_TIME_STANDARD_GPS:
-        return float(seconds - (leap - 9.0 if leap else _GPS_MINUS_UTC_S))
+        return float(seconds - (leap - 9.0 if leap else GPS_MINUS_UTC_S))
     if m.gnss_time_standard == m.GNSS_TIME_STANDARD_TAI:
-        return float(seconds - (leap + 10.0 if leap else _TAI_MINUS_UTC_S))
+        return float(seconds - (leap + 10.0 if leap else TAI_MINUS_UTC_S))
     return None

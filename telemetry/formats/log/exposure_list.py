@@ -10,13 +10,12 @@ DJI's documents for the Phantom 4 RTK.
 import re
 from pathlib import Path
 
-from telemetry.formats.log.dataflash import GPS_EPOCH_S, LEAP_S, WEEK_S
 from telemetry.formats.log.log_data import FlightLog, NotALog
 from telemetry.formats.log.mavlink_poses import CameraEvent
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, parse_time
+from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
-_MOST_BYTES = 256 << 20
 _NUMBER = r"\s*([+-]?\d+(?:\.\d+)?)"
 _MARK = re.compile(
     rf"^(\d+)\s+(\d+\.\d+)\s+\[(\d+)\].*?{_NUMBER},Lat\s+{_NUMBER},Lon\s+{_NUMBER},Ellh\s+{_NUMBER},{_NUMBER}",
@@ -32,7 +31,7 @@ def read_exposure_list(path: Path) -> FlightLog:
         OSError: it cannot be read. NotALog: it is not such a list.
     """
     with path.open("rb") as handle:
-        text = handle.read(_MOST_BYTES).decode("utf-8-sig", "replace")
+        text = handle.read(MOST_TEXT_BYTES).decode("utf-8-sig", "replace")
     is_marks = path.suffix.lower() == ".mrk"
     log = FlightLog(path=path, kind="DJI MRK" if is_marks else "RTKLIB events", vehicle=path.stem)
     log.events = _marks(text) if is_marks else _positions(text)
@@ -45,7 +44,7 @@ def _marks(text: str) -> list[CameraEvent]:
     events = []
     for match in _MARK.finditer(text):
         number, seconds, week, lat, lon, height, sigma_north, sigma_east = (float(group) for group in match.groups())
-        time_s = GPS_EPOCH_S + week * WEEK_S + seconds - LEAP_S
+        time_s = GPS_EPOCH_S + week * WEEK_S + seconds - GPS_MINUS_UTC_S
         sigma = max(sigma_north, sigma_east) or None
         events += _event(time_s, int(number), Sample(lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma))
     return events
@@ -68,7 +67,7 @@ def _positions(text: str) -> list[CameraEvent]:
             continue
         sigma = max(north, east) if quality in (_FIXED, _FLOAT) and max(north, east) > 0.0 else None
         sample = Sample(lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma)
-        events += _event(exposed[0] - (0.0 if is_utc else LEAP_S), len(events) + 1, sample)
+        events += _event(exposed[0] - (0.0 if is_utc else GPS_MINUS_UTC_S), len(events) + 1, sample)
     return events
 
 

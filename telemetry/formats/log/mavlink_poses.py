@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked, is_position
+from telemetry.samples.times import YEAR_2000_S
 
 Array = NDArray[np.float64]
 
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5
-_EARLIEST_UTC_S = 946_684_800.0  # 2000-01-01: clocks before that were never set
 _DOWNWARD = 25
 _REBOOT_S = 10.0
 _MOST_H_ACC_MM = 1_000_000
@@ -102,7 +102,7 @@ class MavlinkPoses:
     def _system_time(self, m: Any) -> None:
         boot_s = self._boot(m.time_boot_ms)
         utc_s = m.time_unix_usec * 1e-6
-        if utc_s > _EARLIEST_UTC_S:
+        if utc_s > YEAR_2000_S:
             self.utc_minus_boot_s = utc_s - boot_s
 
     def _position(self, m: Any) -> Sample | None:
@@ -199,7 +199,7 @@ class MavlinkPoses:
 
     def _event(self, seconds: float, number: int, sample: Sample, kind: str) -> CameraEvent:
         """An event whose time is UTC, or time since boot where the value is too small for UTC."""
-        if seconds > _EARLIEST_UTC_S:
+        if seconds > YEAR_2000_S:
             boot_s = None if self.utc_minus_boot_s is None else seconds - self.utc_minus_boot_s
             time_s: float | None = seconds
         else:

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
-
-MOST_BYTES = 256 << 20
+from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 
 @dataclass(slots=True, kw_only=True)
@@ -54,8 +53,8 @@ def read_text(path: Path) -> str:
         InputError: it is too large, or cannot be read.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path.name} is larger than {MOST_BYTES >> 20} MB; split it")
+        if path.stat().st_size > MOST_TEXT_BYTES:
+            raise InputError(f"{path.name} is larger than {MOST_TEXT_BYTES >> 20} MB; split it")
         return path.read_bytes().decode("utf-8-sig", "replace").replace("\0", "")
     except OSError as error:
         raise InputError(f"{path.name} cannot be read ({error.strerror}); check the file") from None

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import YEAR_2000_S, parse_time
 
-_EPOCH_2000_S = 946_684_800.0
 _MOST_ENTRIES = 4096
 _MOST_DEPTH = 4
 _GPS9 = struct.Struct(">7iHH")
@@ -107,7 +106,7 @@ def _gps9(entry: _Entry, scale: list[float]) -> list[Sample]:
     found = []
     for i in range(len(entry.value) // _GPS9.size):
         lat, lon, altitude, _, _, days, seconds, _, fix = _GPS9.unpack_from(entry.value, _GPS9.size * i)
-        time_s = _EPOCH_2000_S + days / scale[5] * 86_400.0 + seconds / scale[6]
+        time_s = YEAR_2000_S + days / scale[5] * 86_400.0 + seconds / scale[6]
         sample = Sample(time_s=time_s, lat_deg=lat / scale[0], lon_deg=lon / scale[1], altitude_m=altitude / scale[2])
         found.append((checked(sample) if fix >= 2 else None) or Sample())
     return found

@@ -23,8 +23,8 @@ from pathlib import Path
 from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import parse_time
+from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
-_MAX_BYTES = 256 << 20
 _MAX_BLOCK = 4096
 
 _CUE = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})\s*-->\s*(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})")
@@ -78,7 +78,7 @@ def read_srt(path: Path) -> Subtitles:
         OSError: the file cannot be read.
     """
     with path.open("rb") as handle:
-        data = handle.read(_MAX_BYTES)
+        data = handle.read(MOST_TEXT_BYTES)
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     return parse_srt(data.decode(encoding, "replace"))
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-CERTAIN = 1.0 - 1e-4
-"""Probability from which on a pairing counts as decided: the model's odds of losses are estimates."""
-_LEAST_PROBABILITY = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +42,7 @@ class SequenceMatch:
         nodes: list[tuple[int, int, float, int]] = []  # photo, event, probability, node before
         for i, row in enumerate(self.probability):
             reached = []
-            for column in np.flatnonzero(row > _LEAST_PROBABILITY).tolist():
+            for column in np.flatnonzero(row > active().pairing.least_probability).tolist():
                 event = int(self.first[i]) + column
                 value, before = _prefix_maximum(tree, event)
                 nodes.append((i, event, float(row[column]), before))
@@ -60,7 +58,7 @@ class SequenceMatch:
 
     def alternatives(self, photo: int) -> list[int]:
         """Events that a photo may belong to."""
-        columns = np.flatnonzero(self.probability[photo] > _LEAST_PROBABILITY)
+        columns = np.flatnonzero(self.probability[photo] > active().pairing.least_probability)
         return [int(self.events[self.first[photo] + column]) for column in columns]
 
 

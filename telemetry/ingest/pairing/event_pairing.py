@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.pairing.alignment import CERTAIN
+from orthoswarm.config import active
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.sequence_match import match_sequences
 
@@ -109,12 +109,12 @@ def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -
     if found is None:
         return Pairing()
     pairs = found.pairs()
-    certain = sum(probability >= CERTAIN for _, _, probability in pairs)
+    certain = sum(probability >= active().pairing.certain for _, _, probability in pairs)
     result = Pairing(offset_s=found.offset_s, ambiguous=certain < 0.5 * len(pairs), by_pictures=found.by_pictures)
     for i, j, probability in pairs:
         photo, event = int(order_p[i]), int(order_e[j])
         result.pairs.append((photo, event))
-        if probability < CERTAIN or result.ambiguous:
+        if probability < active().pairing.certain or result.ambiguous:
             result.doubtful[photo] = [int(order_e[k]) for k in found.alternatives(i)]
     if pairs:
         own, theirs = photos[order_p][[i for i, _, _ in pairs]], events[order_e][[j for _, j, _ in pairs]]

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.pairing.motion_chains import PictureMotion
@@ -15,8 +16,6 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
 Array = NDArray[np.float64]
-
-_MOST_TILT_DEG = 60.0
 
 
 def picture_motion(
@@ -41,6 +40,6 @@ def _way_m(poses: Sequence[Sample]) -> Array:
         if pose.height_m is None or pose.pitch_deg is None or pose.yaw_deg is None:
             continue
         tilt = pose.pitch_deg + 90.0
-        if abs(tilt) < _MOST_TILT_DEG:
+        if abs(tilt) < active().pairing.most_tilt_deg:
             way[i] += pose.height_m * np.tan(np.radians(tilt)) * np.cos(np.radians(pose.yaw_deg - course[i]))
     return way

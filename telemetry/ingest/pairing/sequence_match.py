@@ -12,11 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.pairing.alignment import CERTAIN, SequenceMatch
+from orthoswarm.config import active
+from telemetry.ingest.pairing.alignment import SequenceMatch
 from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
 from telemetry.ingest.pairing.sequence_model import (
-    FIRST_JITTER_S,
-    MOST_DRIFT,
     ClockGrid,
     SequenceModel,
     clock_grid,
@@ -28,26 +27,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Clock = tuple[float, float]
 """Offset in seconds and drift."""
-
-_SAME_EXPOSURE_S = 0.12
-_NEGLIGIBLE = 16.0
-"""Natural logarithm of the odds beyond which a hypothesis is left out."""
-_MARGIN = 0.9
-"""Of the shortest interval seen: none is expected below."""
-_COARSE_S = 0.5
-"""Resolution of a clock from which on pictures decide better than times."""
-_LEAST_AGREEMENT = 0.9
-_LEAST_MATCHED = 0.6
-"""Share of photos or events with a partner; a clock that leaves more alone is not the right one."""
-_CANDIDATES = 24
-_MOST_WINDOWS = 64
-_WINDOW_DRIFT_S = 0.16
-"""Half width in drift of a window of clocks, as the shift of the first and last exposure."""
-_JITTERS_S = (0.02, 0.03, 0.045, 0.07, 0.1, 0.16)
-_MISSING = (0.03, 0.06, 0.12, 0.2, 0.35)
-"""Odds that are tried; not less than 0.03, since a flight without any loss does not show that there can be none."""
-_MOST_BINS = 1 << 19
-_MOST_DRIFTS = 81
 
 
 def match_sequences(photos: Array, events: Array, motion: PictureMotion | None = None) -> SequenceMatch | None:
@@ -74,7 +53,7 @@ def match_sequences(photos: Array, events: Array, motion: PictureMotion | None =
     if not windows:
         return None
     result = _alignment(model, windows, single)
-    if motion is not None and resolution >= _COARSE_S and (~_decided(result)).any():
+    if motion is not None and resolution >= active().pairing.pictures_from_s and (~_decided(result)).any():
         chained = _chained(model, result, motion)
         again = None if chained is None else _alignment(chained, windows, single)
         result = again if again is not None and _decides_more(again, result) else result
@@ -104,15 +83,17 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
 
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
     """(N,) whether a photo's event is certain, or that it has none."""
+    config = active().pairing
     likeliest = match.probability.max(axis=1, initial=0.0)
-    return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
+    return np.asarray((likeliest >= config.certain) | (match.probability.sum(axis=1) <= 1.0 - config.certain))
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
     """Whether more photos are decided now and hardly fewer have an event; else log and pictures disagree."""
+    config = active().pairing
     more = _decided(now).sum() > _decided(before).sum()
-    least = _LEAST_MATCHED * min(len(now.probability), len(now.events))
-    return bool(more and now.probability.sum() > max(_LEAST_AGREEMENT * before.probability.sum(), least))
+    least = config.least_matched * min(len(now.probability), len(now.events))
+    return bool(more and now.probability.sum() > max(config.least_agreement * before.probability.sum(), least))
 
 
 def _chained(model: SequenceModel, match: SequenceMatch, motion: PictureMotion) -> SequenceModel | None:
@@ -141,16 +122,17 @@ def _single_events(events: Array) -> Indices:
     """Indices of events without repetitions."""
     steps = np.diff(events)
     usual = float(np.median(steps[steps > 0.01])) if (steps > 0.01).any() else 1.0
-    return np.flatnonzero(np.concatenate([[True], steps > min(_SAME_EXPOSURE_S, 0.35 * usual)]))
+    return np.flatnonzero(np.concatenate([[True], steps > min(active().pairing.same_exposure_s, 0.35 * usual)]))
 
 
 def _least_interval(photos: Array, events: Array, resolution: float) -> float:
     """Time between exposures in seconds that hardly any two of them go below."""
+    config = active().pairing
     least = float(np.quantile(np.diff(events), 0.02))
     if resolution < 0.05:
-        return _MARGIN * min(least, float(np.quantile(np.diff(photos), 0.02)))
+        return config.interval_margin * min(least, float(np.quantile(np.diff(photos), 0.02)))
     together = int(np.unique(np.floor(photos / resolution), return_counts=True)[1].max())
-    return _MARGIN * (min(least, resolution / (together - 1)) if together > 1 else least)
+    return config.interval_margin * (min(least, resolution / (together - 1)) if together > 1 else least)
 
 
 def _resolution(times: Array) -> float:
@@ -163,13 +145,14 @@ def _resolution(times: Array) -> float:
 
 def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
     """Offsets and drifts under which most photos fall on events, the best first."""
+    config = active().pairing
     p, e = model.p, model.e
-    span = float(np.ptp(p) + np.ptp(e)) * (1.0 + MOST_DRIFT) + 4.0
-    bin_s = max(0.25 if model.resolution_s >= 0.5 else 0.1, span / _MOST_BINS)
+    span = float(np.ptp(p) + np.ptp(e)) * (1.0 + config.most_drift) + 4.0
+    bin_s = max(0.25 if model.resolution_s >= 0.5 else 0.1, span / config.most_bins)
     size = 1 << int(np.ceil(np.log2(span / bin_s + 16)))
     half = max(0.5 * float(np.ptp(e)), 1e-3)
-    count = min(int(np.ceil(MOST_DRIFT * half / bin_s)), _MOST_DRIFTS // 2)
-    drifts = np.linspace(-MOST_DRIFT, MOST_DRIFT, 2 * count + 1) if count else np.zeros(1)
+    count = min(int(np.ceil(config.most_drift * half / bin_s)), config.most_drifts // 2)
+    drifts = np.linspace(-config.most_drift, config.most_drift, 2 * count + 1) if count else np.zeros(1)
     photos = np.fft.rfft(_train(p - p[0], bin_s, size, model.resolution_s))
     best, drift_at = np.full(size, -np.inf), np.zeros(size)
     for drift in drifts:
@@ -179,7 +162,7 @@ def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
         better = together > best
         best[better], drift_at[better] = together[better], drift
     apart = max(1, round(_reach_s(model) / bin_s))
-    for _ in range(_CANDIDATES):
+    for _ in range(config.clock_candidates):
         lag = int(np.argmax(best))
         if not np.isfinite(best[lag]) or best[lag] < 0.25:
             return
@@ -208,6 +191,7 @@ def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
 
 def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     """The model's parameters for the best clock, and centres of windows that hold all clocks still possible."""
+    config = active().pairing
     bin_s = 0.25 if model.resolution_s >= 0.5 else 0.1
     grids = [clock_grid(model, *peak, _reach_s(model), bin_s) for peak in _correlation_peaks(model)]
     if not grids:
@@ -218,12 +202,12 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     if not np.isfinite(evidence[best]):
         return model, []
     # The first parameters are guesses: exclude only what they make impossible.
-    possible = evidence > evidence[best] - 3.0 * _NEGLIGIBLE
+    possible = evidence > evidence[best] - 3.0 * config.negligible_log_odds
     order = np.argsort(-evidence, kind="stable")
     clocks = clocks[:, order[possible[order]]]
     model = _fitted(model, *clocks[:, 0].tolist()).regular()
     windows: list[Clock] = []
-    while clocks.shape[1] and len(windows) < _MOST_WINDOWS:
+    while clocks.shape[1] and len(windows) < config.most_windows:
         windows.append((float(clocks[0, 0]), float(clocks[1, 0])))
         clocks = clocks[:, ~_inside(model, windows[-1], clocks[0], clocks[1], share=0.75)]
     return model, windows
@@ -231,38 +215,42 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
 
 def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
     """A fine grid of clocks around one."""
-    return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
+    config = active().pairing
+    return clock_grid(model, *centre, 2.0 * config.first_jitter_s + 0.3 * _reach_s(model), config.window_drift_s)
 
 
 def _inside(
     model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0
 ) -> NDArray[np.bool_]:
     """Which clocks lie in a share of the window around one."""
+    config = active().pairing
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
-    reach = share * (2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model))
+    reach = share * (2.0 * config.first_jitter_s + 0.3 * _reach_s(model))
     apart = half * np.abs(drift - centre[1])
-    return np.asarray((np.abs(offset - centre[0]) <= reach) & (apart <= share * _WINDOW_DRIFT_S))
+    return np.asarray((np.abs(offset - centre[0]) <= reach) & (apart <= share * config.window_drift_s))
 
 
 def _fitted(model: SequenceModel, offset: float, drift: float) -> SequenceModel:
     """Jitter and shares of missing exposures with the most evidence."""
+    config = active().pairing
     trials = []
-    for jitter in _JITTERS_S:
+    for jitter in config.jitters_s:
         trial = replace(model, jitter_s=jitter)
-        grid = clock_grid(trial, offset, drift, 2.0 * FIRST_JITTER_S, 2.0 * FIRST_JITTER_S)
-        trials += [(replace(trial, no_event=odds, no_photo=odds), grid) for odds in _MISSING[::2]]
+        grid = clock_grid(trial, offset, drift, 2.0 * config.first_jitter_s, 2.0 * config.first_jitter_s)
+        trials += [(replace(trial, no_event=odds, no_photo=odds), grid) for odds in config.missing_odds[::2]]
     return _with_odds(*max(trials, key=lambda trial: _normalised(*trial)))
 
 
 def _with_odds(model: SequenceModel, grid: ClockGrid) -> SequenceModel:
     """The odds of missing events and missing photos with the most evidence, one after the other."""
+    config = active().pairing
 
     def best(trials: Iterable[SequenceModel]) -> SequenceModel:
         return max(trials, key=lambda trial: _normalised(trial, grid))
 
-    model = best(replace(model, no_event=odds) for odds in _MISSING)
-    model = best(replace(model, no_photo=odds) for odds in _MISSING)
-    return best(replace(model, no_event=odds) for odds in _MISSING)
+    model = best(replace(model, no_event=odds) for odds in config.missing_odds)
+    model = best(replace(model, no_photo=odds) for odds in config.missing_odds)
+    return best(replace(model, no_event=odds) for odds in config.missing_odds)
 
 
 def _normalised(model: SequenceModel, grid: ClockGrid) -> float:
@@ -286,7 +274,7 @@ def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices,
     total = np.logaddexp.reduce(np.concatenate([evidence for _, evidence in scored]))
     parts: list[tuple[Indices, Array]] = []
     for grid, evidence in scored:
-        chosen = np.flatnonzero(evidence > most - _NEGLIGIBLE)
+        chosen = np.flatnonzero(evidence > most - active().pairing.negligible_log_odds)
         if len(chosen):
             some = replace(grid, offset=grid.offset[chosen], drift=grid.drift[chosen])
             parts.append((some.band(model)[0], posterior(model, some, float(total))))

@@ -8,24 +8,18 @@ interval: a photo can be without event only where its time leaves room between t
 an end weigh less than those missing in between: logs begin before the first photo.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from orthoswarm.config import active
 from orthoswarm.model.robust import mad_sigma
 from telemetry.ingest.pairing.motion_chains import Chains
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-MOST_DRIFT = 1.2e-3
-"""Seconds a second: quartz clocks of cameras stay below 1e-4, a tenfold margin for poor ones."""
-FIRST_JITTER_S = 0.08
-_MISSING_AT_END = 0.5
-_FALSE_TIME = 1e-5
-"""Probability of an exposure that is closer to another than the camera's least interval."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +40,7 @@ class SequenceModel:
     resolution_s: float
     interval_s: float
     least_s: float
-    jitter_s: float = FIRST_JITTER_S
+    jitter_s: float = field(default_factory=lambda: active().pairing.first_jitter_s)
     no_event: float = 0.1
     no_photo: float = 0.1
     chains: Chains | None = None
@@ -86,7 +80,7 @@ class SequenceModel:
         begins = np.concatenate([np.zeros((len(offset), 1)), np.clip(places + least, 0.0, 1.0)], axis=1)
         ends = np.concatenate([np.clip(places - least, 0.0, 1.0), np.ones((len(offset), 1))], axis=1)
         room = np.maximum(ends - begins, 0.0).sum(axis=1)
-        room = np.maximum(room, _FALSE_TIME)
+        room = np.maximum(room, active().pairing.false_time)
         if self.chains is None:
             return np.asarray(room)
         return np.asarray(np.minimum(room[:, None], self.chains.alone(i, offset, drift)).ravel())
@@ -128,12 +122,13 @@ class ClockGrid:
 
 def clock_grid(model: SequenceModel, offset: float, drift: float, reach_s: float, drift_reach_s: float) -> ClockGrid:
     """A grid as fine as the jitter: offsets within reach_s, drifts that move the ends by up to drift_reach_s."""
+    config = active().pairing
     step = 0.8 * max(model.jitter_s, 0.04 * model.resolution_s)
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
     offsets = offset + step * np.arange(-np.ceil(reach_s / step), np.ceil(reach_s / step) + 1)
     count = np.ceil(drift_reach_s / (2.0 * step))
     drifts = drift + 2.0 * step / half * np.arange(-count, count + 1)
-    drifts = np.unique(np.clip(drifts, -MOST_DRIFT, MOST_DRIFT))
+    drifts = np.unique(np.clip(drifts, -config.most_drift, config.most_drift))
     both = np.meshgrid(offsets, drifts, indexing="ij")
     return ClockGrid(both[0].ravel(), both[1].ravel(), (offset, drift), reach_s + drift_reach_s + 2.0 * step)
 
@@ -163,7 +158,7 @@ def forward(model: SequenceModel, grid: ClockGrid, *, backward: bool = False, ke
     """
     first, width = grid.band(model)
     count, total, clocks = len(model.p), len(model.e), len(grid.offset) * model.hypotheses
-    s, log_t = model.no_photo, float(np.log(_MISSING_AT_END))
+    s, log_t = model.no_photo, float(np.log(active().pairing.missing_at_end))
     columns = np.arange(width + 1)
     decay = np.tril(s ** np.maximum(columns[1:, None] - columns[None, 1:], 0).astype(np.float64)).T
     sums, scale = np.zeros((clocks, width + 1)), np.zeros(clocks)

@@ -127,7 +127,7 @@ def _compare(whole: bytes) -> int:
 
 
 def test_real_st0601_values_agree_with_stanag4609(real_data):
-    body = _klv_of((real_data("kwiver_klv") / "h264_klv.ts").read_bytes())
+    body = klv_of((real_data("kwiver_klv") / "h264_klv.ts").read_bytes())
     assert sum(p.sample is not None for p in klv.packets(body)) == 30
     items = _items(body)
     kept = {tag: items[tag] for tag in (2, *NAMES, 65) if tag in items}
@@ -144,7 +144,7 @@ def test_any_st0601_values_agree_with_stanag4609(raw):
     _compare(local_set({**items, 65: b"\x11"}))
 
 
-def _klv_of(transport: bytes) -> bytes:
+def klv_of(transport: bytes) -> bytes:
     import io
 
     import av
@@ -167,7 +167,7 @@ def test_universal_sets_of_real_aircraft(real_data):
 
     from telemetry.samples.course import local_metres
 
-    found = list(klv.packets(_klv_of((real_data("kwiver_klv") / "aphill_short.ts").read_bytes())))
+    found = list(klv.packets(klv_of((real_data("kwiver_klv") / "aphill_short.ts").read_bytes())))
     assert len(found) == 48
     assert {p.kind for p in found} == {"EG 0104"}
     for packet in found:

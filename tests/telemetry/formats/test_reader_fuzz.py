@@ -61,10 +61,10 @@ def parse_sei(data: bytes) -> None:
 
 
 def klv_seeds(real_data) -> list[bytes]:
-    from tests.telemetry.formats.test_klv import NADIR, _klv_of, local_set
+    from tests.telemetry.formats.test_klv import NADIR, klv_of, local_set
 
     folder = real_data("kwiver_klv")
-    streams = [_klv_of((folder / name).read_bytes()) for name in ("aphill_short.ts", "h264_klv.ts")]
+    streams = [klv_of((folder / name).read_bytes()) for name in ("aphill_short.ts", "h264_klv.ts")]
     return [local_set(NADIR), streams[0][:554], streams[1][:2422]]
 
 
