@@ -109,7 +109,7 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
                 Layer(frames=fine[0], terrain=fine_ground, canvas=second, gains=state.gains, seams=_seams(run, state)),
             ]
             drawn = partial(run.progress, "drawing orthoimage")
-            stats = render_layers(layers, read=state.read_rgb(), run=run.workers.map, progress=drawn)
+            stats = render_layers(layers, read=state.read_rgb(), run=run.drawers.map, progress=drawn)
             _write(run, first, COARSE)
         _write(run, second, ORTHOIMAGE)
         _write_seamlines(run, second, fine[0])
@@ -155,7 +155,7 @@ def draw(
     with _canvas(run, name, placed, terrain, state) as canvas:
         if realtime:
             stats = mosaic(
-                placed, canvas, previews=state.previews, read=state.read_rgb(), run=run.workers.map, progress=drawn
+                placed, canvas, previews=state.previews, read=state.read_rgb(), run=run.drawers.map, progress=drawn
             )
         else:
             seams = _seams(run, state) if name == ORTHOIMAGE else None
@@ -166,7 +166,7 @@ def draw(
                 gains=state.gains,
                 seams=seams,
                 read=state.read_rgb(),
-                run=run.workers.map,
+                run=run.drawers.map,
                 progress=drawn,
             )
         _write(run, canvas, name)
@@ -197,7 +197,7 @@ def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: 
 def _write(run: RunContext, canvas: Canvas, name: str) -> None:
     """Write a canvas as a COG."""
     written = partial(run.progress, f"writing {name}")
-    write_cog(canvas, run.out / name, window=drawn_window(canvas), progress=written, threads=run.workers.count)
+    write_cog(canvas, run.out / name, window=drawn_window(canvas), progress=written, threads=run.drawers.count)
 
 
 def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFrame]) -> None:

@@ -11,6 +11,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Refinement
 from orthoswarm.mosaic.extent import from_takeoff, ground_level, solved_level
 from orthoswarm.report.page import write_page
+from orthoswarm.stores.addresses import address_of
 
 
 def write_products(
@@ -90,7 +91,7 @@ def _report(
         "gsd_m": state.gsd_m,
         "area_ha": state.drawn[0] / 1e4,
         "covered_share": state.drawn[1],
-        "basemap": str(run.options.basemap) if state.basemap else None,
+        "basemap": address_of(run.options.basemap) if run.options.basemap and state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
         "control": None if state.control is None else state.control.document(),
         "until": run.options.until,

@@ -92,12 +92,14 @@ class RunContext:
     Attributes:
         out: output folder; space: its lock and results of an interrupted run.
         options: see Options. workers: run the tasks. progress: called during long work. clock: times by stage.
+        drawers: run the tasks that write into the output folder; the same workers where these see it.
     """
 
     out: Path
     space: Workspace
     options: Options
     workers: Workers
+    drawers: Workers
     progress: Progress
     clock: Clock
 

@@ -28,6 +28,7 @@ from orthoswarm.config.refiner.registration import RegistrationConfig
 from orthoswarm.config.refiner.strategy import StrategyConfig
 from orthoswarm.config.refiner.surface import SurfaceConfig
 from orthoswarm.config.stereo import StereoConfig
+from orthoswarm.config.stores import StoresConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -60,6 +61,7 @@ class Config:
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
+    stores: StoresConfig = field(default_factory=StoresConfig)
 
 
 _DEFAULT = Config()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
 from orthoswarm.config import active
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import reduced
@@ -330,6 +330,8 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
     for path, shots in task.pictures:
         try:
             picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
+        except RunInterruptedError:
+            raise
         except OrthoSwarmError as error:
             results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
             continue

@@ -141,12 +141,13 @@ def _cameras(kind: str, args: argparse.Namespace, dest: Path, tell: Tell, notes:
     from orthoswarm.export.opensfm_folder import write_opensfm
     from orthoswarm.export.product_files import read_frames
     from orthoswarm.model.errors import InputError
+    from orthoswarm.stores.addresses import path_of
 
     lines = args.map / "frames.jsonl"
     if not lines.exists():
         raise InputError(f"{args.map} holds no frames.jsonl; make the map with `orthoswarm mosaic` first")
     report = json.loads((args.map / "report.json").read_text(encoding="utf-8"))
-    root = args.images or (Path(report["root"]) if report.get("root") else None)
+    root = args.images or (path_of(report["root"]) if report.get("root") else None)
 
     def find(row: Mapping[str, Any]) -> Path | None:
         path = root / row["image"] if root else None
