@@ -15,6 +15,7 @@ from orthoswarm.batch.run_state import (
     ORTHOIMAGE,
     PRODUCTS,
     REALTIME,
+    WRITTEN,
     Load,
     Options,
     Progress,
@@ -30,6 +31,7 @@ from orthoswarm.config import override
 from orthoswarm.control.control_observations import check_control
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
 from orthoswarm.export.atomic_file import disk_error
+from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -44,7 +46,7 @@ from orthoswarm.raster.height_model import HeightModel, check_dem
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
-__all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "Load", "Options", "Progress", "run"]
+__all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "WRITTEN", "Load", "Options", "Progress", "run"]
 
 
 def run(
@@ -179,7 +181,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
         state.previews = PreviewFile.create(run.space.file("previews"), images)
         state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
     known = run.space.recall("realtime")
-    if known is not None and (run.out / REALTIME).exists():
+    if known is not None and product_file(run.out, REALTIME) is not None:
         stats, stage = known
         run.clock.stages.append(stage)
     else:

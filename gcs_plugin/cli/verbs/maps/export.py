@@ -88,12 +88,13 @@ Tell = Callable[[int, int], None]
 
 def _layer(args: argparse.Namespace) -> Path:
     """The picture to export."""
+    from orthoswarm.export.catalog.tiled_raster import product_file
     from orthoswarm.model.errors import InputError
 
     names = [args.layer] if args.layer else ["orthoimage", "coarse", "realtime"]
     for name in names:
-        path = Path(args.map / f"{name}.tif")
-        if path.exists():
+        path = product_file(args.map, f"{name}.tif")
+        if path is not None:
             return path
     raise InputError(f"{args.map} holds no {' or '.join(names)}.tif; make the map with `orthoswarm mosaic` first")
 

@@ -67,6 +67,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--blend", choices=("none", "seam"), default="seam", help="mix the pictures over a few pixels at seams, or not")
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
+    add(
+        "--tiles", choices=("auto", "yes", "no"), default="auto",
+        help="write rasters in tiles with a STAC collection (default: those of more than 4 billion pixels)",
+    )  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core, one for few photos)")
     add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
@@ -116,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
         checkpoints=args.checkpoints,
         pixel_scale=args.pixel_scale,
         covariance=args.covariance,
+        tiles=args.tiles,
         config=read_overrides(args.config) if args.config is not None else {},
     )
 
@@ -149,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
         with ProgressBars() as progress:
             report = pipeline.run(load, out, options, pool, progress, drawers=drawers)
             if published is not None:
-                published.publish(pipeline.PRODUCTS, progress)
+                published.publish(pipeline.WRITTEN, progress)
     finally:
         for each in (pool, drawers):
             if each is not None:
