@@ -86,7 +86,7 @@ def test_the_collection_has_an_item_for_each_tile_and_vehicle(maps):
 
 
 def test_pystac_reads_and_validates_the_collection(maps):
-    pystac = pytest.importorskip("pystac", reason="needs the package pystac")
+    pystac = pytest.importorskip("pystac", reason="needs the package pystac-core")
     collection = pystac.Collection.from_file(str(maps / "tiled" / "tiles" / "collection.json"))
     items = list(collection.get_items())
     assert len(items) == len(documents(maps / "tiled")) - 1 and collection.get_root() is collection

@@ -6,7 +6,8 @@ import re
 import pytest
 
 pytest.importorskip("s3fs", reason="needs the extra 'cloud'")
-pytest.importorskip("moto", reason="needs the S3 server of the package moto[server]")
+pytest.importorskip("moto", reason="needs the S3 server of moto[s3] with flask and flask-cors")
+pytest.importorskip("flask_cors", reason="needs the S3 server of moto[s3] with flask and flask-cors")
 pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
 from gcs_plugin.cli.main import main

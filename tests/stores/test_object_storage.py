@@ -8,7 +8,8 @@ import sys
 import pytest
 
 pytest.importorskip("s3fs", reason="needs the extra 'cloud'")
-pytest.importorskip("moto", reason="needs the S3 server of the package moto[server]")
+pytest.importorskip("moto", reason="needs the S3 server of moto[s3] with flask and flask-cors")
+pytest.importorskip("flask_cors", reason="needs the S3 server of moto[s3] with flask and flask-cors")
 
 from gcs_plugin.cli.main import main
 from orthoswarm.config import active
