@@ -96,7 +96,7 @@ def started(stack: ExitStack, folder: Path, count: int, network: DelayedNetwork,
     for n in range(count):
         own = free_port()
         contact = f"tcp://127.0.0.1:{network.forward(own)}"
-        place = ["--host", "127.0.0.1", "--worker-port", str(own), "--contact-address", contact]
+        place = ["--listen-address", f"tcp://127.0.0.1:{own}", "--contact-address", contact]
         run(
             stack,
             [*common, "worker", address, *place, "--nthreads", "1", "--no-nanny", "--no-dashboard"],

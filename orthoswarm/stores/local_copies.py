@@ -8,12 +8,14 @@ import contextlib
 import os
 import threading
 import time
+from collections.abc import Iterable
 from hashlib import blake2b
 from pathlib import Path
 
 from orthoswarm.config import active
 from orthoswarm.model.errors import StorageError
 from orthoswarm.stores.addresses import address_of, is_stored
+from orthoswarm.stores.ahead import Ahead
 from orthoswarm.stores.listing import known, look_up
 from orthoswarm.stores.requests import StoreRequestError, request
 
@@ -39,6 +41,19 @@ def local_file(path: Path) -> Path:
     """
     if not is_stored(path):
         return path
+    _ahead.wait(path)
+    return _copied(path)
+
+
+def copy_ahead(paths: Iterable[Path]) -> None:
+    """Begin to copy those of these files that lie in stores: they will be read soon, in this order."""
+    stored = [path for path in paths if is_stored(path)]
+    if stored:
+        _ahead.announce(stored, active().stores.connections)
+
+
+def _copied(path: Path) -> Path:
+    """The local copy of a file in a store, made if there is none or an old one."""
     copy = _place(path)
     now = time.time()
     with contextlib.suppress(FileNotFoundError):
@@ -49,6 +64,9 @@ def local_file(path: Path) -> Path:
             return copy
     _fetch(path, copy)
     return copy
+
+
+_ahead = Ahead(_copied)
 
 
 def content(path: Path) -> bytes:

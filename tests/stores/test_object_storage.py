@@ -181,13 +181,15 @@ def test_an_upload_that_fails_goes_on_and_the_report_comes_last(bucket, store, t
 
 def test_products_of_an_earlier_run_are_removed_and_other_files_stay(bucket, tmp_path):
     address = path_of(bucket()) / "map"
-    for names in (("a.tif", "b.tif", "notes.txt", "report.json"), ("a.tif", "report.json")):
+    first = ("a.tif", "b.tif", "notes.txt", "tiles/a/r0.tif", "tiles/b/r0.tif", "report.json")
+    for names in (first, ("a.tif", "tiles/a/r0.tif", "report.json")):
         out = PublishedFolder(address)
-        out.local.mkdir(parents=True)
         for name in names:
+            (out.local / name).parent.mkdir(parents=True, exist_ok=True)
             (out.local / name).write_text(name)
-        out.publish(["a.tif", "b.tif", "report.json"])
-    assert [p.name for p in list_folder(address)] == ["a.tif", "notes.txt", "report.json"]
+        out.publish(["a.tif", "b.tif", "tiles", "report.json"])
+    left = [p.relative_to(address).as_posix() for p in list_folder(address)]
+    assert left == ["a.tif", "notes.txt", "report.json", "tiles/a/r0.tif"]
 
 
 def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
