@@ -1,72 +1,152 @@
-"""Throughput per core: a Dask cluster on loopback against the local pool, with the same number of processes.
+"""A Dask cluster on loopback against the local pool: throughput per core, and what a slow network costs.
 
-    python -m benchmarks.speed.scaling_cluster PHOTOS... --basemap MAP [--processes 2]
+    python -m benchmarks.speed.scaling_cluster PHOTOS... --basemap MAP [--workers 1 2 4] [--round-trip-ms 20] [--store]
 
-Needs the extra `cluster`. Both make the same map, one after the other; products are compared, too.
+Needs the extra `cluster`. The same map is made by the local pool and by the cluster with each number of workers;
+products are compared, too. With --round-trip-ms every byte between command, scheduler, workers and store arrives half
+that later. With --store (extra `cloud`, and moto[s3] with flask and flask-cors) photos and map lie on an S3 server on
+loopback, the workers share no folder, and each has a cache of its own.
 """
 
 import argparse
 import hashlib
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
+
+from benchmarks.speed.delayed_network import DelayedNetwork, delayed_network
+
+CREDENTIALS = {"AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1"}
+Variables = dict[str, str]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("photos", nargs="+", type=Path)
+    parser.add_argument("photos", type=Path)
     parser.add_argument("--basemap", type=Path, required=True)
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--workers", type=int, nargs="+", default=[2])
+    parser.add_argument("--round-trip-ms", type=float, default=0.0)
+    parser.add_argument("--store", action="store_true")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
-        local = mosaic(args, folder / "local", ["--workers", str(args.processes)])
-        file = folder / "scheduler.json"
-        common = ["--scheduler-file", str(file), "--host", "127.0.0.1"]
-        processes = [start("scheduler", *common, "--port", "0", "--no-dashboard")]
-        try:
-            while not file.exists():
-                time.sleep(0.2)
-            for _ in range(args.processes):
-                processes.append(start("worker", *common, "--nthreads", "1", "--no-nanny", "--no-dashboard"))
-            address = json.loads(file.read_text())["address"]
-            wait_for_workers(address, args.processes)
-            cluster = mosaic(args, folder / "cluster", ["--cluster", address])
-        finally:
-            for process in processes:
-                process.kill()
-                process.wait()
-        same = all(
-            digest(folder / "local" / n) == digest(folder / "cluster" / n) for n in ("coarse.tif", "frames.jsonl")
+        network = stack.enter_context(delayed_network(args.round_trip_ms / 1000))
+        local = mosaic(args.photos, args.basemap, folder / "local", ["--workers", "1"], {})
+        tell("one local process", local)
+        photos, basemap, variables = str(args.photos), str(args.basemap), Variables()
+        if args.store:
+            photos, basemap, variables = filled_store(args, stack, folder, network)
+        for count in args.workers:
+            out, before = folder / f"cluster{count}", network.bytes_sent
+            with ExitStack() as cluster:
+                address = started(cluster, folder / f"c{count}", count, network, variables)
+                own = {**variables, "ORTHOSWARM_CACHE": str(folder / f"c{count}" / "command")}
+                how = ["--cluster", address, "--workers", "1"]
+                report = mosaic(photos, basemap, out, how, own)
+            same = all(digest(folder / "local" / n) == digest(out / n) for n in ("coarse.tif", "frames.jsonl"))
+            tell(f"cluster of {count}", report, (network.bytes_sent - before) / 1e6)
+            print("  same products" if same else "  DIFFERENT products", flush=True)
+
+
+def tell(label: str, report: dict[str, Any], megabytes: float | None = None) -> None:
+    """A line about a run: its stages, and what went over the network."""
+    count = report["frames"]["used"]
+    over = "" if megabytes is None else f", {1000 * megabytes / count:.0f} kB a picture over the network"
+    print(
+        f"{label}: {count} pictures, {1000 * report['cpu_s'] / count:.1f} CPU ms a picture, "
+        f"{report['wall_s']:.1f} s wall{over}"
+    )
+    print("  " + ", ".join(f"{s['name']} {s['wall_s']:.1f} s" for s in report["stages"]), flush=True)
+
+
+def filled_store(
+    args: argparse.Namespace, stack: ExitStack, folder: Path, network: DelayedNetwork
+) -> tuple[str, str, Variables]:
+    """An S3 server with the photos and the map; their addresses, and the variables with which it is reached."""
+    import fsspec
+
+    port = free_port()
+    run(stack, [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], {})
+    wait(lambda: answers(port))
+    os.environ.update(CREDENTIALS)
+    system = fsspec.filesystem("s3", client_kwargs={"endpoint_url": f"http://127.0.0.1:{port}"})
+    system.mkdir("site")
+    system.put(f"{args.photos}/", "site/photos", recursive=True)
+    system.put_file(str(args.basemap), f"site/{args.basemap.name}")
+    variables = {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{network.forward(port)}"}
+    return "s3://site/photos", f"s3://site/{args.basemap.name}", variables
+
+
+def started(stack: ExitStack, folder: Path, count: int, network: DelayedNetwork, variables: Variables) -> str:
+    """The address of a new scheduler with workers, each reached through the network."""
+    folder.mkdir()
+    port = free_port()
+    common = [sys.executable, "-m", "dask"]
+    run(stack, [*common, "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"], {})
+    wait(lambda: answers(port))
+    address = f"tcp://127.0.0.1:{network.forward(port)}"
+    for n in range(count):
+        own = free_port()
+        contact = f"tcp://127.0.0.1:{network.forward(own)}"
+        place = ["--listen-address", f"tcp://127.0.0.1:{own}", "--contact-address", contact]
+        run(
+            stack,
+            [*common, "worker", address, *place, "--nthreads", "1", "--no-nanny", "--no-dashboard"],
+            {**variables, "ORTHOSWARM_CACHE": str(folder / f"worker{n}")},
         )
-    for label, report in (("local pool", local), ("cluster", cluster)):
-        count = report["frames"]["used"]
-        print(f"{label}: {count / report['cpu_s']:.1f} pictures per core-second, {report['wall_s']:.1f} s wall")
-    print("same products" if same else "DIFFERENT products")
-
-
-def start(what: str, *options: str) -> subprocess.Popen:
-    quiet = subprocess.DEVNULL
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # a nanny would set it
-    command = [sys.executable, "-m", "dask", what, *options]
-    return subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet)
-
-
-def wait_for_workers(address: str, count: int) -> None:
     from distributed import Client
 
-    with Client(address, set_as_default=False) as client:
-        client.wait_for_workers(count, timeout=120)
+    with Client(address, set_as_default=False, timeout=60) as client:
+        client.wait_for_workers(count, timeout=180)
+    return address
 
 
-def mosaic(args: argparse.Namespace, out: Path, how: list[str]) -> dict:
-    command = [sys.executable, "-m", "gcs_plugin.cli", "mosaic", *map(str, args.photos), "--basemap", str(args.basemap)]
-    done = subprocess.run([*command, "--out", str(out), "--json", *how], stdout=subprocess.PIPE, check=True)
-    return json.loads(done.stdout)
+def run(stack: ExitStack, command: list[str], variables: Variables) -> None:
+    """A process that ends with the stack."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}  # a nanny would set it
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet)
+    stack.callback(process.wait)
+    stack.callback(process.kill)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=1).close()
+    except OSError:
+        return False
+    return True
+
+
+def wait(ready: Callable[[], bool]) -> None:
+    end = time.monotonic() + 120
+    while not ready():
+        if time.monotonic() > end:
+            raise SystemExit("a server did not start")
+        time.sleep(0.1)
+
+
+def mosaic(photos: str | Path, basemap: str | Path, out: Path, how: list[str], variables: Variables) -> dict[str, Any]:
+    command = [sys.executable, "-m", "gcs_plugin.cli", "mosaic", str(photos), "--basemap", str(basemap)]
+    environment = {**os.environ, **variables}
+    command += ["--out", str(out), "--json", *how]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, check=True)
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
 
 
 def digest(path: Path) -> str:

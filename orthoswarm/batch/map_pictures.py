@@ -11,6 +11,7 @@ from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.config import active
 from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product_file, remove_tiles, write_tiled
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import describe_frame
 from orthoswarm.export.seamlines import write_seamlines
@@ -109,7 +110,7 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
                 Layer(frames=fine[0], terrain=fine_ground, canvas=second, gains=state.gains, seams=_seams(run, state)),
             ]
             drawn = partial(run.progress, "drawing orthoimage")
-            stats = render_layers(layers, read=state.read_rgb(), run=run.workers.map, progress=drawn)
+            stats = render_layers(layers, read=state.read_rgb(), run=run.drawers.map, progress=drawn)
             _write(run, first, COARSE)
         _write(run, second, ORTHOIMAGE)
         _write_seamlines(run, second, fine[0])
@@ -129,7 +130,7 @@ def _picture(
 ) -> None:
     """Render one product, unless an interrupted run has."""
     known = run.space.recall(name)
-    if known is not None and (run.out / name).exists():
+    if known is not None and product_file(run.out, name) is not None:
         rejected, state.drawn, stage = known
         run.clock.stages.append(stage)
     else:
@@ -155,7 +156,7 @@ def draw(
     with _canvas(run, name, placed, terrain, state) as canvas:
         if realtime:
             stats = mosaic(
-                placed, canvas, previews=state.previews, read=state.read_rgb(), run=run.workers.map, progress=drawn
+                placed, canvas, previews=state.previews, read=state.read_rgb(), run=run.drawers.map, progress=drawn
             )
         else:
             seams = _seams(run, state) if name == ORTHOIMAGE else None
@@ -166,7 +167,7 @@ def draw(
                 gains=state.gains,
                 seams=seams,
                 read=state.read_rgb(),
-                run=run.workers.map,
+                run=run.drawers.map,
                 progress=drawn,
             )
         _write(run, canvas, name)
@@ -195,9 +196,15 @@ def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: 
 
 
 def _write(run: RunContext, canvas: Canvas, name: str) -> None:
-    """Write a canvas as a COG."""
+    """Write a canvas as a COG, a large one in tiles."""
     written = partial(run.progress, f"writing {name}")
-    write_cog(canvas, run.out / name, window=drawn_window(canvas), progress=written, threads=run.workers.count)
+    window, threads = drawn_window(canvas), run.drawers.count
+    if in_tiles(run.options.tiles, window):
+        drawn = map(canvas.tile_bounds, canvas.changed_since(0))
+        write_tiled(canvas, run.out, name, window=window, drawn=drawn, progress=written, threads=threads)
+        return
+    write_cog(canvas, run.out / name, window=window, progress=written, threads=threads)
+    remove_tiles(run.out, name)
 
 
 def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFrame]) -> None:
@@ -207,8 +214,12 @@ def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFra
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:
     """Without a map the orthoimage is the coarse product, too."""
-    with written_whole(run.out / COARSE) as part:
-        shutil.copyfile(run.out / ORTHOIMAGE, part)
+    if (run.out / ORTHOIMAGE).exists():
+        with written_whole(run.out / COARSE) as part:
+            shutil.copyfile(run.out / ORTHOIMAGE, part)
+        remove_tiles(run.out, COARSE)
+    else:
+        copy_tiled(run.out, ORTHOIMAGE, COARSE)
     moved = state.control is not None and state.control.by_receivers is not None
     if run.options.basemap is None and not moved:
         state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")

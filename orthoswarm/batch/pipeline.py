@@ -15,6 +15,7 @@ from orthoswarm.batch.run_state import (
     ORTHOIMAGE,
     PRODUCTS,
     REALTIME,
+    WRITTEN,
     Load,
     Options,
     Progress,
@@ -25,11 +26,12 @@ from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.batch.unpositioned import with_control_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
-from orthoswarm.compute.workers import Workers
+from orthoswarm.compute.workers import Workers, usage_of
 from orthoswarm.config import override
 from orthoswarm.control.control_observations import check_control
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
 from orthoswarm.export.atomic_file import disk_error
+from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -41,11 +43,15 @@ from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel, check_dem
+from orthoswarm.stores.addresses import address_of
+from orthoswarm.stores.listing import exists
 
-__all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "Load", "Options", "Progress", "run"]
+__all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "WRITTEN", "Load", "Options", "Progress", "run"]
 
 
-def run(load: Load, out: Path, options: Options, workers: Workers, progress: Progress) -> dict[str, Any]:
+def run(
+    load: Load, out: Path, options: Options, workers: Workers, progress: Progress, *, drawers: Workers | None = None
+) -> dict[str, Any]:
     """Make all products of a set of inputs.
 
     Args:
@@ -54,6 +60,7 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
         options: see Options.
         workers: run the tasks; the products do not depend on their number.
         progress: called during long work.
+        drawers: run the tasks that write into the output folder, where the workers do not see it; None: the workers.
 
     Returns:
         The content of report.json.
@@ -64,12 +71,18 @@ def run(load: Load, out: Path, options: Options, workers: Workers, progress: Pro
             real-time picture, the frames as recorded and the report with the error exist, but no orthoimage, which
             would look like a refined one.
     """
-    if options.basemap is not None and not options.basemap.exists():
-        raise InputError(f"the basemap {options.basemap} does not exist; check the path")
+    if options.basemap is not None and not exists(options.basemap):
+        raise InputError(f"the basemap {address_of(options.basemap)} does not exist; check the path")
     override(options.config)
     with Workspace(out) as space:
         context = RunContext(
-            out=out, space=space, options=options, workers=workers, progress=progress, clock=Clock(workers.usage)
+            out=out,
+            space=space,
+            options=options,
+            workers=workers,
+            drawers=drawers or workers,
+            progress=progress,
+            clock=Clock(usage_of(workers, drawers)),
         )
         with context.clock.stage("load") as stage:
             state = _load(context, load)
@@ -168,7 +181,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
         state.previews = PreviewFile.create(run.space.file("previews"), images)
         state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
     known = run.space.recall("realtime")
-    if known is not None and (run.out / REALTIME).exists():
+    if known is not None and product_file(run.out, REALTIME) is not None:
         stats, stage = known
         run.clock.stages.append(stage)
     else:

@@ -10,7 +10,7 @@ from orthoswarm.batch.run_state import RunContext, RunState
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.ground_control import place_on_control
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import local_origin
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution
@@ -40,6 +40,8 @@ def refine(run: RunContext, state: RunState) -> Refinement | None:
     with outer.stage("refine", len(frames)) as stage:
         try:
             refinement = _refined(run, frames, state)
+        except RunInterruptedError:  # what is done is kept, and the same command goes on
+            raise
         except OrthoSwarmError as error:
             state.warnings.append(f"the pictures could not be refined ({error}); the map is the real-time one")
             return None

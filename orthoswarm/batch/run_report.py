@@ -1,16 +1,27 @@
 """The report of a run: frames.jsonl, footprints, report.json and the report's page."""
 
+import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, SEAMLINES, RunContext, RunState
+from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
 from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
-from orthoswarm.export.product_files import image_root, leg_rows, stage_row, vehicle_rows, write_frames, write_json
+from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
+from orthoswarm.export.product_files import (
+    image_root,
+    iso_time,
+    leg_rows,
+    stage_row,
+    vehicle_rows,
+    write_frames,
+    write_json,
+)
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Refinement
 from orthoswarm.mosaic.extent import from_takeoff, ground_level, solved_level
 from orthoswarm.report.page import write_page
+from orthoswarm.stores.addresses import address_of
 
 
 def write_products(
@@ -19,7 +30,8 @@ def write_products(
     """frames.jsonl, footprints and the report."""
     for name in PRODUCTS:  # left by an earlier run with other options
         if name not in _made(run, state.fault is not None):
-            (run.out / name).unlink(missing_ok=True)
+            remove_product(run.out, name)
+    remove_collection(run.out)
     solved = refinement is not None and state.terrain is refinement.terrain
     level = solved_level(refinement.fine) if refinement and solved else ground_level(placed, state.terrain)
     stated, z = from_takeoff(placed, level, state.terrain)
@@ -41,6 +53,12 @@ def write_products(
     wall, cpu, memory = run.clock.totals()
     report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
     report["stages"].append(stage_row(stage))
+    if any(tiles_of(run.out, name) for name in (REALTIME, COARSE, ORTHOIMAGE)):
+        from orthoswarm.export.catalog.stac_collection import write_collection
+
+        report["tiles"] = {name: len(tiles_of(run.out, name)) for name in (REALTIME, COARSE, ORTHOIMAGE)}
+        write_json(run.out / "report.json", report)  # which the collection quotes
+        write_collection(run.out, iso_time(time.time()) or "")
     write_json(run.out / "report.json", report)
     return report
 
@@ -90,7 +108,7 @@ def _report(
         "gsd_m": state.gsd_m,
         "area_ha": state.drawn[0] / 1e4,
         "covered_share": state.drawn[1],
-        "basemap": str(run.options.basemap) if state.basemap else None,
+        "basemap": address_of(run.options.basemap) if run.options.basemap and state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
         "control": None if state.control is None else state.control.document(),
         "until": run.options.until,

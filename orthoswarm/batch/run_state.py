@@ -15,6 +15,7 @@ from orthoswarm.compute.workers import Workers
 from orthoswarm.config import Overrides
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -47,6 +48,10 @@ PRODUCTS = (
 )
 
 
+WRITTEN = (*PRODUCTS, *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)), FOLDER)
+"""Files and folders that runs write, those of rasters in tiles among them."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
     """The options of a run.
@@ -64,6 +69,7 @@ class Options:
         control: surveyed points that move the map onto the ground; checkpoints: others that it is measured at (files
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         covariance: write the covariance of each camera's position and rotation to frames.jsonl.
+        tiles: write rasters in tiles with a STAC collection: "yes", "no", or "auto" by their pixels.
         config: thresholds that replace the defaults.
     """
 
@@ -82,6 +88,7 @@ class Options:
     checkpoints: Path | None = None
     pixel_scale: float = 1.0
     covariance: bool = False
+    tiles: Tiles = "auto"
     config: Overrides = field(default_factory=dict)
 
 
@@ -92,12 +99,14 @@ class RunContext:
     Attributes:
         out: output folder; space: its lock and results of an interrupted run.
         options: see Options. workers: run the tasks. progress: called during long work. clock: times by stage.
+        drawers: run the tasks that write into the output folder; the same workers where these see it.
     """
 
     out: Path
     space: Workspace
     options: Options
     workers: Workers
+    drawers: Workers
     progress: Progress
     clock: Clock
 

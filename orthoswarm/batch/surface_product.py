@@ -42,7 +42,7 @@ def make_surface(
     try:
         with run.clock.stage("final: surface", len(placed)):
             model = surface_model(
-                placed, terrain, state.grid.epsg, run.space.scratch("surface"), run=run.workers.map,
+                placed, terrain, state.grid.epsg, run.space.scratch("surface"), run=run.drawers.map,
                 progress=partial(run.progress, "matching the surface"),
             )  # fmt: skip
             write_surface(path, model, altitude)

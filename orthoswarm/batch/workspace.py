@@ -13,6 +13,8 @@ from orthoswarm import __version__
 from orthoswarm.export.atomic_file import disk_error, written_whole
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
+from orthoswarm.stores.addresses import is_stored
+from orthoswarm.stores.listing import known, stamp
 
 Result = TypeVar("Result")
 
@@ -28,8 +30,11 @@ def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
     digest = hashlib.sha256(f"{__version__} {options!r}".encode())
     for file in files:
         with contextlib.suppress(OSError):
-            digest.update(f"{file and (file.stat().st_size, file.stat().st_mtime_ns)}".encode())
+            told = file and (stamp(file) or (file.stat().st_size, file.stat().st_mtime_ns))
+            digest.update(f"{told}".encode())
     for frame in frames:
+        if is_stored(frame.path):
+            digest.update(f"{known(frame.path)}".encode())
         with contextlib.suppress(OSError):
             stat = frame.path.stat()
             # Pictures of videos are taken out anew each time.

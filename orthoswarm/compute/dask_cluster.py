@@ -1,9 +1,11 @@
 """Work on a Dask cluster (paper III.E): the second implementation of `workers.Workers`.
 
 Tasks and results travel over the network; pictures, map and output folder do not: every worker must see them under the
-same paths, through a shared folder (docs/cluster.md). A task whose worker dies is repeated by another one.
+same paths, through a shared folder or in a store (docs/cluster.md). A task whose worker dies is repeated by another
+one; when the scheduler dies, tasks without a result are sent to the one that takes its place.
 """
 
+import contextlib
 import os
 import pickle
 import re
@@ -11,6 +13,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -20,10 +23,23 @@ from uuid import uuid4
 from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, prepare_process
 from orthoswarm.config import active, overridden, override
-from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, RunInterruptedError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+class ClusterLostError(RunInterruptedError):
+    """A cluster's scheduler or workers are gone, or die at a task."""
+
+
+@dataclass(slots=True)
+class _Task:
+    """What was sent, to be sent again if the scheduler dies, its future, and the client that it belongs to."""
+
+    payload: bytes
+    future: Any
+    client: Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +59,8 @@ class Cluster:
     Args:
         address: of the scheduler, for example tcp://192.168.1.10:8786.
         shared: files and folders that every worker must see under the same path.
-        patience_s: how long to wait for a worker to come back when all are gone; None for the configuration's.
+        patience_s: how long to wait for a worker to come back when all are gone, and for a scheduler; None for the
+            configuration's.
 
     Raises:
         InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
@@ -51,13 +68,15 @@ class Cluster:
     """
 
     def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float | None = None) -> None:
+        self._address = address
+        self._shared = [p.absolute() for p in shared]
         self._client = _connect(address)
         self._patience_s = active().compute.cluster_patience_s if patience_s is None else patience_s
         self._cpu_s: dict[str, float] = {}
         self._rss_mb: dict[str, float] = {}
         self._first_cpu_s: dict[str, float] = {}
         try:
-            self._check(address, [p.absolute() for p in shared])
+            self._check()
         except BaseException:
             self.close()
             raise
@@ -70,7 +89,7 @@ class Cluster:
     def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         source = iter(items)
-        queue: deque[Any] = deque()
+        queue: deque[_Task] = deque()
         try:
             while True:
                 wanted = active().compute.cluster_queue_per_worker * self.count
@@ -82,10 +101,11 @@ class Cluster:
                         break
                 if not queue:
                     return
-                yield self._take(queue.popleft())
+                outcome = self._outcome(queue)
+                queue.popleft()
+                yield self._account(outcome)
         finally:
-            for future in queue:
-                future.cancel()
+            self._cancel(queue)
 
     def usage(self) -> Usage:
         """See Workers."""
@@ -103,23 +123,44 @@ class Cluster:
         self.close()
 
     def _workers(self) -> dict[str, Any]:
-        known: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        """The scheduler's workers; none while it is gone."""
+        try:
+            known: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        except (OSError, RuntimeError, TimeoutError):
+            return {}
         return known
 
-    def _submit(self, function: Callable[[Any], Any], item: Any) -> Any:
+    def _submit(self, function: Callable[[Any], Any], item: Any) -> _Task:
         payload = pickle.dumps((function, item, overridden()), pickle.HIGHEST_PROTOCOL)
-        # A unique key, so that Dask processes equal items separately, as Processes does.
-        return self._client.submit(_work, payload, key=f"orthoswarm-{uuid4().hex}", pure=False)
+        return _Task(payload, self._sent(payload), self._client)
 
-    def _take(self, future: Any) -> Any:
+    def _sent(self, payload: bytes) -> Any:
+        """The future of a payload; None if the scheduler is gone, which is found out when its result is due."""
+        try:
+            # A unique key, so that Dask processes equal items separately, as Processes does.
+            return self._client.submit(_work, payload, key=f"orthoswarm-{uuid4().hex}", pure=False)
+        except (OSError, RuntimeError, TimeoutError):
+            return None
+
+    def _cancel(self, queue: Iterable[_Task]) -> None:
+        """Have unfinished tasks forgotten."""
+        for task in queue:
+            with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+                if task.future is not None:
+                    task.future.cancel()
+
+    def _outcome(self, queue: deque[_Task]) -> _Outcome:
+        """The result of the first task; all are sent again when the scheduler was lost."""
         from distributed import KilledWorker
         from distributed import TimeoutError as Late
 
         alone_since = None
         while True:
             try:
-                outcome: _Outcome = future.result(timeout=active().compute.cluster_poll_s)
-                break
+                if queue[0].future is None:
+                    raise CancelledError
+                outcome: _Outcome = queue[0].future.result(timeout=active().compute.cluster_poll_s)
+                return outcome
             except Late:
                 if self._workers():
                     alone_since = None
@@ -127,13 +168,45 @@ class Cluster:
                 now = time.monotonic()
                 alone_since = alone_since or now
                 if now - alone_since > self._patience_s:
-                    raise OrthoSwarmError(
+                    raise ClusterLostError(
                         "all workers of the cluster are gone; start some and run the same command again to go on"
                     ) from None
             except KilledWorker:
-                raise OrthoSwarmError(
-                    "several workers died at the same task, mostly for lack of memory; give workers more memory"
+                raise ClusterLostError(
+                    "several workers died at the same task, mostly for lack of memory; give workers more memory and "
+                    "run the same command again to go on"
                 ) from None
+            except (CancelledError, OSError):  # the scheduler was lost, and with it all that it knew
+                if queue[0].client is self._client:  # and not found out before, by tasks of another call
+                    self._reconnect()
+                for task in queue:
+                    task.future, task.client = self._sent(task.payload), self._client
+
+    def _reconnect(self) -> None:
+        """Find the scheduler that takes the place of a lost one, with workers.
+
+        Raises:
+            ClusterLostError: if there is none within the time.
+        """
+        end = time.monotonic() + self._patience_s
+        while True:
+            with contextlib.suppress(Exception):  # a lost connection may end in many ways
+                self._client.close(timeout=1)
+            try:
+                self._client = _connect(self._address)
+                while not self._workers() and time.monotonic() < end:
+                    time.sleep(active().compute.cluster_poll_s)
+                self._check()
+                return
+            except (InputError, OSError) as error:
+                if time.monotonic() > end:
+                    raise ClusterLostError(
+                        f"the cluster was lost ({error}); run the same command again to go on when it is back"
+                    ) from None
+                time.sleep(active().compute.cluster_poll_s)
+
+    def _account(self, outcome: _Outcome) -> Any:
+        """A task's value or error, after adding up what its process has used."""
         self._cpu_s[outcome.process] = max(outcome.cpu_s, self._cpu_s.get(outcome.process, 0.0))
         self._rss_mb[outcome.process] = max(outcome.rss_mb, self._rss_mb.get(outcome.process, 0.0))
         value = pickle.loads(outcome.value)
@@ -141,10 +214,11 @@ class Cluster:
             raise value
         return value
 
-    def _check(self, address: str, shared: list[Path]) -> None:
+    def _check(self) -> None:
         if not self._workers():
-            raise InputError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
-        for worker, found in self._client.run(_inspect, [str(p) for p in shared]).items():
+            at = self._address
+            raise InputError(f"the cluster at {at} has no workers; start some with `dask worker {at}`")
+        for worker, found in self._client.run(_inspect, [str(p) for p in self._shared]).items():
             version, missing, process, cpu_s, alone = found
             if not alone:  # sums over several threads differ in their last digits, and threads compete for the cores
                 raise InputError(
@@ -159,8 +233,8 @@ class Cluster:
                 raise InputError(
                     f"the worker {worker} does not see {missing[0]}; share it under the same path on all machines"
                 )
-            self._first_cpu_s[process] = cpu_s
-            self._cpu_s[process] = cpu_s
+            self._first_cpu_s.setdefault(process, cpu_s)
+            self._cpu_s.setdefault(process, cpu_s)
 
 
 def _connect(address: str) -> Any:

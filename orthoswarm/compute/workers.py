@@ -70,6 +70,16 @@ class Usage:
     peak_rss_mb: float = 0.0
 
 
+def usage_of(*pools: "Workers | None") -> Callable[[], Usage]:
+    """A function that gives the resources used by several pools together."""
+
+    def together() -> Usage:
+        used = [pool.usage() for pool in pools if pool is not None]
+        return Usage(sum(u.cpu_s for u in used), sum(u.peak_rss_mb for u in used))
+
+    return together
+
+
 class Workers(Protocol):
     """Interface of everything that maps a function over items."""
 

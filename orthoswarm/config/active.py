@@ -12,6 +12,7 @@ from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.coverage import CoverageConfig
 from orthoswarm.config.evaluation import EvaluationConfig
+from orthoswarm.config.export import ExportConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
@@ -28,6 +29,7 @@ from orthoswarm.config.refiner.registration import RegistrationConfig
 from orthoswarm.config.refiner.strategy import StrategyConfig
 from orthoswarm.config.refiner.surface import SurfaceConfig
 from orthoswarm.config.stereo import StereoConfig
+from orthoswarm.config.stores import StoresConfig
 from orthoswarm.config.telemetry import IngestConfig, PairingConfig
 from orthoswarm.model.errors import InputError
 
@@ -60,9 +62,11 @@ class Config:
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
+    stores: StoresConfig = field(default_factory=StoresConfig)
 
 
 _DEFAULT = Config()

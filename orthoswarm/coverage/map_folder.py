@@ -20,6 +20,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.picture_file import PictureError, read_gray
 from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
+from orthoswarm.stores.addresses import path_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,7 @@ def read_map(folder: Path) -> MapFolder:
     unsure = sum(not math.isfinite(v.sigma_m) for v in views)
     if unsure:
         warnings.append(f"{unsure} pictures have no known position error and count nowhere as well seen")
-    root = Path(report["root"]) if report.get("root") else None
+    root = path_of(report["root"]) if report.get("root") else None
     return MapFolder(epsg=grid.epsg, ground_z_m=level, views=views, rejected=rejected, root=root, warnings=warnings)
 
 

@@ -24,6 +24,7 @@ from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.mosaic.footprint import footprint
+from orthoswarm.stores.addresses import address_of
 
 Array = NDArray[np.float64]
 
@@ -292,11 +293,11 @@ def stage_row(stage: Stage) -> dict[str, Any]:
 
 
 def image_root(frames: Sequence[Frame]) -> str | None:
-    """The folder that picture names are relative to; None for pictures of videos."""
+    """The folder (or address) that picture names are relative to; None for pictures of videos."""
     for frame in frames:
         path = frame.path.absolute().as_posix()
         if path.endswith("/" + frame.image):
-            return path.removesuffix("/" + frame.image) or "/"
+            return address_of(Path(path.removesuffix("/" + frame.image) or "/"))
     return None
 
 

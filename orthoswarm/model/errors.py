@@ -9,6 +9,11 @@
     │   ├── StorageError               a file cannot be written; the same may succeed later
     │   │   └── DiskFullError          there is no room on the disk
     │   ├── WorkerStoppedError         a worker process was killed
+    │   ├── RunInterruptedError        a run cannot go on now; the same command goes on later
+    │   │   ├── ClusterLostError       a cluster's scheduler or workers are gone    compute.dask_cluster
+    │   │   └── StoreLostError         a store cannot be reached        stores.requests
+    │   ├── NotStoredError             a file is not in its store       stores.requests
+    │   ├── StoreRequestError          a store refuses one request      stores.requests
     │   ├── SolutionFileError          a refined sortie's file is damaged or old    gcs_plugin.daemon.jobs.solution_file
     │   ├── OutdatedError              the shared plan was changed by another user meanwhile  gcs_plugin.daemon.store
     │   └── TooLarge                   a request's body is too large        gcs_plugin.web.guard
@@ -43,6 +48,10 @@ class StorageError(OrthoSwarmError):
 
 class DiskFullError(StorageError):
     """There is no room left on the disk."""
+
+
+class RunInterruptedError(OrthoSwarmError):
+    """A run cannot go on because of something outside it; what is done is kept, and the same command goes on."""
 
 
 class WorkerStoppedError(OrthoSwarmError):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
 from orthoswarm.config import active
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import reduced
@@ -25,6 +25,7 @@ from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_color
 from orthoswarm.mosaic.seams.previews import write_preview
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
+from orthoswarm.stores.local_copies import copy_ahead
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
@@ -235,6 +236,7 @@ class PreviewTask:
 
 def preview_pass(task: PreviewTask) -> None:
     """Write previews; a picture that cannot be read is left without, and is found out when it is drawn."""
+    copy_ahead(path for path, _ in task.pictures)
     for path, row in task.pictures:
         with contextlib.suppress(PictureError):
             write_preview(task.previews, row, task.read(path))
@@ -326,10 +328,13 @@ class _Ground:
 def sample_pass(task: SampleTask) -> list[Sampled]:
     """Colour the pixels of some frames in the tiles' files, each picture read once for all layers."""
     grounds = [_Ground(layer) for layer in task.layers]
+    copy_ahead(path for path, _ in task.pictures)
     results = []
     for path, shots in task.pictures:
         try:
             picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
+        except RunInterruptedError:
+            raise
         except OrthoSwarmError as error:
             results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
             continue

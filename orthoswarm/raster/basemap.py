@@ -17,6 +17,8 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.gdal_map import RasterMap, luma
 from orthoswarm.raster.map_check import sample_windows
 from orthoswarm.raster.tile_folder import TileFolder
+from orthoswarm.stores.addresses import address_of
+from orthoswarm.stores.listing import exists
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -70,8 +72,8 @@ class Basemap:
             InputError: if the map cannot be read, has no coordinate system or lies elsewhere.
         """
         path = Path(path)
-        if not path.exists():
-            raise InputError(f"the basemap {path} does not exist; check the path")
+        if not exists(path):
+            raise InputError(f"the basemap {address_of(path)} does not exist; check the path")
         basemap = cls(path, epsg, near)
         basemap.require_overlap(near or basemap.bounds)
         return basemap

@@ -18,6 +18,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.map_check import UnreadableMapError, ends_early
 from orthoswarm.raster.resampling import resample
+from orthoswarm.stores.local_copies import local_file
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -84,7 +85,7 @@ class RasterMap:
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported as an error in plain words
-                    handles[key] = rasterio.open(self._path, **options)
+                    handles[key] = rasterio.open(local_file(self._path), **options)
             except (RasterioIOError, OSError):
                 raise UnreadableMapError(
                     f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"
@@ -104,7 +105,7 @@ class RasterMap:
         corners = np.array([_apply(~self._affine, x, y) for x in (west, east) for y in (south, north)])
         (c0, r0), (c1, r1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
         rows, cols = np.clip([r0, r1], 0, source.height), np.clip([c0, c1], 0, source.width)
-        if ends_early(source, self._path, (int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1]))):
+        if ends_early(source, local_file(self._path), (int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1]))):
             raise UnreadableMapError(f"the basemap {self._path.name} is cut short; copy or export it again")
 
     @contextmanager

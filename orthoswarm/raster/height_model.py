@@ -13,6 +13,9 @@ from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.stores.addresses import address_of
+from orthoswarm.stores.listing import exists
+from orthoswarm.stores.local_copies import local_file
 
 Array = NDArray[np.float64]
 
@@ -197,12 +200,12 @@ def _on_area(
     from rasterio.vrt import WarpedVRT
 
     name = path.name
-    if not path.exists():
-        raise InputError(f"the DEM {path} does not exist; check --dem")
+    if not exists(path):
+        raise InputError(f"the DEM {address_of(path)} does not exist; check --dem")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = rasterio.open(path)
+            dataset = rasterio.open(local_file(path))
     except RasterioError:
         raise InputError(f"{name} is not a readable height model; give a GeoTIFF with heights by --dem") from None
     with dataset:

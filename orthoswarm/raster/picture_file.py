@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.stores.addresses import is_stored
+from orthoswarm.stores.local_copies import content
+from orthoswarm.stores.requests import NotStoredError, StoreRequestError
 
 Bytes = NDArray[np.uint8]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".dng"})
@@ -156,7 +159,9 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 def _content(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return content(path) if is_stored(path) else path.read_bytes()
+    except (NotStoredError, StoreRequestError) as error:
+        raise PictureError(str(error)) from None
     except OSError as error:
         raise PictureError(f"{path.name} cannot be read ({error.strerror}); check the file") from None
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
+from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import write_text
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Rejection
@@ -90,7 +91,7 @@ def write_page(
     """
     import jinja2
 
-    best = next((out / name for name, _, _ in reversed(_STAGES) if (out / name).exists()), None)
+    best = next((path for name, _, _ in reversed(_STAGES) if (path := product_file(out, name))), None)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("orthoswarm.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -185,8 +186,9 @@ def _pictures(
     stages = []
     on_map = any(p.stage == "fine" for p in placed)
     for name, title, text in _STAGES:
-        if (out / name).exists() and (name != ORTHOIMAGE or on_map):
-            stages.append(Figure(title, data_uri(product_picture(out / name, small).rgb), text))
+        path = product_file(out, name)
+        if path is not None and (name != ORTHOIMAGE or on_map):
+            stages.append(Figure(title, data_uri(product_picture(path, small).rgb), text))
     return {
         "main": data_uri(main.rgb, 86),
         "stages": stages if len(stages) > 1 else [],

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+from orthoswarm.stores.addresses import address_of, is_stored
+from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 
 VIDEO_SUFFIXES = frozenset(
@@ -96,19 +98,20 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     """
     if not inputs:
         raise InputError("no input was given; name a folder of photos or a video")
-    absolute = [Path(os.path.abspath(path)) for path in inputs]
+    absolute = [path if is_stored(path) else Path(os.path.abspath(path)) for path in inputs]
     for original, path in zip(inputs, absolute, strict=True):
-        if not path.exists():
-            raise InputError(f"{original} does not exist; check the path")
-    tops = [path if path.is_dir() else path.parent for path in absolute]
+        if not exists(path):
+            raise InputError(f"{address_of(original)} does not exist; check the path")
+    single = {path for path in absolute if is_file(path)}
+    tops = [path.parent if path in single else path for path in absolute]
     root = Path(os.path.commonpath(tops))
     outside = {os.path.abspath(path) for path in exclude}
     folders: dict[Path, Folder] = {}
     seen: dict[str, Path] = {}
     left_out: dict[Path, str] = {}
     sorted_in: set[Path] = set()
-    inside = [(file, True) for path in absolute if path.is_dir() for file in _walk(path, outside)]
-    named = [path for path in absolute if not path.is_dir()]
+    inside = [(file, True) for path in absolute if path not in single for file in _walk(path, outside)]
+    named = [path for path in absolute if path in single]
     files = [*inside, *((path, False) for path in named), *((path, True) for path in _with_side_files(named))]
     real_folder = lru_cache(maxsize=None)(os.path.realpath)
     links = [(file.is_symlink(), file, walked) for file, walked in files]
@@ -137,6 +140,8 @@ def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 
 def _walk(top: Path, outside: set[str]) -> list[Path]:
+    if is_stored(top):
+        return _stored(top, outside)
     found: list[Path] = []
     for folder, below, files in os.walk(top):
         below[:] = sorted(
@@ -146,6 +151,17 @@ def _walk(top: Path, outside: set[str]) -> list[Path]:
     return found
 
 
+def _stored(top: Path, outside: set[str]) -> list[Path]:
+    """The files of a folder in a store in the order in which a local one is walked."""
+
+    def hidden(path: Path) -> bool:
+        below = path.parent.relative_to(top).parts
+        return any(part.startswith(".") for part in below) or not outside.isdisjoint(map(str, path.parents))
+
+    files = [path for path in list_folder(top) if not hidden(path)]
+    return sorted(files, key=lambda path: (path.parent.parts, natural_key(path.name)))
+
+
 def _with_side_files(named: list[Path]) -> list[Path]:
     """Files next to videos and photos that describe their poses."""
     videos = {(path.parent, path.stem.lower()) for path in named if path.suffix.lower() in VIDEO_SUFFIXES}
@@ -153,7 +169,7 @@ def _with_side_files(named: list[Path]) -> list[Path]:
     found: list[Path] = []
     for folder in sorted(photos | {parent for parent, _ in videos}):
         try:
-            files = sorted(path for path in folder.iterdir() if path.is_file())
+            files = sorted(_in_folder(folder))
         except OSError:  # a folder that may be entered but not listed
             continue
         for path in files:
@@ -162,6 +178,12 @@ def _with_side_files(named: list[Path]) -> list[Path]:
             if (table and folder in photos) or (suffix in _SUBTITLES and (folder, path.stem.lower()) in videos):
                 found.append(path)
     return found
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    if is_stored(folder):
+        return [path for path in list_folder(folder) if path.parent == folder]
+    return [path for path in folder.iterdir() if path.is_file()]
 
 
 def _far_from_pictures(tops: Sequence[Path], folders: list[Folder]) -> frozenset[Path]:

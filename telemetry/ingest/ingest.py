@@ -13,6 +13,7 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
+from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.table.pose_row import PoseTable, lookup, names_of
 from telemetry.formats.video.sei import register
@@ -100,15 +101,19 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
     for folder in found.folders:
         for path in folder.tables:
             table: PoseTable | Unreadable | None
-            if geo_txt.is_geo_txt(path):
-                table, kind = read_or_reason(geo_txt.read_geo_txt, path), "geo.txt"
+            copy = read_or_reason(local_file, path)
+            if isinstance(copy, Unreadable):
+                table, kind = copy, "table"
+            elif geo_txt.is_geo_txt(copy):
+                table, kind = read_or_reason(geo_txt.read_geo_txt, copy), "geo.txt"
             else:
-                table = read_or_reason(pose_csv.read_pose_csv, path)
+                table = read_or_reason(pose_csv.read_pose_csv, copy)
                 kind = "CSV" if path.suffix.lower() == ".csv" else "table"
             if isinstance(table, Unreadable):
                 result.findings.append(Finding("table-unreadable", f"{found.name(path)} is not used: {table}"))
             elif table is None:
-                if pose_csv.names_pictures(path) and read_control_points(path) is None:
+                assert isinstance(copy, Path)
+                if pose_csv.names_pictures(copy) and read_control_points(copy) is None:
                     text = (
                         f"{found.name(path)} names pictures, but is not a table of poses that is known; it is not used"
                     )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from orthoswarm.config import active
+from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 from telemetry.formats.log.can_log import is_can_log
 from telemetry.formats.log.dataflash import has_dataflash_records
@@ -52,12 +53,14 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
     logs: list[LogSource] = []
     for folder in found.folders:
         for path in folder.logs:
-            vehicles = read_or_reason(read_log, path)
+            copy = read_or_reason(local_file, path)
+            vehicles = copy if isinstance(copy, Unreadable) else read_or_reason(read_log, copy)
             if isinstance(vehicles, Unreadable):
                 # A .bin that is not a DataFlash log, a .log that is not a CAN log: a note, not a warning.
                 suffix = path.suffix.lower()
-                foreign = (suffix == ".bin" and not has_dataflash_records(path)) or (
-                    suffix in CAN_LOGS and not is_can_log(path)
+                foreign = isinstance(copy, Path) and (
+                    (suffix == ".bin" and not has_dataflash_records(copy))
+                    or (suffix in CAN_LOGS and not is_can_log(copy))
                 )
                 result.findings.append(Finding("not-a-log", f"{found.name(path)}: {vehicles}", note=foreign))
                 continue

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthoswarm.model.frame import Rejection
+from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.video import srt
 from telemetry.ingest.discovery import Discovery, Folder
 from telemetry.ingest.log_ingest import LogSource
@@ -37,7 +38,8 @@ def read_videos(
     for path in folder.videos:
         name = found.name(path)
         subtitles = subtitle_files.pop(path.stem.lower(), None)
-        scanned = read_or_reason(scan, path)
+        copy = read_or_reason(local_file, path)
+        scanned = copy if isinstance(copy, Unreadable) else read_or_reason(scan, copy)
         if isinstance(scanned, Unreadable):
             result.rejected.append(Rejection(name, str(scanned), found.videos[path]))
             continue
@@ -99,7 +101,7 @@ def _take(
         return
     try:
         extraction = extract(
-            path,
+            local_file(path),
             name,
             options.cache or cache_folder(result.root),
             poses=poses,
@@ -134,7 +136,8 @@ def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) ->
 
 def _subtitles(path: Path, name: str, findings: list[Finding]) -> srt.Subtitles | None:
     """Read an SRT file; None with a finding if it cannot be read."""
-    cues = read_or_reason(srt.read_srt, path)
+    copy = read_or_reason(local_file, path)
+    cues = copy if isinstance(copy, Unreadable) else read_or_reason(srt.read_srt, copy)
     if isinstance(cues, Unreadable):
         findings.append(Finding("unreadable", f"{name} is not used: {cues}"))
         return None

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from orthoswarm.config import active
+from orthoswarm.stores.addresses import is_stored
+from orthoswarm.stores.listing import StoredFile, known, remember
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
@@ -99,7 +101,7 @@ def read_photos(
         run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
         progress: called with the number of photos done since the last call.
     """
-    chunks = [paths[i : i + _CHUNK] for i in range(0, len(paths), _CHUNK)]
+    chunks = [_chunk(paths[i : i + _CHUNK]) for i in range(0, len(paths), _CHUNK)]
     with ThreadPoolExecutor(max(1, workers)) as pool:
         for result in (run or pool.map)(_read_chunk, chunks):
             if progress is not None:
@@ -107,8 +109,29 @@ def read_photos(
             yield from result
 
 
-def _read_chunk(paths: Sequence[Path]) -> list[PhotoTags | Unreadable | None]:
-    return [read_or_reason(read_photo, path) for path in paths]
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """Photos to be read one after the other, and what is known about those in stores."""
+
+    paths: Sequence[Path]
+    stored: dict[Path, StoredFile]
+
+
+def _chunk(paths: Sequence[Path]) -> _Chunk:
+    found = ((path, known(path)) for path in paths if is_stored(path))
+    return _Chunk(paths, {path: file for path, file in found if file is not None})
+
+
+def _read_chunk(chunk: _Chunk) -> list[PhotoTags | Unreadable | None]:
+    if not any(map(is_stored, chunk.paths)):
+        return [_tags_or_reason(path) for path in chunk.paths]
+    remember(chunk.stored)
+    with ThreadPoolExecutor(active().stores.connections) as pool:  # a request mostly waits for the network
+        return list(pool.map(_tags_or_reason, chunk.paths))
+
+
+def _tags_or_reason(path: Path) -> PhotoTags | Unreadable | None:
+    return read_or_reason(read_photo, path)
 
 
 def tags_of(path: Path, container: Container) -> PhotoTags:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,6 +29,8 @@ def read_or_reason(read: Callable[P, T], *args: P.args, **options: P.kwargs) -> 
     """
     try:
         return read(*args, **options)
+    except RunInterruptedError:  # not this file's fault
+        raise
     except Exception as error:
         return reason_of(error)
 

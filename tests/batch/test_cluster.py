@@ -2,22 +2,18 @@
 
 import hashlib
 import os
-import subprocess
-import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
-from orthoswarm.compute.dask_cluster import Cluster
+from orthoswarm.compute.dask_cluster import Cluster, ClusterLostError
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-
-SMALL = {"DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "False", "OMP_NUM_THREADS": "1"}
+from tests.kit.servers.loopback_cluster import SMALL, Loopback
 
 
 def squares(n):
@@ -48,61 +44,6 @@ def die_once(marker, n):
 
 def die(_):
     os._exit(9)
-
-
-class Loopback:
-    """A scheduler and workers as processes of their own."""
-
-    def __init__(self, folder: Path):
-        self.file = folder / "scheduler.json"
-        self.processes = []
-        root = str(Path(__file__).resolve().parents[2])
-        self.environment = {**os.environ, **SMALL, "PYTHONPATH": root}
-
-    def begin(self, workers):
-        self.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-        self.wait(self.file.exists)
-        for _ in range(workers):
-            self.worker()
-        self.wait_for_workers(workers)
-
-    def start(self, what, *args):
-        command = [sys.executable, "-m", "dask", what, "--scheduler-file", str(self.file), *args]
-        quiet = subprocess.DEVNULL
-        self.processes.append(subprocess.Popen(command, env=self.environment, stdout=quiet, stderr=quiet))
-
-    def worker(self):
-        self.start("worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard")
-
-    @property
-    def address(self):
-        import json
-
-        return json.loads(self.file.read_text())["address"]
-
-    def wait(self, ready, seconds=180):
-        end = time.monotonic() + seconds
-        while not ready():
-            assert time.monotonic() < end, "the cluster did not start"
-            time.sleep(0.1)
-
-    def wait_for_workers(self, count):
-        from distributed import Client
-
-        with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(count, timeout=180)
-
-    def close(self):
-        for process in self.processes:
-            process.kill()
-        for process in self.processes:
-            process.wait(60)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +131,75 @@ def test_a_worker_that_dies_in_the_middle_loses_nothing(tmp_path):
             assert (tmp_path / "died").exists() and cluster.count == 1
             with pytest.raises(OrthoSwarmError, match="all workers of the cluster are gone"):
                 list(cluster.map(die, [0]))
+
+
+def slowly(folder, n):
+    """Marks that it has begun and takes a moment."""
+    (folder / f"begun-{n}").touch()
+    time.sleep(0.1)
+    return n * n
+
+
+def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, configure):
+    configure({"compute": {"cluster_connect_s": 5.0, "cluster_poll_s": 0.2}})
+    with Loopback(tmp_path) as both:
+        both.begin(1)
+        with Cluster(both.address, patience_s=120.0) as cluster:
+            results = cluster.map(partial(slowly, tmp_path), range(40))
+            found = [next(results) for _ in range(10)]
+            for process in list(both.processes):
+                process.kill()
+                process.wait(60)
+            both.scheduler()
+            both.worker()
+            found += list(results)
+    assert found == [n * n for n in range(40)]
+
+
+def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, configure):
+    configure({"compute": {"cluster_connect_s": 0.5, "cluster_poll_s": 0.2}})
+    with Loopback(tmp_path) as both:
+        both.begin(1)
+        with Cluster(both.address, patience_s=1.0) as cluster:
+            results = cluster.map(partial(slowly, tmp_path), range(40))
+            next(results)
+            both.close()
+            with pytest.raises(ClusterLostError, match="run the same command again"):
+                list(results)
+
+
+def test_a_run_whose_cluster_is_lost_keeps_finished_flights(tmp_path):
+    from orthoswarm.batch.pipeline import Options, run
+    from telemetry import load
+    from tests.kit.scene import Scene, legs
+
+    scene = Scene()
+    for vehicle in "ab":
+        scene.fly(tmp_path / "photos" / vehicle, legs(count=2, photos=5))
+
+    def read(_):
+        return load([tmp_path / "photos"])
+
+    class Watched(Serial):
+        """Counts the flights of the first pass; its cluster may be lost once one of them is done."""
+
+        def __init__(self, last=None):
+            self.last, self.flights = last, 0
+
+        def map(self, function, items):
+            for item in items:
+                if getattr(function, "func", function).__name__ == "refine_tracked":
+                    self.flights += 1
+                if self.last is not None and self.last.exists():
+                    raise ClusterLostError("gone")
+                yield from super().map(function, [item])
+
+    whole, lost, again = Watched(), Watched(tmp_path / "out" / ".work" / "vehicle-1-0.pickle"), Watched()
+    run(read, tmp_path / "whole", Options(gsd_m=0.5), whole, lambda *_: None)
+    with pytest.raises(ClusterLostError):
+        run(read, tmp_path / "out", Options(gsd_m=0.5), lost, lambda *_: None)
+    assert lost.last.exists()
+    report = run(read, tmp_path / "out", Options(gsd_m=0.5), again, lambda *_: None)
+    assert again.flights == whole.flights - 1 and any("was continued" in text for text in report["warnings"])
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

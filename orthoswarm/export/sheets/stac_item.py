@@ -12,6 +12,7 @@ from orthoswarm.export.atomic_file import written_whole
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import GroundGrid, LocalGrid
 
 _EXTENSIONS: Final = [
     "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
@@ -37,37 +38,53 @@ def write_stac_item(cog: Path, path: Path) -> None:
 
     import rasterio
     from rasterio.errors import RasterioError
-    from rasterio.warp import transform_geom
 
     try:
         with rasterio.open(cog) as raster:
-            west, south, east, north = raster.bounds
-            ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
-            outline = {"type": "Polygon", "coordinates": [ring]}
-            geometry = transform_geom(raster.crs, "EPSG:4326", outline, precision=8)
-            epsg, shape, transform = raster.crs.to_epsg(), list(raster.shape), list(raster.transform)
-            bands, gsd = raster.count, float(raster.res[0])
+            grid = GroundGrid(
+                epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
+                gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
+            )  # fmt: skip
+            bands = int(raster.count)
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
-    corners = np.asarray(geometry["coordinates"][0])
-    asset = {
-        "href": Path(os.path.relpath(cog, path.parent)).as_posix(), "type": _COG, "roles": ["data"],
-        "title": "Orthoimage", "proj:shape": shape, "proj:transform": transform,
+    item = raster_item(
+        grid, identifier=_identifier(cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
+        title="Orthoimage", properties=_properties(cog), asset="orthoimage", bands=bands,
+    )  # fmt: skip
+    with written_whole(path) as part:
+        part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def raster_item(
+    grid: GroundGrid, *, identifier: str, href: str, title: str, properties: Mapping[str, Any], asset: str,
+    bands: int = 4,
+) -> dict[str, Any]:  # fmt: skip
+    """The item of a COG, without links.
+
+    Args:
+        grid: where it lies. identifier: of the item. href: of the COG, relative to the item.
+        title: of the asset. properties: of the item, times among them. asset: its key. bands: how many the COG has.
+    """
+    west, south, east, north = grid.bounds
+    ring = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
+    corners = np.round(LocalGrid(grid.epsg).to_geographic(ring)[:, ::-1], 8)
+    described = {
+        "href": href, "type": _COG, "roles": ["data"],
+        "title": title, "proj:shape": [grid.height, grid.width], "proj:transform": list(grid.affine()),
         "raster:bands": [
-            {"name": name, "data_type": "uint8", "spatial_resolution": gsd, "sampling": "area"}
+            {"name": name, "data_type": "uint8", "spatial_resolution": grid.gsd_m, "sampling": "area"}
             for name in _COLOURS[:bands]
         ],
         "bands": [{"name": name} for name in _COLOURS[:bands]],
     }  # fmt: skip
-    item = {
-        "type": "Feature", "stac_version": "1.1.0", "stac_extensions": _EXTENSIONS, "id": _identifier(cog),
+    return {
+        "type": "Feature", "stac_version": "1.1.0", "stac_extensions": _EXTENSIONS, "id": identifier,
         "geometry": {"type": "Polygon", "coordinates": [corners.tolist()]},
         "bbox": [*corners.min(0).tolist(), *corners.max(0).tolist()],
-        "properties": _properties(cog) | {"proj:code": f"EPSG:{epsg}", "gsd": gsd},
-        "links": [], "assets": {"orthoimage": asset},
+        "properties": {**properties, "proj:code": f"EPSG:{grid.epsg}", "gsd": grid.gsd_m},
+        "links": [], "assets": {asset: described},
     }  # fmt: skip
-    with written_whole(path) as part:
-        part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _identifier(cog: Path) -> str:

@@ -41,6 +41,7 @@ from orthoswarm.refine.registration.map_offset import had_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
+from orthoswarm.stores.local_copies import copy_ahead
 from orthoswarm.trajectory.legs import leads_one_way
 
 Array = NDArray[np.float64]
@@ -107,6 +108,7 @@ def refine_tracked(
         None where the pictures cannot be tracked or the adjustment of the tracks fails; they are then matched in pairs.
     """
     watch = Stopwatch()
+    copy_ahead(f.path for f in frames)
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     flight = open_flight(frames, LocalGrid(epsg), origin, options.read, start)

@@ -4,13 +4,12 @@ Reads the head of a JPEG (and two kilobytes of its end, to check that it is comp
 chunk; TIFF through a memory map. A photo costs a few tens of microseconds.
 """
 
-import mmap
-import os
-import stat
 import struct
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from orthoswarm.stores.ranges import Parts, open_parts
 from telemetry.formats.photo import exif, xmp
 from telemetry.samples.unreadable import Unreadable
 
@@ -53,39 +52,37 @@ def read_container(path: Path) -> Container:
 
     Raises:
         NotAPicture: empty, unreadable, of another type, or cut off.
+        StoreLostError: the store that it lies in cannot be reached.
     """
-    try:
-        fd = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
-    except OSError as error:
-        raise NotAPicture(f"the file cannot be opened ({error.strerror}); check its permissions") from None
-    try:
-        state = os.fstat(fd)
-        if not stat.S_ISREG(state.st_mode):  # reading from a named pipe could block for ever
+    with ExitStack() as stack:
+        try:
+            parts = stack.enter_context(open_parts(path))
+        except OSError as error:
+            raise NotAPicture(f"the file cannot be opened ({error.strerror}); check its permissions") from None
+        if not parts.is_file:  # reading from a named pipe could block for ever
             raise NotAPicture("this is not a file but a pipe or a device; copy the picture itself here")
-        size = state.st_size
-        head = os.read(fd, _HEAD)
-        if size == 0 or not head:
-            raise NotAPicture("the file is empty; copy it again from the camera")
-        return _by_content(fd, head, size)
-    except struct.error:
-        raise NotAPicture("the picture is cut off; copy it again from the camera") from None
-    except (OSError, ValueError, OverflowError) as error:
-        raise NotAPicture(f"the file cannot be read ({error}); copy it again from the camera") from None
-    finally:
-        os.close(fd)
+        try:
+            head = parts.read(0, _HEAD)
+            if parts.size == 0 or not head:
+                raise NotAPicture("the file is empty; copy it again from the camera")
+            return _by_content(parts, head, parts.size)
+        except struct.error:
+            raise NotAPicture("the picture is cut off; copy it again from the camera") from None
+        except (OSError, ValueError, OverflowError) as error:
+            raise NotAPicture(f"the file cannot be read ({error}); copy it again from the camera") from None
 
 
-def _by_content(fd: int, head: bytes, size: int) -> Container:
+def _by_content(parts: Parts, head: bytes, size: int) -> Container:
     if head[:3] == b"\xff\xd8\xff":
-        return _jpeg(fd, head, size)
+        return _jpeg(parts, head, size)
     if head[:8] == b"\x89PNG\r\n\x1a\n":
-        return _png(fd, size)
+        return _png(parts, size)
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return _webp(fd, size)
+        return _webp(parts, size)
     if head[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff(fd)
+        return _tiff(parts)
     if head[:4] in (b"II+\0", b"MM\0+"):
-        return _big_tiff(fd, head[:1] == b"I")
+        return _big_tiff(parts, head[:1] == b"I")
     if head[:2] == b"BM" and len(head) >= 26:
         width, height = struct.unpack_from("<ii", head, 18)
         return Container(kind="bmp", width=abs(width), height=abs(height), exif=exif.Exif())
@@ -94,19 +91,14 @@ def _by_content(fd: int, head: bytes, size: int) -> Container:
     raise NotAPicture("the content is not a picture that can be read (JPEG, PNG, TIFF, WebP, BMP); leave the file out")
 
 
-def _read_at(fd: int, offset: int, length: int) -> bytes:
-    os.lseek(fd, offset, os.SEEK_SET)
-    return os.read(fd, length)
-
-
-def _jpeg(fd: int, head: bytes, size: int) -> Container:
+def _jpeg(parts: Parts, head: bytes, size: int) -> Container:
     """Segments up to the start of the scan, then the end."""
     base, data, at = 0, head, 2
     found: Container | None = None
     tags, packet = exif.Exif(), b""
     for _ in range(_MAX_SEGMENTS):
         if at + 4 - base > len(data):
-            base, data = at, _read_at(fd, at, _HEAD)
+            base, data = at, parts.read(at, _HEAD)
         if len(data) - (at - base) < 4:
             break
         mark, code, length = struct.unpack_from(">BBH", data, at - base)
@@ -119,7 +111,7 @@ def _jpeg(fd: int, head: bytes, size: int) -> Container:
             break
         wanted = code == 0xE1 or code in _START_OF_FRAME
         if wanted and at + 2 + length - base > len(data):
-            base, data = at, _read_at(fd, at, 2 + length)
+            base, data = at, parts.read(at, 2 + length)
         body = data[at + 4 - base : at + 2 + length - base] if wanted else b""
         if code in _START_OF_FRAME and len(body) >= 5:
             height, width = struct.unpack_from(">HH", body, 1)
@@ -133,40 +125,40 @@ def _jpeg(fd: int, head: bytes, size: int) -> Container:
         at += 2 + max(length, 2)
     if found is None or found.width == 0 or found.height == 0:
         raise NotAPicture("the JPEG is cut off in its header; copy it again from the camera")
-    if not _jpeg_is_complete(fd, at, size):
+    if not _jpeg_is_complete(parts, at, size):
         raise NotAPicture("the JPEG is cut off (its end is missing); copy it again from the camera")
     found.exif, found.xmp = tags, packet
     return found
 
 
-def _jpeg_is_complete(fd: int, scan: int, size: int) -> bool:
+def _jpeg_is_complete(parts: Parts, scan: int, size: int) -> bool:
     """Whether an end-of-image mark follows the scan; within a scan the encoder never writes those two bytes."""
     start = max(scan, size - _TAIL)
-    if b"\xff\xd9" in _read_at(fd, start, size - start):
+    if b"\xff\xd9" in parts.read(start, size - start):
         return True
     end = start
     while end > scan:  # rare: long trailing data after the picture, or a truncated file
         start = max(scan, end - (1 << 20))
-        if b"\xff\xd9" in _read_at(fd, start, end - start + 1):
+        if b"\xff\xd9" in parts.read(start, end - start + 1):
             return True
         end = start
     return False
 
 
-def _png(fd: int, size: int) -> Container:
+def _png(parts: Parts, size: int) -> Container:
     at, width, height = 8, 0, 0
     tags, packet = exif.Exif(), b""
     for _ in range(_MAX_SEGMENTS):
-        head = _read_at(fd, at, 8)
+        head = parts.read(at, 8)
         if len(head) < 8:
             break
         length, kind = struct.unpack(">I4s", head)
         if kind == b"IHDR":
-            width, height = struct.unpack(">II", _read_at(fd, at + 8, 8))
+            width, height = struct.unpack(">II", parts.read(at + 8, 8))
         elif kind == b"eXIf" and length < 1 << 20:
-            tags = exif.parse_tiff(_read_at(fd, at + 8, length))
+            tags = exif.parse_tiff(parts.read(at + 8, length))
         elif kind == b"iTXt" and length < 1 << 20:
-            body = _read_at(fd, at + 8, length)
+            body = parts.read(at + 8, length)
             packet = body[max(body.find(xmp.PACKET_START), 0) :] if xmp.PACKET_START in body else packet
         elif kind == b"IEND":
             if width and height:
@@ -176,51 +168,51 @@ def _png(fd: int, size: int) -> Container:
     raise NotAPicture("the PNG is cut off; copy it again")
 
 
-def _webp(fd: int, size: int) -> Container:
+def _webp(parts: Parts, size: int) -> Container:
     at, width, height = 12, 0, 0
     tags, packet = exif.Exif(), b""
     for _ in range(_MAX_SEGMENTS):
-        head = _read_at(fd, at, 8)
+        head = parts.read(at, 8)
         if len(head) < 8:
             break
         kind, length = struct.unpack("<4sI", head)
         if at + 8 + length > size:
             raise NotAPicture("the WebP file is cut off; copy it again")
         if kind == b"VP8X":
-            body = _read_at(fd, at + 8, 10)
+            body = parts.read(at + 8, 10)
             width = int.from_bytes(body[4:7], "little") + 1
             height = int.from_bytes(body[7:10], "little") + 1
         elif kind == b"VP8 ":
-            body = _read_at(fd, at + 8, 10)
+            body = parts.read(at + 8, 10)
             width, height = (v & 0x3FFF for v in struct.unpack("<HH", body[6:10]))
         elif kind == b"VP8L":
-            bits = int.from_bytes(_read_at(fd, at + 9, 4), "little")
+            bits = int.from_bytes(parts.read(at + 9, 4), "little")
             width, height = (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
         elif kind == b"EXIF" and length < 1 << 20:
-            body = _read_at(fd, at + 8, length)
+            body = parts.read(at + 8, length)
             tags = exif.parse_tiff(body[6:] if body[:6] == b"Exif\0\0" else body)
         elif kind == b"XMP " and length < 1 << 20:
-            packet = _read_at(fd, at + 8, length)
+            packet = parts.read(at + 8, length)
         at += 8 + length + (length & 1)
     if not width or not height:
         raise NotAPicture("the WebP file is damaged; copy it again")
     return Container(kind="webp", width=width, height=height, exif=tags, xmp=packet)
 
 
-def _big_tiff(fd: int, little: bool) -> Container:
+def _big_tiff(parts: Parts, little: bool) -> Container:
     """A BigTIFF, whose offsets have 64 bits: a map if it is georeferenced; no camera writes such pictures."""
     order = "<" if little else ">"
-    (first,) = struct.unpack(order + "Q", _read_at(fd, 8, 8))
-    (count,) = struct.unpack(order + "Q", _read_at(fd, first, 8))
-    entries = _read_at(fd, first + 8, 20 * min(count, _MAX_SEGMENTS))
+    (first,) = struct.unpack(order + "Q", parts.read(8, 8))
+    (count,) = struct.unpack(order + "Q", parts.read(first, 8))
+    entries = parts.read(first + 8, 20 * min(count, _MAX_SEGMENTS))
     tags = {struct.unpack_from(order + "H", entries, at)[0] for at in range(0, len(entries) - 19, 20)}
     if exif.GEO_KEYS not in tags:
         raise NotAPicture("a BigTIFF is not a picture of a camera; save it as TIFF or JPEG")
     return Container(kind="tiff", width=0, height=0, exif=exif.Exif(), georeferenced=True)
 
 
-def _tiff(fd: int) -> Container:
-    with mmap.mmap(fd, 0, access=mmap.ACCESS_READ) as data:
+def _tiff(parts: Parts) -> Container:
+    with parts.whole() as data:
         tags = exif.parse_tiff(data)
     width, height = exif.number(tags.main.get(exif.WIDTH)), exif.number(tags.main.get(exif.HEIGHT))
     if not width or not height:

@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.coverage.coverage_files import draw_cells, write_cells, write_gaps
     from orthoswarm.coverage.gaps import find_gaps
     from orthoswarm.coverage.map_folder import read_map
+    from orthoswarm.export.catalog.tiled_raster import product_file
     from orthoswarm.export.product_files import write_json
     from orthoswarm.model.errors import InputError
     from orthoswarm.model.geo import LocalGrid
@@ -76,9 +77,8 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     write_cells(args.out / "cells.tif", cover)
     write_gaps(args.out, gaps, area.grid)
-    ortho = next(
-        (p for p in (args.map / n for n in ("orthoimage.tif", "coarse.tif", "realtime.tif")) if p.exists()), None
-    )
+    rasters = (product_file(args.map, name) for name in ("orthoimage.tif", "coarse.tif", "realtime.tif"))
+    ortho = next((path for path in rasters if path is not None), None)
     draw_cells(args.out / "coverage.png", cover, gaps, ortho)
     write_json(args.out / "coverage.json", figures)
     if args.json:

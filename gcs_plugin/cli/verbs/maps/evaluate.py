@@ -76,8 +76,11 @@ def _against_reference(args: argparse.Namespace) -> dict[str, Any]:
     from orthoswarm.evaluation.displacement import FieldSettings
     from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask, seen_share
     from orthoswarm.evaluation.true_cameras import evaluate_poses, read_truth
+    from orthoswarm.export.catalog.tiled_raster import product_file
 
-    ortho = args.ortho / "orthoimage.tif" if args.ortho.is_dir() else args.ortho
+    ortho = args.ortho
+    if ortho.is_dir():
+        ortho = product_file(ortho, "orthoimage.tif") or ortho / "orthoimage.tif"
     mask = find_mask(args.reference, args.mask)
     result = evaluate_ortho(ortho, args.reference, mask, FieldSettings(search_m=args.search), args.gsd)
     figures: dict[str, Any] = dict(result.figures())

@@ -88,12 +88,13 @@ Tell = Callable[[int, int], None]
 
 def _layer(args: argparse.Namespace) -> Path:
     """The picture to export."""
+    from orthoswarm.export.catalog.tiled_raster import product_file
     from orthoswarm.model.errors import InputError
 
     names = [args.layer] if args.layer else ["orthoimage", "coarse", "realtime"]
     for name in names:
-        path = Path(args.map / f"{name}.tif")
-        if path.exists():
+        path = product_file(args.map, f"{name}.tif")
+        if path is not None:
             return path
     raise InputError(f"{args.map} holds no {' or '.join(names)}.tif; make the map with `orthoswarm mosaic` first")
 
@@ -141,12 +142,13 @@ def _cameras(kind: str, args: argparse.Namespace, dest: Path, tell: Tell, notes:
     from orthoswarm.export.opensfm_folder import write_opensfm
     from orthoswarm.export.product_files import read_frames
     from orthoswarm.model.errors import InputError
+    from orthoswarm.stores.addresses import path_of
 
     lines = args.map / "frames.jsonl"
     if not lines.exists():
         raise InputError(f"{args.map} holds no frames.jsonl; make the map with `orthoswarm mosaic` first")
     report = json.loads((args.map / "report.json").read_text(encoding="utf-8"))
-    root = args.images or (Path(report["root"]) if report.get("root") else None)
+    root = args.images or (path_of(report["root"]) if report.get("root") else None)
 
     def find(row: Mapping[str, Any]) -> Path | None:
         path = root / row["image"] if root else None

@@ -4,6 +4,13 @@ import argparse
 import gc
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthoswarm.stores.addresses import address_of, path_of
+
+if TYPE_CHECKING:
+    from orthoswarm.compute.workers import Workers
+    from orthoswarm.model.frame import Ingest
 
 _REASONS = 5  # printed; all are in the report
 
@@ -11,13 +18,15 @@ _REASONS = 5  # printed; all are in the report
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
-        "A folder of photos is read with its sub-folders; each sub-folder with photos is one vehicle.\n\n"
-        "example:\n  orthoswarm mosaic photos --basemap before.tif --out map"
+        "A folder of photos is read with its sub-folders; each sub-folder with photos is one vehicle.\n"
+        "INPUT, MAP, the DEM and DIR may be addresses: s3://, gs:// or, to read, https:// (docs/cluster.md).\n\n"
+        "examples:\n  orthoswarm mosaic photos --basemap before.tif --out map\n"
+        "  orthoswarm mosaic s3://flood/photos --basemap s3://flood/before.tif --out s3://flood/map"
     )
     add = parser.add_argument
-    add("inputs", nargs="+", type=Path, metavar="INPUT", help="folders of photos, photos, videos")
-    add("--basemap", type=Path, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
-    add("--out", type=Path, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
+    add("inputs", nargs="+", type=path_of, metavar="INPUT", help="folders of photos, photos, videos")
+    add("--basemap", type=path_of, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
+    add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
     refiners = _refiners()
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
     add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
@@ -27,7 +36,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
     add("--sei-layout", type=Path, action="append", default=[], metavar="FILE", help="layout of a maker's private SEI")
     add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
-    add("--dem", type=Path, metavar="FILE", help="raster of ground heights, instead of terrain found from the pictures")
+    add(
+        "--dem",
+        type=path_of,
+        metavar="FILE",
+        help="raster of ground heights, instead of terrain found from the pictures",
+    )
     add(
         "--surface", type=Path, metavar="FILE.tif",
         help="also write a surface model there: height of ground, roofs and crowns, with its sigma",
@@ -58,6 +72,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="blend pictures over a few pixels at seams, or not",
     )
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
+    add(
+        "--tiles", choices=("auto", "yes", "no"), default="auto",
+        help="write rasters in tiles with a STAC collection (default: those of more than 4 billion pixels)",
+    )  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core, one for few photos)")
     add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
@@ -72,7 +90,7 @@ def _refiners() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Make the map."""
-    from orthoswarm.compute.workers import Processes, Workers, prepare_process, workers
+    from orthoswarm.compute.workers import Processes, prepare_process
 
     prepare_process()
     # Objects of tens of thousands of photos live to the end: collecting garbage among them would cost a tenth of the
@@ -87,7 +105,8 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
     from orthoswarm.config import override, read_overrides
     from orthoswarm.model.errors import InputError
-    from orthoswarm.model.frame import Ingest
+    from orthoswarm.stores.addresses import is_stored
+    from orthoswarm.stores.published_folder import PublishedFolder
 
     _check(args)
     options = pipeline.Options(
@@ -106,21 +125,24 @@ def run(args: argparse.Namespace) -> int:
         checkpoints=args.checkpoints,
         pixel_scale=args.pixel_scale,
         covariance=args.covariance,
+        tiles=args.tiles,
         config=read_overrides(args.config) if args.config is not None else {},
     )
 
     override(options.config)  # before workers are started, which have their own values
 
-    def load(progress: pipeline.Progress) -> Ingest:
+    def load(progress: pipeline.Progress) -> "Ingest":
         reading = telemetry.LoadOptions(
             every_m=args.every_m,
             every_s=args.every_s,
-            cache=args.out / ".work" / VIDEO,
+            cache=out / ".work" / VIDEO,
             exclude=(args.out,),
             sei_layouts=tuple(args.sei_layout),
-            run=None if args.cluster or pool is None else pool.map,
+            run=None if pool is None or (args.cluster and drawers is None) else pool.map,
         )
         ingest = telemetry.load(args.inputs, progress=progress, options=reading)
+        if drawers is not None:
+            _refuse_videos(ingest)
         if isinstance(pool, Processes) and args.workers is None:
             pool.fit(sum(frame.width * frame.height for frame in ingest.frames))
         return ingest
@@ -128,20 +150,20 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_file():
         raise InputError(f"{args.out} is a file; choose a folder for --out")
     pool: Workers | None = None
-    folders = missing(args.out)
+    drawers: Workers | None = None
+    published = PublishedFolder(args.out) if is_stored(args.out) else None
+    out = args.out if published is None else published.local
+    folders = missing(out)
     try:
-        if args.cluster:
-            from orthoswarm.compute.dask_cluster import Cluster
-
-            args.out.mkdir(parents=True, exist_ok=True)  # the workers read it from there
-            pool = Cluster(args.cluster, [p for p in (*args.inputs, args.out, args.basemap, args.dem) if p is not None])
-        else:
-            pool = workers(args.workers)
+        pool, drawers = _pools(args, out)
         with ProgressBars() as progress:
-            report = pipeline.run(load, args.out, options, pool, progress)
+            report = pipeline.run(load, out, options, pool, progress, drawers=drawers)
+            if published is not None:
+                published.publish(pipeline.WRITTEN, progress)
     finally:
-        if pool is not None:
-            pool.close()
+        for each in (pool, drawers):
+            if each is not None:
+                each.close()
         unmake(folders)
     if args.json:
         json.dump(report, sys.stdout, indent=1, ensure_ascii=False)
@@ -151,9 +173,42 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _pools(args: argparse.Namespace, out: Path) -> "tuple[Workers, Workers | None]":
+    """What refines, and what draws if that is something else.
+
+    Workers of a cluster draw where they see the output folder. Photos in a store need no folder that all see: the
+    cluster refines then, and this machine draws.
+    """
+    from orthoswarm.compute.workers import workers
+    from orthoswarm.model.errors import InputError
+    from orthoswarm.stores.addresses import is_stored
+
+    if not args.cluster:
+        return workers(args.workers), None
+    from orthoswarm.compute.dask_cluster import Cluster
+
+    apart = all(map(is_stored, args.inputs))
+    read = [p for p in (*args.inputs, args.basemap, args.dem) if p is not None and not is_stored(p)]
+    if apart:
+        return Cluster(args.cluster, read), workers(args.workers)
+    if is_stored(args.out):
+        raise InputError("with --cluster and photos in a folder, --out has to be a folder, too, that all workers see")
+    out.mkdir(parents=True, exist_ok=True)  # the workers write there
+    return Cluster(args.cluster, [*read, out]), None
+
+
+def _refuse_videos(ingest: "Ingest") -> None:
+    """Pictures of videos are taken out on this machine, where a cluster does not see them."""
+    from orthoswarm.model.errors import InputError
+
+    if any("#" in frame.image for frame in ingest.frames):
+        raise InputError("pictures of videos in a store are not seen by a cluster; leave out --cluster")
+
+
 def _check(args: argparse.Namespace) -> None:
     """Refuse invalid values."""
     from orthoswarm.model.errors import InputError
+    from orthoswarm.stores.listing import exists
 
     if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
         raise InputError(f"--gsd {args.gsd:g} is not a ground pixel; give metres, for example 0.1")
@@ -183,8 +238,8 @@ def _check(args: argparse.Namespace) -> None:
         ("--checkpoints", args.checkpoints),
     )
     for flag, path in files:
-        if path is not None and not path.exists():
-            raise InputError(f"{flag} {path} does not exist; check the path")
+        if path is not None and not exists(path):
+            raise InputError(f"{flag} {address_of(path)} does not exist; check the path")
 
 
 def _tell(report: dict[str, object], out: Path) -> None:
@@ -193,7 +248,7 @@ def _tell(report: dict[str, object], out: Path) -> None:
 
     frames = report["frames"]
     assert isinstance(frames, dict)
-    print(f"{frames['used']} of {frames['input']} pictures mapped in {report['wall_s']:.0f} s: {out}")
+    print(f"{frames['used']} of {frames['input']} pictures mapped in {report['wall_s']:.0f} s: {address_of(out)}")
     left_out = report["left_out"]
     assert isinstance(left_out, dict)
     reasons = list(left_out.items())
@@ -201,7 +256,7 @@ def _tell(report: dict[str, object], out: Path) -> None:
         print(f"left out: {count}: {reason}", file=sys.stderr)
     if len(reasons) > _REASONS:
         rest = sum(count for _, count in reasons[_REASONS:])
-        print(f"left out: {rest} more, see {out / 'report.html'}", file=sys.stderr)
+        print(f"left out: {rest} more, see {address_of(out / 'report.html')}", file=sys.stderr)
     warnings = report["warnings"]
     assert isinstance(warnings, list)
     for warning in warnings:

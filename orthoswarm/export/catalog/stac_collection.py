@@ -1,0 +1,189 @@
+"""A STAC collection (1.1.0) of a map in tiles: an item for each tile and one for each vehicle.
+
+All links are relative, so that the folder may be moved, copied or uploaded as it is (a self-contained catalog).
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of, write_json
+from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.sheets.stac_item import raster_item
+from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.model.geo import LocalGrid
+
+Array = NDArray[np.float64]
+_TITLES = {"realtime.tif": "Real-time picture", "coarse.tif": "Coarse orthoimage", "orthoimage.tif": "Orthoimage"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """A placed picture: vehicle, time (ISO 8601) or None, ring float64 (4, 2) of what it sees on the grid."""
+
+    vehicle: str
+    time: str | None
+    ring: Array
+
+
+def write_collection(folder: Path, made: str) -> int:
+    """Write the collection of a map's folder, if rasters of it are in tiles.
+
+    Args:
+        folder: of the map, with frames.jsonl and report.json. made: when the map was made (ISO 8601), for pictures
+            without a time.
+
+    Returns:
+        Number of items; 0 where no raster is in tiles, and nothing is written.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    rasters = {name: tiles for name in _TITLES if (tiles := tiles_of(folder, name))}
+    if not rasters:
+        return 0
+    pictures = _placed_pictures(folder)
+    top, name = folder / FOLDER, _slug(folder.resolve().name or "map")
+    items: list[tuple[str, dict[str, Any]]] = []
+    for raster, tiles in rasters.items():
+        stem = Path(raster).stem
+        for tile in tiles:
+            where = f"{stem}/{Path(tile.name).stem}.json"
+            items.append(
+                (where, _tile_item(tile, f"{name}-{stem}-{Path(tile.name).stem}", _TITLES[raster], pictures, made))
+            )
+    epsg = next(iter(rasters.values()))[0].grid.epsg
+    items += _vehicle_items(pictures, epsg, name, made)
+    for where, item in items:
+        up = "../" * where.count("/")
+        item["collection"] = name
+        item["links"] = [
+            {"rel": rel, "href": f"{up}{COLLECTION}", "type": "application/json"}
+            for rel in ("root", "parent", "collection")
+        ]
+        write_json(top / where, item)
+    write_json(top / COLLECTION, _collection(folder, name, items, list(rasters)))
+    return len(items)
+
+
+def _placed_pictures(folder: Path) -> list[_Picture]:
+    pictures = []
+    for row in read_frames(folder / "frames.jsonl"):
+        if "homography" in row and row.get("width"):
+            ring = _ring(np.array(row["homography"]), int(row["width"]), int(row["height"]))
+            pictures.append(_Picture(str(row["vehicle"]), row.get("time"), ring))
+    return pictures
+
+
+def _ring(homography: Array, width: int, height: int) -> Array:
+    """What a picture sees, float64 (4, 2) on the grid; the horizon does not count, where it is in the picture."""
+    corners = np.array(
+        [[-0.5, -0.5, 1], [width - 0.5, -0.5, 1], [width - 0.5, height - 0.5, 1], [-0.5, height - 0.5, 1]]
+    )
+    ground = corners @ homography.T
+    middle = float(homography[2] @ [(width - 1) / 2, (height - 1) / 2, 1])
+    if (ground[:, 2] * middle <= 0).any():
+        at = homography @ [(width - 1) / 2, (height - 1) / 2, 1]
+        return np.repeat((at[:2] / at[2])[None], 4, axis=0)
+    return np.asarray(ground[:, :2] / ground[:, 2:], np.float64)
+
+
+def _tile_item(
+    tile: RasterTile, identifier: str, title: str, pictures: Sequence[_Picture], made: str
+) -> dict[str, Any]:
+    west, south, east, north = tile.grid.bounds
+    seen = [
+        p for p in pictures
+        if (p.ring.max(0) >= (west, south)).all() and (p.ring.min(0) <= (east, north)).all()
+    ]  # fmt: skip
+    properties = {"title": f"{title}, {Path(tile.name).stem}", **_times(seen or pictures, made)}
+    return raster_item(
+        tile.grid, identifier=identifier, href=tile.name, title=title, properties=properties,
+        asset=Path(title.lower().replace(" ", "-")).name,
+    )  # fmt: skip
+
+
+def _vehicle_items(pictures: Sequence[_Picture], epsg: int, name: str, made: str) -> list[tuple[str, dict[str, Any]]]:
+    """An item for each vehicle, with the hull of what its pictures see."""
+    import shapely
+
+    by_vehicle: defaultdict[str, list[_Picture]] = defaultdict(list)
+    for picture in pictures:
+        by_vehicle[picture.vehicle].append(picture)
+    grid, items, used = LocalGrid(epsg), [], set[str]()
+    for vehicle in sorted(by_vehicle):
+        own = by_vehicle[vehicle]
+        hull = shapely.convex_hull(shapely.multipoints(np.concatenate([p.ring for p in own])))
+        outline = np.array(hull.exterior.coords) if hull.geom_type == "Polygon" else np.array(hull.envelope.coords)
+        lat_lon = grid.to_geographic(outline)
+        ring = np.round(lat_lon[:, ::-1], 8)
+        slug = _slug(vehicle)
+        while slug in used:
+            slug += "_"
+        used.add(slug)
+        up = "../../"
+        assets = {
+            "frames": {"href": f"{up}frames.jsonl", "type": "application/jsonl", "roles": ["metadata"],
+                       "title": "Where each picture lies"},
+            "footprints": {"href": f"{up}footprints.gpkg", "type": "application/geopackage+sqlite3",
+                           "roles": ["metadata"], "title": "What each picture sees"},
+        }  # fmt: skip
+        item: dict[str, Any] = {
+            "type": "Feature", "stac_version": "1.1.0", "stac_extensions": [], "id": f"{name}-vehicle-{slug}",
+            "geometry": {"type": "Polygon", "coordinates": [ring.tolist()]},
+            "bbox": [*ring.min(0).tolist(), *ring.max(0).tolist()],
+            "properties": {"title": f"Pictures of {vehicle}", "orthoswarm:vehicle": vehicle,
+                           "orthoswarm:pictures": len(own), **_times(own, made)},
+            "assets": assets,
+        }  # fmt: skip
+        items.append((f"{VEHICLES}/{slug}.json", item))
+    return items
+
+
+def _times(pictures: Sequence[_Picture], made: str) -> dict[str, str]:
+    times = sorted(p.time for p in pictures if p.time)
+    if not times:
+        return {"datetime": made}
+    return {"datetime": times[0], "start_datetime": times[0], "end_datetime": times[-1]}
+
+
+def _collection(
+    folder: Path, name: str, items: Sequence[tuple[str, Mapping[str, Any]]], rasters: Sequence[str]
+) -> dict[str, Any]:
+    boxes = np.array([item["bbox"] for _, item in items])
+    times = [item["properties"] for _, item in items]
+    starts = sorted(p.get("start_datetime", p["datetime"]) for p in times)
+    ends = sorted(p.get("end_datetime", p["datetime"]) for p in times)
+    stated = stated_accuracy(folder)
+    assets = {
+        Path(raster).stem: {"href": f"../{Path(raster).stem}.vrt", "type": "application/x-ogc-vrt", "roles": ["data"],
+                            "title": f"{_TITLES[raster]}, all tiles as one raster"}
+        for raster in rasters
+    }  # fmt: skip
+    assets["report"] = {
+        "href": "../report.html", "type": "text/html", "roles": ["metadata"], "title": "The map's accuracy",
+    }  # fmt: skip
+    links = [{"rel": "root", "href": f"./{COLLECTION}", "type": "application/json"}]
+    links += [{"rel": "item", "href": f"./{where}", "type": "application/geo+json"} for where, _ in items]
+    return {
+        "type": "Collection", "stac_version": "1.1.0", "stac_extensions": [], "id": name,
+        "title": "Orthoimage of drone photos",
+        "description": stated.sentence if stated else "An orthoimage of drone photos in tiles.",
+        "license": "other",
+        "extent": {
+            "spatial": {"bbox": [[*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()]]},
+            "temporal": {"interval": [[starts[0], ends[-1]]]},
+        },
+        "links": links, "assets": assets,
+    }  # fmt: skip
+
+
+def _slug(name: str) -> str:
+    """A name of letters, digits, dots and hyphens, as file names and ids of STAC should be."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "map"

@@ -1,0 +1,222 @@
+"""A raster in tiles: COGs in a folder, and a virtual raster (VRT) beside it that QGIS and GDAL open as one.
+
+orthoimage.vrt
+tiles/orthoimage/r000_c000.tif ...
+"""
+
+import contextlib
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from pyproj import CRS
+
+from orthoswarm.config import active
+from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.cog import Source, write_cog
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import GroundGrid
+
+FOLDER = "tiles"
+"""Folder of all tiles and of the collection, within the map's."""
+COLLECTION = "collection.json"
+VEHICLES = "vehicles"
+Tiles = Literal["auto", "yes", "no"]
+_NAME = re.compile(r"r(\d+)_c(\d+)\.tif")
+
+
+@dataclass(frozen=True, slots=True)
+class RasterTile:
+    """One file of a raster in tiles: its name in the raster's folder, and where it lies on the ground."""
+
+    name: str
+    grid: GroundGrid
+
+
+def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:
+    """Whether rows and columns (row0, row1, col0, col1) of a raster are to be written in tiles."""
+    row0, row1, col0, col1 = window
+    return wanted == "yes" or (wanted == "auto" and (row1 - row0) * (col1 - col0) > active().export.one_file_px)
+
+
+def product_file(folder: Path, name: str) -> Path | None:
+    """The raster `name` (`orthoimage.tif`) of a map's folder, as one file or as the virtual raster of its tiles.
+
+    Returns:
+        None if the folder holds neither.
+    """
+    whole, virtual = folder / name, _virtual(folder, name)
+    return whole if whole.exists() else virtual if virtual.exists() else None
+
+
+def remove_product(folder: Path, name: str) -> None:
+    """Remove a raster, in whichever form it is there."""
+    (folder / name).unlink(missing_ok=True)
+    remove_tiles(folder, name)
+
+
+def remove_tiles(folder: Path, name: str) -> None:
+    """Remove a raster's tiles and the virtual raster of them."""
+    if _virtual(folder, name).exists():
+        _virtual(folder, name).unlink()
+        shutil.rmtree(_tiles(folder, name), ignore_errors=True)
+    with contextlib.suppress(OSError):
+        (folder / FOLDER).rmdir()  # if nothing is left in it
+
+
+def remove_collection(folder: Path) -> None:
+    """Remove the collection and its vehicles, not the tiles."""
+    top = folder / FOLDER
+    if (top / COLLECTION).exists():
+        (top / COLLECTION).unlink()
+        shutil.rmtree(top / VEHICLES, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            top.rmdir()  # if nothing is left in it
+
+
+def write_tiled(
+    source: Source, folder: Path, name: str, *, window: tuple[int, int, int, int], drawn: Iterable[BoundingBox],
+    progress: Callable[[int, int], None] | None = None, threads: int = 2,
+) -> None:  # fmt: skip
+    """Write a raster in tiles; tiles without content are left out.
+
+    Args:
+        source: where the pixels come from. folder: the map's. name: the product, `orthoimage.tif`.
+        window: rows and columns (row0, row1, col0, col1) to write, the first ones multiples of 512.
+        drawn: parts of the ground that have content, metres.
+        progress: called with tiles written and tiles in all. threads: how many blocks are compressed at once.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    side, grid = active().export.tile_px, source.grid
+    row0, row1, col0, col1 = window
+    filled = {
+        (r, c)
+        for bounds in drawn
+        for r, c in _touched(bounds, grid, (row0, col0), side)
+        if row0 + r * side < row1 and col0 + c * side < col1
+    }
+    with written_whole(_tiles(folder, name)) as part:
+        part.mkdir()
+        for done, (r, c) in enumerate(sorted(filled), 1):
+            top, left = row0 + r * side, col0 + c * side
+            inside = (top, min(top + side, row1), left, min(left + side, col1))
+            write_cog(source, part / f"r{r:03d}_c{c:03d}.tif", window=inside, threads=threads)
+            if progress is not None:
+                progress(done, len(filled))
+    whole = replace(
+        grid, west=grid.west + col0 * grid.gsd_m, north=grid.north - row0 * grid.gsd_m, width=col1 - col0,
+        height=row1 - row0,
+    )  # fmt: skip
+    with written_whole(_virtual(folder, name)) as part:
+        part.write_text(
+            _document(whole, _in_whole(folder, name, whole), Path(FOLDER, Path(name).stem)), encoding="utf-8"
+        )
+    (folder / name).unlink(missing_ok=True)
+
+
+def copy_tiled(folder: Path, name: str, other: str) -> None:
+    """Copy a raster in tiles to another name in the same folder."""
+    with written_whole(_tiles(folder, other)) as part:
+        shutil.copytree(_tiles(folder, name), part)
+    text = _virtual(folder, name).read_text(encoding="utf-8")
+    with written_whole(_virtual(folder, other)) as part:
+        part.write_text(text.replace(f"{FOLDER}/{Path(name).stem}/", f"{FOLDER}/{Path(other).stem}/"), encoding="utf-8")
+    (folder / other).unlink(missing_ok=True)
+
+
+def tiles_of(folder: Path, name: str) -> list[RasterTile]:
+    """The tiles of a raster, in order of their names; none if it is one file or absent."""
+    import rasterio
+
+    if not _virtual(folder, name).exists():
+        return []
+    with rasterio.open(_virtual(folder, name)) as raster:
+        whole = GroundGrid(
+            epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
+            gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
+        )  # fmt: skip
+    return list(_in_whole(folder, name, whole))
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write one JSON document that appears when it is complete."""
+    with written_whole(path) as part:
+        part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _virtual(folder: Path, name: str) -> Path:
+    return folder / f"{Path(name).stem}.vrt"
+
+
+def _tiles(folder: Path, name: str) -> Path:
+    return folder / FOLDER / Path(name).stem
+
+
+def _touched(
+    bounds: BoundingBox, grid: GroundGrid, first: tuple[int, int], side: int
+) -> Iterator[tuple[int, int]]:  # row and column of tiles
+    west, south, east, north = bounds
+    half = 0.5 * grid.gsd_m  # to the middles of the outermost pixels
+    rows = [int((grid.north - y) / grid.gsd_m - first[0]) // side for y in (north - half, south + half)]
+    cols = [int((x - grid.west) / grid.gsd_m - first[1]) // side for x in (west + half, east - half)]
+    return ((r, c) for r in range(rows[0], rows[1] + 1) for c in range(cols[0], cols[1] + 1))
+
+
+def _in_whole(folder: Path, name: str, whole: GroundGrid) -> Iterator[RasterTile]:
+    """The tiles in a raster's folder, placed on its grid."""
+    side = active().export.tile_px
+    for path in sorted(_tiles(folder, name).glob("*.tif")):
+        found = _NAME.fullmatch(path.name)
+        if found is None:
+            continue
+        r, c = int(found[1]), int(found[2])
+        yield RasterTile(
+            path.name,
+            replace(
+                whole, west=whole.west + c * side * whole.gsd_m, north=whole.north - r * side * whole.gsd_m,
+                width=min(side, whole.width - c * side), height=min(side, whole.height - r * side),
+            ),
+        )  # fmt: skip
+
+
+def _document(whole: GroundGrid, tiles: Iterable[RasterTile], beside: Path) -> str:
+    """The virtual raster: see https://gdal.org/en/stable/drivers/raster/vrt.html."""
+    side = active().export.tile_px
+    placed = list(tiles)
+    sources = []
+    for tile in placed:
+        column = round((tile.grid.west - whole.west) / whole.gsd_m)
+        row = round((whole.north - tile.grid.north) / whole.gsd_m)
+        size = f'xSize="{tile.grid.width}" ySize="{tile.grid.height}"'
+        file = (beside / tile.name).as_posix()
+        sources.append(
+            f'  <SimpleSource>\n   <SourceFilename relativeToVRT="1">{file}</SourceFilename>\n'
+            "   <SourceBand>BAND</SourceBand>\n"
+            f'   <SourceProperties RasterXSize="{tile.grid.width}" RasterYSize="{tile.grid.height}" DataType="Byte" '
+            'BlockXSize="512" BlockYSize="512"/>\n'
+            f'   <SrcRect xOff="0" yOff="0" {size}/>\n   <DstRect xOff="{column}" yOff="{row}" {size}/>\n'
+            "  </SimpleSource>\n"
+        )
+    bands = "".join(
+        f' <VRTRasterBand dataType="Byte" band="{n}">\n  <ColorInterp>{colour}</ColorInterp>\n'
+        + "".join(source.replace("BAND", str(n), 1) for source in sources)
+        + " </VRTRasterBand>\n"
+        for n, colour in enumerate(("Red", "Green", "Blue", "Alpha"), 1)
+    )
+    step = repr(whole.gsd_m)
+    return (
+        f'<VRTDataset rasterXSize="{whole.width}" rasterYSize="{whole.height}">\n <!-- tiles of {side} pixels -->\n'
+        f' <SRS dataAxisToSRSAxisMapping="1,2">{_escaped(CRS.from_epsg(whole.epsg).to_wkt("WKT1_GDAL"))}</SRS>\n'
+        f" <GeoTransform>{whole.west!r}, {step}, 0.0, {whole.north!r}, 0.0, -{step}</GeoTransform>\n"
+        f"{bands}</VRTDataset>\n"
+    )
+
+
+def _escaped(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;")

@@ -1,0 +1,171 @@
+"""Local copies of files from stores, in a cache of bounded size that all processes of a machine share.
+
+A copy appears as a whole. When the cache is full, copies go in the order of their last use, except those that were
+used a moment ago; a copy that went away between two uses is fetched again.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Iterable
+from hashlib import blake2b
+from pathlib import Path
+
+from orthoswarm.config import active
+from orthoswarm.model.errors import StorageError
+from orthoswarm.stores.addresses import address_of, is_stored
+from orthoswarm.stores.ahead import Ahead
+from orthoswarm.stores.listing import known, look_up
+from orthoswarm.stores.requests import StoreRequestError, request
+
+FOLDER_VARIABLE = "ORTHOSWARM_CACHE"
+"""Environment variable that names another folder for copies than the user's cache folder."""
+_SLACK = 16  # the cache may exceed its size by a 16th for each process that writes to it
+_ABANDONED_S = 86_400.0
+_added = 0
+_lock = threading.Lock()
+
+
+def cache_folder() -> Path:
+    """Where copies lie on this machine."""
+    return Path(os.environ.get(FOLDER_VARIABLE) or Path.home() / ".cache" / "orthoswarm")
+
+
+def local_file(path: Path) -> Path:
+    """A local file with the content of a file, under the same name; the path itself if it is local.
+
+    Raises:
+        InputError, NotStoredError, StoreRequestError, StoreLostError: see `requests.request`.
+        StorageError: if the copy cannot be written.
+    """
+    if not is_stored(path):
+        return path
+    _ahead.wait(path)
+    return _copied(path)
+
+
+def copy_ahead(paths: Iterable[Path]) -> None:
+    """Begin to copy those of these files that lie in stores: they will be read soon, in this order."""
+    stored = [path for path in paths if is_stored(path)]
+    if stored:
+        _ahead.announce(stored, active().stores.connections)
+
+
+def _copied(path: Path) -> Path:
+    """The local copy of a file in a store, made if there is none or an old one."""
+    copy = _place(path)
+    now = time.time()
+    with contextlib.suppress(FileNotFoundError):
+        state = copy.stat()
+        trusted = now - state.st_mtime <= active().stores.cache_trust_s
+        if trusted or _is_current(path, copy):  # times of the copy: of its last use, of its last comparison
+            os.utime(copy, (now, state.st_mtime if trusted else now))
+            return copy
+    _fetch(path, copy)
+    return copy
+
+
+_ahead = Ahead(_copied)
+
+
+def content(path: Path) -> bytes:
+    """The bytes of a file, local or in a store.
+
+    Raises:
+        OSError: if a local file cannot be read. Else see `local_file`.
+    """
+    while True:
+        try:
+            return local_file(path).read_bytes()
+        except FileNotFoundError:
+            if not is_stored(path):
+                raise  # a copy that another process has just removed is fetched again
+
+
+def clear_old_copies() -> None:
+    """Remove copies used least recently until the cache is within its size."""
+    config = active().stores
+    limit, now = config.cache_mb * 1e6, time.time()
+    copies: list[tuple[float, int, Path]] = []
+    for folder in _folders(cache_folder() / "copies"):
+        with contextlib.suppress(OSError):
+            for entry in os.scandir(folder):
+                state = entry.stat(follow_symlinks=False)
+                copies.append((state.st_atime, state.st_size, Path(entry.path)))
+    for part in (cache_folder() / "parts").glob("*"):
+        with contextlib.suppress(OSError):
+            if now - part.stat().st_mtime > _ABANDONED_S:  # of a process that was killed
+                part.unlink()
+    total = sum(size for _, size, _ in copies)
+    for used, size, copy in sorted(copies):
+        if total <= limit or now - used < config.held_s:
+            return
+        with contextlib.suppress(OSError):
+            copy.unlink()
+            Path(f"{copy}.version").unlink(missing_ok=True)
+            copy.parent.rmdir()  # if nothing else lies there
+        total -= size
+
+
+def _folders(top: Path) -> list[Path]:
+    try:
+        return [Path(entry.path) for entry in os.scandir(top) if entry.is_dir()]
+    except OSError:
+        return []
+
+
+def _place(path: Path) -> Path:
+    """Where a path's copy lies; the file keeps its name, which users see in messages and GDAL takes its format from."""
+    return cache_folder() / "copies" / blake2b(address_of(path).encode(), digest_size=12).hexdigest() / path.name
+
+
+def _is_current(path: Path, copy: Path) -> bool:
+    """Whether the store still holds what was copied."""
+    try:
+        version = Path(f"{copy}.version").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    found = look_up(path)
+    return version == f"{found.size} {found.version}" != "None "
+
+
+def _fetch(path: Path, copy: Path) -> None:
+    """Copy a file from its store; one that is replaced meanwhile is copied once more."""
+    global _added
+    part = cache_folder() / "parts" / f"{os.getpid()}-{threading.get_ident()}"
+    try:
+        part.parent.mkdir(parents=True, exist_ok=True)
+        for told in (known(path), None):
+            found = told or look_up(path)
+            request(path, lambda system, key: system.get_file(key, str(part)))
+            size = part.stat().st_size
+            if found.size in (None, size):
+                break
+        else:
+            raise StoreRequestError(f"{address_of(path)} came with {size} of {found.size} bytes; upload it again")
+        _put_in_place(part, copy, f"{found.size} {found.version}")
+    except OSError as error:
+        raise StorageError(
+            f"{cache_folder()} cannot be written ({error.strerror}); set {FOLDER_VARIABLE} to a folder with room"
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+    with _lock:
+        _added += size
+        full = _added * _SLACK > active().stores.cache_mb * 1e6
+        _added = 0 if full else _added
+    if full:
+        clear_old_copies()
+
+
+def _put_in_place(part: Path, copy: Path, version: str) -> None:
+    for left in (2, 1, 0):
+        try:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            Path(f"{copy}.version").write_text(version, encoding="utf-8")
+            os.replace(part, copy)
+            return
+        except FileNotFoundError:  # another process has just removed the empty folder
+            if not left:
+                raise

@@ -1,0 +1,106 @@
+"""An S3 server on loopback, and a proxy before it that fails as told."""
+
+import http.client
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+ENVIRONMENT = {
+    "AWS_ACCESS_KEY_ID": "testing",
+    "AWS_SECRET_ACCESS_KEY": "testing",
+    "AWS_DEFAULT_REGION": "us-east-1",
+    "AWS_CONFIG_FILE": os.devnull,
+    "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+}
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def s3_server():
+    """A server process; yields its address."""
+    port = free_port()
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        address = f"http://127.0.0.1:{port}"
+        end = time.monotonic() + 60
+        while True:
+            try:
+                urllib.request.urlopen(f"{address}/moto-api/", timeout=5).close()
+                break
+            except OSError:
+                assert server.poll() is None and time.monotonic() < end, "the S3 server did not start"
+                time.sleep(0.1)
+        yield address
+    finally:
+        server.kill()
+        server.wait(60)
+
+
+class FaultyProxy:
+    """A proxy on loopback; `fault(method, path)` gives None, a status, or seconds to wait before the answer.
+
+    Attributes:
+        address: of the proxy. seen: (method, path with query) of each request.
+    """
+
+    def __init__(self, target):
+        self.fault = lambda method, path: None
+        self.seen = []
+        proxy = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def handle_one(self):
+                length = int(self.headers.get("Content-Length") or 0)
+                body = self.rfile.read(length) if length else None
+                proxy.seen.append((self.command, self.path))
+                fault = proxy.fault(self.command, self.path)
+                if isinstance(fault, float):
+                    time.sleep(fault)
+                elif fault is not None:
+                    return self.answer(fault, {}, b"")
+                headers = {k: v for k, v in self.headers.items() if k.lower() not in ("connection",)}
+                behind = http.client.HTTPConnection(target.removeprefix("http://"), timeout=60)
+                behind.request(self.command, self.path, body, headers)
+                answer = behind.getresponse()
+                self.answer(answer.status, answer.headers, answer.read())
+                behind.close()
+                return None
+
+            def answer(self, status, headers, data):
+                self.send_response(status)
+                for name, value in headers.items():
+                    if name.lower() not in ("connection", "transfer-encoding", "content-length", "date", "server"):
+                        self.send_header(name, value)
+                size = headers.get("Content-Length") if self.command == "HEAD" else None
+                self.send_header("Content-Length", size or str(len(data)))
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(data)
+
+            do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = handle_one
+
+            def log_message(self, *_):
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self.address = f"http://127.0.0.1:{self._server.server_port}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def close(self):
+        self._server.shutdown()
+        self._server.server_close()
