@@ -15,6 +15,7 @@ from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.page_kit import DESK, PHONE, TABLET, opened
 from tests.kit.sim_cameras import Cameras, square
 from tests.page.test_command_bar import confirm
+from tests.vehicles.autopilots.test_fleet_scenarios import charge
 from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess, free_port, small_area
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -49,9 +50,11 @@ def poll_until(page, done, limit_s=600.0):
 
 
 def ended_done(page, count):
-    """All vehicles have acknowledged; the list is dismissed."""
+    """All vehicles have acknowledged; the list is dismissed, unless it goes by itself first (after 12 s)."""
     page.wait_for_function(f"() => document.querySelectorAll('[data-outcome=done]').length >= {count}")
-    page.click("footer >> text=Dismiss")
+    with contextlib.suppress(playwright.TimeoutError):
+        page.click("footer >> text=Dismiss", timeout=15_000)
+    page.wait_for_selector(".command-log", state="hidden")
 
 
 @pytest.mark.slow
@@ -79,6 +82,7 @@ def test_a_real_autopilot_from_an_area_to_the_pack(browser, tmp_path, address, s
     """The same under a real autopilot that carries the twin's camera; see test_twin_camera."""
     if not ADDRESSES:
         pytest.skip("ORTHOSWARM_SITL names no autopilot")
+    charge(address)
     relay, stream, twin = free_port(), free_port(), tmp_path / "twin"
     with contextlib.ExitStack() as opened_here:
         camera = CameraProcess(
