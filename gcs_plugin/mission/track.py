@@ -87,10 +87,16 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points)
-    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission))
+    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=_lands(mission))
     times = motion.times(points) + np.cumsum(waits)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
+
+
+def _lands(mission: "Mission") -> bool:
+    """It ends with LAND, not with a return to launch."""
+    ends = [item.command for item in mission.items if item.command in (RTL, LAND, VTOL_LAND)]
+    return bool(ends) and ends[0] != RTL
 
 
 def _autopilot_of(mission: "Mission") -> AutopilotConfig:

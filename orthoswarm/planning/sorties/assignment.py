@@ -65,6 +65,9 @@ class Options:
     run_in_m: float = 0.0
     wait_s: float = 0.0
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "motion", replace(self.motion, lands=self.end == "land"))
+
     def motion_of(self, vehicle: int) -> Motion:
         """How a vehicle, counted from 0, moves."""
         if not self.autopilots:
