@@ -49,11 +49,22 @@ def poll_until(page, done, limit_s=600.0):
         page.wait_for_timeout(500)
 
 
+COUNT_DONE = """() => {
+  window.done = 0;
+  const count = (row) => { if (row.dataset?.outcome === "done") window.done += 1; };
+  const seen = (change) => change.type === "attributes" ? count(change.target) : change.addedNodes.forEach(count);
+  const list = document.querySelector(".outcomes");
+  new MutationObserver((changes) => changes.forEach(seen))
+    .observe(list, { subtree: true, childList: true, attributeFilter: ["data-outcome"] });
+}"""
+
+
 def ended_done(page, count):
-    """All vehicles have acknowledged; the list is dismissed, unless it goes by itself first (after 12 s)."""
-    page.wait_for_function(f"() => document.querySelectorAll('[data-outcome=done]').length >= {count}")
+    """All vehicles have acknowledged, counted by `COUNT_DONE`: it goes by itself after 12 s, however busy we are."""
+    page.wait_for_function(f"() => window.done >= {count}")
+    page.evaluate("window.done = 0")
     with contextlib.suppress(playwright.TimeoutError):
-        page.click("footer >> text=Dismiss", timeout=15_000)
+        page.click("footer >> text=Dismiss", timeout=5_000)
     page.wait_for_selector(".command-log", state="hidden")
 
 
@@ -112,6 +123,7 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg, way_home=False
 
     `way_home`: pictures of it come after the mission is complete, and the pack waits for them, too.
     """
+    page.evaluate(COUNT_DONE)
     page.click("#tab-plan")
     file = {"name": "area.geojson", "mimeType": "application/json", "buffer": json.dumps(area).encode()}
     page.set_input_files("input[type=file]", files=[file])
