@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from orthoswarm.config.active import override
 from orthoswarm.config.autopilot import ArduPilotConfig
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import Plan
@@ -96,14 +97,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--side", type=float, default=890.0, metavar="M", help="of the square area (default 890)")
     parser.add_argument("--seeds", type=int, default=10, help="flights of each plan (default 10)")
+    parser.add_argument(
+        "--in-turn-share", type=float, metavar="X",
+        help="take off and land in turn if it takes at most so much longer (-1 never, 99 always; default as plans do)",
+    )  # fmt: skip
     args = parser.parse_args()
+    if args.in_turn_share is not None:
+        override({"planning": {"in_turn_share": args.in_turn_share}})
     grid = LocalGrid(32632)
     corner = np.array([[0, 0], [args.side, 0], [args.side, args.side], [0, args.side]]) + CORNER
     area = Area(grid, shapely.Polygon(corner), shapely.MultiPolygon())
     start = grid.to_geographic(CORNER + np.array([-20.0, 0.5 * args.side]))
     print("| vehicles | start | fleet | plan by | makespan s | pairs | met | nearest m | met at the start |")
     print("|---|---|---|---|---|---|---|---|---|")
-    for vehicles in (3, 8, 16, 32):
+    for vehicles in (3, 4, 8, 16, 32):
         for where, starts in (("own", []), ("one", [(float(start[0]), float(start[1]))])):
             for fleet, kinds in (("ArduCopter", ["ardupilot"]), ("PX4", ["px4"]), ("mixed", ["ardupilot", "px4"])):
                 names = [kinds[k % len(kinds)] for k in range(vehicles)]
