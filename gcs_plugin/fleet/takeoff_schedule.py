@@ -36,7 +36,7 @@ class TakeoffSchedule:
     def of(cls, delays: Mapping[int, float], now: float, airspace: Airspace | None = None) -> "TakeoffSchedule":
         """Starts so many seconds from now, by system id."""
         waiting = {system: now + delay for system, delay in delays.items()}
-        return cls(waiting, airspace, {}, dict(waiting), {})
+        return cls(waiting, airspace and airspace.as_planned(delays), {}, dict(waiting), {})
 
     def due(self, now: float) -> list[int]:
         """Vehicles that are due, with no earlier start undecided; they are no longer waiting."""

@@ -7,7 +7,7 @@ later, they are far enough from each other or at another height (orthoswarm.plan
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,7 +28,7 @@ _STEP_S: Final = 0.5
 _GROUND_M: Final = 2.0
 _SPEED_M_S: Final = 5.0
 _HAIR_M: Final = 0.01
-_PAD: Final = 1.5  # radius about a start that vehicles share, in separation distances: only time keeps them apart there
+_PAD: Final = 1.5  # radius about a start that vehicles share, in separation distances
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +87,16 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points)
-    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission))
+    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=_lands(mission))
     times = motion.times(points) + np.cumsum(waits)
     moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
     return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
+
+
+def _lands(mission: "Mission") -> bool:
+    """It ends with LAND, not with a return to launch."""
+    ends = [item.command for item in mission.items if item.command in (RTL, LAND, VTOL_LAND)]
+    return bool(ends) and ends[0] != RTL
 
 
 def _autopilot_of(mission: "Mission") -> AutopilotConfig:
@@ -123,11 +129,13 @@ class _Approaches:
     Attributes:
         delay: int64 (n,), by how many samples the second flight must start later for the pair to be at one time.
         at: int64 (n,), sample of the first flight. distance_m: float64 (n,), horizontal distance.
+        at_start: bool (n,), both are around a start that they share.
     """
 
     delay: Ints
     at: Ints
     distance_m: Array
+    at_start: NDArray[np.bool_]
 
 
 @dataclass(slots=True)
@@ -138,6 +146,7 @@ class Airspace:
         tracks: by system id.
         distance_m, height_m, slack_s: how far apart, or at what other height, and how many seconds off schedule.
         launch_s: time between takeoffs at one start.
+        in_turn: around a start that they share, vehicles keep apart in height, too; if not, by `launch_s` alone.
     """
 
     tracks: dict[int, Track]
@@ -145,7 +154,8 @@ class Airspace:
     height_m: float = 5.0
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = 5.0
-    _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, init=False, repr=False)
+    in_turn: bool = False
+    _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
@@ -158,33 +168,41 @@ class Airspace:
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.
 
-        None if they stay separated by the plan's measure: at any time, and `slack_s` earlier or later.
+        None if they stay separated by the plan's measure: at any time, and `slack_s` earlier or later, around a start
+        that they share a part of it.
         """
         near = self._approaches(one, other)
-        slack, shift = math.ceil(self.slack_s / _STEP_S), round(later_s / _STEP_S)
-        within = np.flatnonzero(np.abs(near.delay - shift) <= slack)
+        slack, pad_slack = math.ceil(self.slack_s / _STEP_S), -1
+        if self.in_turn:  # a sample less than the plan's, which lie at other moments
+            pad_slack = math.ceil(active().planning.pad_slack_share * self.slack_s / _STEP_S) - 1
+        shift = round(later_s / _STEP_S)
+        within = np.flatnonzero(np.abs(near.delay - shift) <= np.where(near.at_start, pad_slack, slack))
         if not len(within):
             return None
         at = within[np.argmin(near.distance_m[within])]
         return float(near.at[at]) * _STEP_S, float(near.distance_m[at])
 
     def _approaches(self, one: int, other: int) -> "_Approaches":
-        """All moments of two flights that lie too near each other, found once; they meet for some delays of the other.
-
-        Not counted is what lies about a start that they share: there only time keeps vehicles apart.
-        """
+        """All moments of two flights too near each other, found once; they meet for some delays of the other."""
         known = self._found.get((one, other))
         if known is None:
             a, b = self.tracks[one].places, self.tracks[other].places
             i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
             counted = np.abs(a[i, 2] - b[j, 2]) < self.height_m - _HAIR_M
+            i, j = i[counted], j[counted]
+            at_start = np.zeros(len(i), bool)
             if self._share_a_start(one, other):
                 pads = [self.tracks[system].pad(_PAD * self.distance_m) for system in (one, other)]
-                counted &= ~(pads[0][i] & pads[1][j])
-            i, j = i[counted], j[counted]
-            known = _Approaches(delay=i - j, at=i, distance_m=np.hypot(*(a[i, :2] - b[j, :2]).T))
+                at_start = pads[0][i] & pads[1][j]
+            distance_m = np.hypot(*(a[i, :2] - b[j, :2]).T)
+            known = _Approaches(delay=i - j, at=i, distance_m=distance_m, at_start=at_start)
             self._found[one, other] = known
         return known
+
+    def as_planned(self, starts: Mapping[int, float]) -> "Airspace":
+        """The same with `in_turn` as these planned starts have it: they may not be moved so that this is lost."""
+        planned = replace(self, in_turn=True)
+        return planned if not planned.conflicts(starts) else replace(self, in_turn=False)
 
     def conflicts(self, starts: Mapping[int, float]) -> list[tuple[int, int, float, float]]:
         """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres."""

@@ -296,7 +296,7 @@ class Flight:
             if item.params[0] > 0.0 and not item.params[2]:  # the first picture only after the distance
                 self._last_photo = self.motion.seen
         elif item.command == CHANGE_SPEED and item.params[1] > 0.0:
-            self.motion.speed = item.params[1]
+            self.motion.speed = self.motion.airframe.held_m_s(item.params[1])
         elif item.command == JUMP and self._jumps.get(seq, 0) < item.params[1]:
             self._jumps[seq] = self._jumps.get(seq, 0) + 1
             return int(item.params[0])
@@ -340,7 +340,10 @@ class Flight:
         if horizontal > _REACHED_M or vertical > 1.0:
             return
         if item.command in (LAND, VTOL_LAND):
-            self._descend(self.motion.target[0], self.motion.target[1]) if self.motion.target else None
+            times = self.motion.airframe.times
+            self._waited += STEP_S
+            if self.motion.target and (times is None or self._waited > times.land_wait_s - _OWN_STOP_S):
+                self._descend(self.motion.target[0], self.motion.target[1])
             return
         if item.command == LOITER_UNLIM:
             return

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Final
 
+import numpy as np
+
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.earth import EQUATOR_RADIUS_M
@@ -110,8 +112,12 @@ class Airframe:
         """Seconds that its autopilot takes longer than its motion for a turn."""
         if self.times is None:
             return 0.0
-        slower = 1.0 / self.times.acceleration_m_s2 - 1.0 / self.accel_m_s2
-        return max(0.0, speed_m_s * math.sin(0.5 * angle_rad) * slower)
+        own_s = speed_m_s * math.sin(0.5 * angle_rad) / self.accel_m_s2
+        return max(0.0, float(planner.Motion(speed_m_s, autopilot=self.times).turn_s(np.array(angle_rad))) - own_s)
+
+    def held_m_s(self, speed_m_s: float) -> float:
+        """The speed that its autopilot holds where so much is asked for."""
+        return speed_m_s if self.times is None else self.times.speed_share * speed_m_s
 
 
 @dataclass(slots=True, kw_only=True)

@@ -20,7 +20,7 @@ from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, stretches
 from orthoswarm.planning.lines.visiting_order import shorten
 from orthoswarm.planning.sorties.assignment import Options, Swarm, Work
-from orthoswarm.planning.sorties.deconfliction import Separation, Slot
+from orthoswarm.planning.sorties.deconfliction import Schedule, Separation, Slot
 from orthoswarm.planning.sorties.flight_heights import FlightHeights, LevelHeights
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
@@ -109,19 +109,19 @@ def plan_area(
         reach_m=min(foot.reach_m, 2.0 * clearance),
     )
     progress("separation")
-    slots = swarm.schedule(best)
+    schedule = swarm.schedule(best)
     progress("coverage")
-    left = over.missed(area.ground, slots)
+    left = over.missed(area.ground, schedule.slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
-    warnings = _warnings(slots, best, foot, options)
+    warnings = _warnings(schedule, best, foot, options)
     if seen < active().planning.complete_share:
         warnings.append(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
         )
     return _plan(
-        method, slots, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
+        method, schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
     )
 
 
@@ -188,18 +188,18 @@ def plan_gaps(
     swarm = Swarm(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
     work = swarm.share(shorten(legs, router, None if swarm.starts is None else swarm.starts[0]), True)
     progress("separation")
-    slots = swarm.schedule(work)
+    schedule = swarm.schedule(work)
     progress("coverage")
-    left = over.missed(area.ground, slots)
+    left = over.missed(area.ground, schedule.slots)
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
-    warnings = _warnings(slots, work, foot, options)
+    warnings = _warnings(schedule, work, foot, options)
     if most < vehicles:
         warnings.append(f"{most} of the {vehicles} vehicles are enough for these gaps")
     if gaps:
         warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
     share = 1.0 - float(left.area) / area.size_m2
     return _plan(
-        "gaps", slots, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, share, gaps)
+        "gaps", schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, share, gaps)
     )
 
 
@@ -267,12 +267,12 @@ def plan_lines(
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
     work = swarm.share(legs, reorder=False)
     progress("separation")
-    slots = swarm.schedule(work)
-    warnings = _warnings(slots, work, foot, options)
-    return _plan("lines", slots, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
+    schedule = swarm.schedule(work)
+    warnings = _warnings(schedule, work, foot, options)
+    return _plan("lines", schedule, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
 
 
-def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Options) -> list[str]:
+def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: Options) -> list[str]:
     result = []
     every_s = foot.trigger_m / options.motion.speed_m_s
     if every_s < active().planning.quickest_s:
@@ -285,10 +285,17 @@ def _warnings(slots: list[list[Slot]], work: Work, foot: Footprint, options: Opt
             f"the longest path is {work.balance:.2f} times the mean: few lines, or long ways out and home, "
             "cannot be shared more evenly"
         )
-    several = [f"v{number}" for number, row in enumerate(slots, start=1) if len(row) > 1]
+    several = [f"v{number}" for number, row in enumerate(schedule.slots, start=1) if len(row) > 1]
     if several and not options.endurances_s and not np.isfinite(options.endurance_s):
         result.append(
             f"one mission holds at most {options.most_items} items, so {', '.join(several)} must fly several sorties"
+        )
+    if not schedule.in_turn:
+        apart = options.separation
+        result.append(
+            f"vehicles of one start take off and land beside each other, {apart.launch_s:g} s apart: in turn, all "
+            f"would be done {schedule.saved_s / 60:.1f} min later; give each its own start, {apart.distance_m:g} m or "
+            "more from the next"
         )
     return result
 
@@ -336,7 +343,7 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
 
 def _plan(
     method: str,
-    slots: list[list[Slot]],
+    schedule: Schedule,
     over: _Over,
     *,
     grid: LocalGrid,
@@ -348,7 +355,7 @@ def _plan(
     foot, level_m = over.foot, over.heights.above_m if over.heights.follows else over.heights.at(np.zeros(2), 0.0)
     made = tuple(
         VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion_of(number - 1)) for s in row))
-        for number, row in enumerate(slots, start=1)
+        for number, row in enumerate(schedule.slots, start=1)
     )
     return Plan(
         method=method,
@@ -363,13 +370,14 @@ def _plan(
         area_m2=area_m2,
         covered_share=share,
         gaps=gaps,
-        separation=_separation_text(slots, level_m, options.separation),
+        separation=_separation_text(schedule, level_m, options.separation),
         warnings=tuple(warnings),
-        over_ground=over.checked(slots),
+        over_ground=over.checked(schedule.slots),
     )
 
 
-def _separation_text(slots: list[list[Slot]], altitude_m: float, apart: Separation) -> str:
+def _separation_text(schedule: Schedule, altitude_m: float, apart: Separation) -> str:
+    slots = schedule.slots
     if len(slots) == 1:
         return "a single vehicle"
     layers = [max(s.out_layer, s.home_layer) for row in slots for s in row]
@@ -380,9 +388,8 @@ def _separation_text(slots: list[list[Slot]], altitude_m: float, apart: Separati
     )
     homes = np.array([row[0].flight.home for row in slots])
     if any(np.hypot(*(homes[:k] - homes[k]).T).min() < apart.distance_m for k in range(1, len(homes))):
-        text += (
-            f"; at one start they stand some metres apart and take off and land {apart.launch_s:g} s after each other"
-        )
+        after = "in turn" if schedule.in_turn else f"{apart.launch_s:g} s after each other"
+        text += f"; at one start they stand some metres apart and take off and land {after}"
     if any(layers):
         top = altitude_m + max(layers) * apart.height_m
         text += f"; ways out or home higher than the lines, up to {top:g} m: {sum(map(bool, layers))}"

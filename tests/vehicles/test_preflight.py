@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -9,7 +10,7 @@ from gcs_plugin.cli.main import main
 from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight, preflight_all, red_text
 from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
@@ -114,6 +115,10 @@ def test_a_track_takes_the_planners_time_and_height():
     assert highest_m(one) == 30.0
     # Takeoff and setting off, climb, 160 m, turning, waiting above home, 20 m down, and the last 10 m.
     assert flight_seconds(one) == pytest.approx(6 + 30 / 2.5 + 160 / 8 + 5 + 12 + 20 / 1.5 + 10 / 0.5, abs=4.0)
+    landed = replace(
+        one, items=(*one.items[:-1], MissionItem.at(LAND, one.items[1].lat_deg, one.items[1].lon_deg, 0.0))
+    )
+    assert 6.0 < flight_seconds(one) - flight_seconds(landed) < 9.0  # LAND does not wait above home
 
 
 def test_the_next_start_keeps_every_pair_apart():

@@ -394,13 +394,14 @@ def test_a_radio_carries_no_more_than_its_rate():
     assert len(radio.take(2.0)) == 6
 
 
+@pytest.mark.parametrize("end", [RTL, LAND])
 @BOTH
-def test_a_vehicle_as_flown_takes_the_times_of_its_autopilot(autopilot):
+def test_a_vehicle_as_flown_takes_the_times_of_its_autopilot(autopilot, end):
     items = [at(WAYPOINT, 0, 0)] if autopilot is AP else []
     items += [at(TAKEOFF, 0, 0, 40.0, autopilot), MissionItem.do(CHANGE_SPEED, 1, 10)]
     corners = [(60, 20), (60, 200), (90, 200), (90, 20), (0, 0)]
     items += [at(WAYPOINT, *corner, 40.0, autopilot) for corner in corners]
-    mission = Mission(autopilot, (*items, MissionItem.do(RTL)))
+    mission = Mission(autopilot, (*items, MissionItem.do(RTL) if end == RTL else at(LAND, 0, 0, 0.0, autopilot)))
 
     def flown_s(airframe):
         sim = SimVehicle(system=1, autopilot=autopilot, airframe=airframe)

@@ -16,7 +16,7 @@ from orthoswarm.model.plan import End
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.visiting_order import shorten
-from orthoswarm.planning.sorties.deconfliction import Maker, Separation, Slot, separate
+from orthoswarm.planning.sorties.deconfliction import Maker, Schedule, Separation, separate
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_path import Flight, make_flight
 from orthoswarm.planning.sorties.flight_time import Motion
@@ -64,6 +64,9 @@ class Options:
     most_items: int = 650
     run_in_m: float = 0.0
     wait_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "motion", replace(self.motion, lands=self.end == "land"))
 
     def motion_of(self, vehicle: int) -> Motion:
         """How a vehicle, counted from 0, moves."""
@@ -231,7 +234,7 @@ class Swarm:
             times.append(sum(f.time_s(moves) for f in flights) + (len(flights) - 1) * self._limits.swap_s)
         return Work(work, homes, max(times), max(lengths) / (sum(lengths) / len(lengths)))
 
-    def schedule(self, work: Work) -> list[list[Slot]]:
+    def schedule(self, work: Work) -> Schedule:
         """Layers and takeoff times of all sorties, so that vehicles stay apart."""
         makers: list[list[Maker]] = []
         for vehicle, (flown, home) in enumerate(zip(work.sorties, work.homes, strict=True)):

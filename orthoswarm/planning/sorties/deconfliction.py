@@ -3,8 +3,9 @@
 Vehicles are placed one after the other, the longest flight first. Each takes the takeoff time and the layers (heights
 of its way out and of its way home) that cost least and keep it apart from all placed before: at any moment, and some
 seconds earlier or later, far enough away or at another height. For one pair of layers every moment at which two paths
-come close forbids a short interval of takeoff times, so the earliest time left is found in one pass. Around their own
-starts vehicles that share one are kept apart by time alone, because they stand some metres apart there.
+come close forbids a short interval of takeoff times, so the earliest time left is found in one pass. Around a start
+that they share, vehicles take off and land in turn, for which fewer seconds are allowed; where that would take too
+long, only some time after each other, because they stand some metres apart there.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +31,8 @@ class Separation:
         distance_m: horizontally, or
         height_m: vertically, the height of a layer.
         layers: how many layers there are above the legs' height.
-        slack_s: how much earlier or later than planned a vehicle may be.
+        slack_s: how much earlier or later than planned a vehicle may be; a share of it around a start that vehicles
+            share (`pad_slack_s`).
         launch_s: time between takeoffs, and between landings, at one start.
         swap_s: time on the ground between a vehicle's sorties.
     """
@@ -41,6 +43,11 @@ class Separation:
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = 5.0
     swap_s: float = 120.0
+
+    @property
+    def pad_slack_s(self) -> float:
+        """How much earlier or later than planned a vehicle may be around a start that it shares."""
+        return active().planning.pad_slack_share * self.slack_s
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,21 @@ class Slot:
     home_layer: int
     start_s: float
     flight: Flight
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What all sorties were given.
+
+    Attributes:
+        slots: per vehicle and sortie.
+        in_turn: vehicles of one start keep apart in height as they take off and land; if not, in time alone.
+        saved_s: how much sooner all is done without that, 0 if they do.
+    """
+
+    slots: list[list[Slot]]
+    in_turn: bool = True
+    saved_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +152,7 @@ def _forbid(mine, begin, others, when, bins, raster, apart, marks):  # type: ign
 
 @dataclass(frozen=True)
 class _Frozen:
-    """Samples of the placed flights, all near their starts (`pad`) or all away, in raster cells."""
+    """Samples of the placed flights in raster cells: around a start that the next one shares, or elsewhere."""
 
     pad: bool
     points: Array
@@ -152,8 +174,8 @@ class _Frozen:
 class _Sky:
     """The flights placed so far."""
 
-    def __init__(self, speed_m_s: float, apart: Separation) -> None:
-        self._apart = apart
+    def __init__(self, speed_m_s: float, apart: Separation, in_turn: bool) -> None:
+        self._apart, self._in_turn = apart, in_turn
         self._tracks: list[tuple[int, _Track]] = []
         # Between samples a vehicle moves: half a step is added to the distance to keep.
         self._reach = apart.distance_m + 0.5 * _step_s() * speed_m_s
@@ -163,7 +185,7 @@ class _Sky:
         ready = int(np.ceil(ready_s / _step_s()))
         layers = self._apart.layers + 1
         pairs = sorted(((o, h) for o in range(layers) for h in range(layers)), key=lambda p: (sum(p), p))
-        frozen = self._frozen()
+        frozen = self._frozen(make(0.0, 0.0).home)
         best: tuple[float, Slot, _Track, int] | None = None
         soonest = 0.0
         for out, home in pairs:
@@ -184,12 +206,12 @@ class _Sky:
         self._tracks.append((best[3], best[2]))
         return best[1]
 
-    def _frozen(self) -> list[_Frozen]:
-        """The placed samples away from their starts, and those near them."""
+    def _frozen(self, home: Array) -> list[_Frozen]:
+        """The placed samples around a start shared with a vehicle at home, and all others."""
         if not self._tracks:
             return []
         points = np.concatenate([t.places for _, t in self._tracks])
-        pad = np.concatenate([t.pad for _, t in self._tracks])
+        pad = np.concatenate([t.pad & self._shared(t.home, home) for _, t in self._tracks])
         when = np.concatenate([s + t.ground + np.arange(len(t.places)) for s, t in self._tracks])
         kinds = ((False, ~pad), (True, pad))
         return [_Frozen.of(near, points[w], when[w], self._reach) for near, w in kinds if w.any()]
@@ -204,21 +226,30 @@ class _Sky:
         end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
         marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
         for start, other in self._tracks:
-            if np.hypot(*(other.home - track.home)) < active().planning.pad_distances * apart.distance_m:
+            if self._shared(other.home, track.home):
                 _mark(marks, start - ready, gap - 1)
         return marks
+
+    def _shared(self, home: Array, other: Array) -> bool:
+        """Two places of takeoff count as one start."""
+        return bool(np.hypot(*(home - other)) < active().planning.pad_distances * self._apart.distance_m)
 
     def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: NDArray[np.int64]) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
-        limits = np.array([self._reach, apart.height_m - 0.01, np.ceil(apart.slack_s / _step_s())])
+        limits, at_pad = (
+            np.array([self._reach, apart.height_m - 0.01, np.ceil(slack_s / _step_s())])
+            for slack_s in (apart.slack_s, apart.pad_slack_s)
+        )
         when = ready + track.ground + np.arange(len(track.places))
         for other in frozen:
             away = ~track.pad if other.pad else np.ones(len(when), bool)
             other.forbid(track.places[away], when[away], limits, marks)
+            if self._in_turn:
+                other.forbid(track.places[~away], when[~away], at_pad, marks)
         for start, placed in self._tracks:
-            if np.hypot(*(placed.home - track.home)) < active().planning.pad_distances * apart.distance_m:
+            if self._shared(placed.home, track.home):
                 landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
                 _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _step_s())) - 1)
 
@@ -234,7 +265,7 @@ def _first_zero(marks: NDArray[np.int64]) -> int:
     return int(np.argmax(np.cumsum(marks) == 0))
 
 
-def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apart: Separation) -> list[list[Slot]]:
+def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apart: Separation) -> Schedule:
     """Layers and takeoff times for all sorties of all vehicles.
 
     Args:
@@ -242,11 +273,28 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
             higher than the legs.
         motions: say where each vehicle is when.
         apart: the distances to keep.
-
-    Returns:
-        The same structure with layers, start and flight.
     """
-    sky = _Sky(max(motion.speed_m_s for motion in motions), apart)
+    in_turn = _separate(sorties, motions, apart, in_turn=True)
+    homes = [row[0].flight.home for row in in_turn]
+    pad_m = active().planning.pad_distances * apart.distance_m
+    if all(np.hypot(*(a - b)) >= pad_m for k, a in enumerate(homes) for b in homes[:k]):
+        return Schedule(in_turn)
+    beside = _separate(sorties, motions, apart, in_turn=False)
+    done, sooner = (_done_s(slots, motions) for slots in (in_turn, beside))
+    if done <= (1.0 + active().planning.in_turn_share) * sooner:
+        return Schedule(in_turn)
+    return Schedule(beside, in_turn=False, saved_s=done - sooner)
+
+
+def _done_s(slots: list[list[Slot]], motions: Sequence[Motion]) -> float:
+    last = [(row[-1], motion) for row, motion in zip(slots, motions, strict=True)]
+    return max(slot.start_s + slot.flight.time_s(motion) for slot, motion in last)
+
+
+def _separate(
+    sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apart: Separation, *, in_turn: bool
+) -> list[list[Slot]]:
+    sky = _Sky(max(motion.speed_m_s for motion in motions), apart, in_turn)
     result: list[list[Slot]] = [[] for _ in sorties]
     ready = [0.0] * len(sorties)
     for turn in range(max(map(len, sorties))):

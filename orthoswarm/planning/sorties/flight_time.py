@@ -26,6 +26,7 @@ class Motion:
         descent_m_s: rate of descent.
         wind_m_s: where the wind blows to, east and north. The speed is then that through the air.
         autopilot: acceleration in turns, and the times of takeoff and landing.
+        lands: its flights end with LAND; if not, with a return to launch, which waits above home first.
     """
 
     speed_m_s: float = 10.0
@@ -33,6 +34,7 @@ class Motion:
     descent_m_s: float = 1.5
     wind_m_s: tuple[float, float] = (0.0, 0.0)
     autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
+    lands: bool = False
 
     @property
     def crab_rad(self) -> float:
@@ -57,9 +59,11 @@ class Motion:
         """Seconds lost by changing direction by an angle.
 
         The velocity changes by 2 v sin(angle / 2), which takes that over the acceleration; half of it is lost
-        against constant speed. A full stop and start costs v / a.
+        against constant speed. A full stop and start costs v / a. An autopilot that passes corners at a speed c
+        slows down by v - c alone, on a way that is shorter by that again.
         """
-        return np.asarray(self.speed_m_s * np.sin(0.5 * angle_rad) / self.autopilot.acceleration_m_s2)
+        slowed = max(0.0, 1.0 - self.autopilot.corner_m_s / self.speed_m_s)
+        return np.asarray(self.stop_s * np.sin(0.5 * angle_rad) * slowed**2)
 
     def without_turns(self) -> "Motion":
         """The same vehicle, if turns took no time."""
@@ -79,7 +83,7 @@ class Motion:
         flat = np.hypot(step[:, 0], step[:, 1])
         rise = step[:, 2]
         vertical = np.maximum(rise, 0.0) / self.climb_m_s + np.maximum(-rise, 0.0) / self.descent_m_s
-        seconds = np.maximum(flat / self.ground_speed(step[:, :2]), vertical)
+        seconds = np.maximum(flat / (self.autopilot.speed_share * self.ground_speed(step[:, :2])), vertical)
         moving = np.flatnonzero(flat > _SPOT_M)
         if len(moving):
             seconds[moving[1:]] += self.turn_s(angles(points))
@@ -103,7 +107,8 @@ class Motion:
     def landing_s(self, height_m: float) -> float:
         """Seconds that coming down from above home takes longer than a descent at the usual rate."""
         slow_m = min(height_m, self.autopilot.landing_below_m)
-        return self.autopilot.home_wait_s + slow_m / self.autopilot.landing_m_s - slow_m / self.descent_m_s
+        wait_s = self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
+        return wait_s + slow_m / self.autopilot.landing_m_s - slow_m / self.descent_m_s
 
 
 def autopilot_config(name: str) -> AutopilotConfig:

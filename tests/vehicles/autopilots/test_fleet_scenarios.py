@@ -113,6 +113,18 @@ class Real:
         return self.fleet.run_until(done, limit_s)
 
 
+def charge(address):
+    """Fill the battery of an ArduPilot, which does not fill by itself in simulation, for a test that needs it full."""
+    place = Real(address)
+    try:
+        site = Site(place)
+        site.charge()
+        full = site.vehicle.autopilot is not AP or place.until(lambda: (site.vehicle.battery or 0.0) > 0.95, 20.0)
+        assert full, site.vehicle.battery
+    finally:
+        place.close()
+
+
 class Site:
     """A vehicle that has been found, and what the scenarios ask of it."""
 
@@ -152,6 +164,12 @@ class Site:
         if self.vehicle.armed:
             self.finish(self.fleet.rtl(self.system))
             assert self.place.until(lambda: not self.vehicle.armed, 300.0)
+
+    def charge(self):
+        if self.vehicle.autopilot is AP:
+            to, command = self.vehicle.address, dialect.MAV_CMD_BATTERY_RESET
+            reset = dialect.MAVLink_command_long_message(to.system, to.component, command, 0, 255, 100, 0, 0, 0, 0, 0)
+            self.fleet._dialogues.send(self.system, [reset])
 
     def finish(self, dialogue, limit_s=180.0):
         self.place.until(lambda: dialogue.outcome is not None, limit_s)

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("MAVProxy")
 
 from tests.kit.daemon_kit import Served, exported
+from tests.vehicles.autopilots.test_fleet_scenarios import charge
 from tests.vehicles.autopilots.test_gap_flight import REAL, row_of
 from tests.vehicles.autopilots.test_twin_camera import RATE_HZ, CameraProcess, free_port, small_area
 from tests.vehicles.test_mavproxy import MavProxy
@@ -25,6 +26,7 @@ def autopilot(request):
 
 @pytest.mark.timeout(1800)
 def test_a_real_vehicle_is_planned_flown_and_refined_from_mavproxys_console(autopilot, tmp_path):
+    charge(autopilot)
     relay, video, folder = free_port(), free_port(), tmp_path / "twin"
     camera = CameraProcess(
         "--link", autopilot, "--relay", f"tcpin:127.0.0.1:{relay}", "--stream", f"tcp://127.0.0.1:{video}",

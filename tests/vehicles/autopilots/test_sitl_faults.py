@@ -60,10 +60,7 @@ class Parameters:
     def restore(self):
         if self.before:
             self.set(**self.before)
-        if self.site.vehicle.autopilot is AP:  # a battery failsafe lasts until the battery was changed
-            to, command = self.site.vehicle.address, dialect.MAV_CMD_BATTERY_RESET
-            reset = dialect.MAVLink_command_long_message(to.system, to.component, command, 0, 255, 100, 0, 0, 0, 0, 0)
-            self.site.fleet._dialogues.send(self.site.system, [reset])
+        self.site.charge()  # a battery failsafe lasts until the battery was changed
 
 
 @pytest.fixture(params=REAL)
