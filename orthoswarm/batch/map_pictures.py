@@ -110,7 +110,7 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
                 Layer(frames=fine[0], terrain=fine_ground, canvas=second, gains=state.gains, seams=_seams(run, state)),
             ]
             drawn = partial(run.progress, "drawing orthoimage")
-            stats = render_layers(layers, read=state.read_rgb(), run=run.drawers.map, progress=drawn)
+            stats = render_layers(layers, read=state.read_rgb(), parts=state.parts, run=run.drawers.map, progress=drawn)
             _write(run, first, COARSE)
         _write(run, second, ORTHOIMAGE)
         _write_seamlines(run, second, fine[0])
@@ -156,7 +156,13 @@ def draw(
     with _canvas(run, name, placed, terrain, state) as canvas:
         if realtime:
             stats = mosaic(
-                placed, canvas, previews=state.previews, read=state.read_rgb(), run=run.drawers.map, progress=drawn
+                placed,
+                canvas,
+                previews=state.previews,
+                read=state.read_rgb(),
+                parts=state.parts,
+                run=run.drawers.map,
+                progress=drawn,
             )
         else:
             seams = _seams(run, state) if name == ORTHOIMAGE else None
@@ -167,6 +173,7 @@ def draw(
                 gains=state.gains,
                 seams=seams,
                 read=state.read_rgb(),
+                parts=state.parts,
                 run=run.drawers.map,
                 progress=drawn,
             )

@@ -43,6 +43,7 @@ from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel, check_dem
+from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
@@ -180,6 +181,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
         images = [p.frame.image for p in state.recorded.placed]
         state.previews = PreviewFile.create(run.space.file("previews"), images)
         state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
+        state.parts = PictureParts.create(run.space.file("parts"), len(images))
     known = run.space.recall("realtime")
     if known is not None and product_file(run.out, REALTIME) is not None:
         stats, stage = known

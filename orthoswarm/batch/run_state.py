@@ -27,6 +27,7 @@ from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_rgb
+from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.registration.map_offset import MapOffset
 
 Bytes = NDArray[np.uint8]
@@ -123,6 +124,7 @@ class RunState:
         still: frames of vehicles that hovered. odd: frames of another camera or direction than their vehicle's others.
         terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
         previews: small copies of the pictures, for the seams. pictures: those that are decoded, None to read the files.
+        parts: what the real-time map shows of each picture, for the refined ones.
         undrawn: image -> why the real-time picture does not show it.
         control_points: surveyed points to move the map onto. control: their result, None before or without them.
         map_offset: offset between map and receivers, None without a map.
@@ -144,6 +146,7 @@ class RunState:
     terrain: Terrain | None = None
     drawn: tuple[float, float] = (0.0, 1.0)
     previews: PreviewFile | None = None
+    parts: PictureParts | None = None
     pictures: GreyPictures | None = None
     undrawn: Mapping[str, str] = field(default_factory=dict)
     control_points: list[Checkpoint] = field(default_factory=list)

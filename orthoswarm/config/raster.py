@@ -24,6 +24,12 @@ class RasterConfig:
     """Grey pictures at the refiner's working size that take no more than this together, megabytes, are kept on disk
     during a batch run (chosen for the disk). They come from the colours then: a grey level off by rounding, a few
     where a colour is clipped."""
+    picture_parts_mb: float = 2000.0
+    """Parts of pictures that are kept on disk between two drawings of a batch run take no more than this together,
+    megabytes (chosen for the disk); larger ones are decoded again."""
+    part_margin: float = 0.1
+    """What the real-time map shows of a picture is kept for the refined maps with a border of this share of the
+    picture's longer side; what they need beyond it is decoded again (measured on 1,017 photos: 6 % are)."""
 
     # Height models
     dem_finest_m: float = 2.0

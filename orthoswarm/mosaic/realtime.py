@@ -26,6 +26,7 @@ from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Progress, RenderStats, Run, render, serial
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.picture_file import read_rgb
+from orthoswarm.raster.picture_parts import PictureParts
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -175,6 +176,7 @@ def mosaic(
     *,
     previews: PreviewFile | None = None,
     read: Read = read_rgb,
+    parts: PictureParts | None = None,
     run: Run = serial,
     progress: Progress | None = None,
 ) -> RenderStats:
@@ -189,7 +191,7 @@ def mosaic(
         canvas: made with plane "frame".
         ground_z_m: height of the ground plane.
         previews: see Layer.
-        read: see render.
+        read: see render. parts: see render.
         run: see render.
         progress: see render.
 
@@ -198,4 +200,5 @@ def mosaic(
         OrthoSwarmError: if the disk is full.
     """
     alike = [replace(frame, weak=False) for frame in frames]
-    return render(alike, Terrain.flat(ground_z_m), canvas, previews=previews, read=read, run=run, progress=progress)
+    ground = Terrain.flat(ground_z_m)
+    return render(alike, ground, canvas, previews=previews, read=read, parts=parts, run=run, progress=progress)

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.canvas.tile_store import Key, TileStore
+from orthoswarm.canvas.tile_store import Key, Tile, TileStore
 from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.kernels.downsampling import reduced
-from orthoswarm.mosaic.kernels.pixel_sampling import WEIGHTS, sample
+from orthoswarm.mosaic.kernels.downsampling import bearable, reduced, reduced_exactly
+from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, place, widen
 from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
@@ -25,6 +25,7 @@ from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_color
 from orthoswarm.mosaic.seams.previews import write_preview
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
+from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
 
 Bytes = NDArray[np.uint8]
@@ -282,16 +283,18 @@ class SampleTask:
 
     Attributes:
         layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture.
+        parts: what is kept of the pictures between drawings; None to read them.
     """
 
     layers: list[TaskLayer]
     pictures: list[tuple[Path, list[Shot]]]
     read: Read
+    parts: PictureParts | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """What became of a picture in a layer: its thumbnail, or the reason why it could not be used."""
+    """What became of a picture in a layer: its thumbnail if it was read, or the reason why it could not be used."""
 
     layer: int
     index: int
@@ -308,42 +311,112 @@ class _Ground:
         self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
-    def draw(self, shot: Shot, small: Bytes, factor: int) -> None:
+    def place(self, shot: Shot) -> "list[_Placed]":
+        """Where the pixels of a picture's windows lie in it."""
+        layer = self.layer
+        size = np.array(layer.shots.size[shot.row], np.int32)
+        factor = bearable(shot.factor, int(size.min()))
+        size //= np.int32(factor)
+        placed = []
         for store, windows in ((self.store, shot.windows), (self.second, shot.near_seams)):
-            for window in windows:
-                self.draw_window(store, window, shot, small, factor)
+            for w in windows:
+                tile = store.get(w.key)
+                assert tile is not None
+                position, rotation = self.about[w.key]
+                window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
+                found = place(
+                    tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row],
+                    layer.shots.lens[shot.row], self.lattices[w.key], layer.place.grid.gsd_m, size, factor,
+                )  # fmt: skip
+                if len(found[0]):
+                    placed.append(_Placed(tile, *found, size=size, factor=factor, field=shot.field))
+        return placed
 
-    def draw_window(self, store: TileStore, w: Window, shot: Shot, small: Bytes, factor: int) -> None:
-        tile = store.get(w.key)
-        assert tile is not None
-        position, rotation = self.about[w.key]
-        window = np.array([w.row0, w.row1, w.col0, w.col1], np.int32)
-        sample(
-            tile.rgba, tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row],
-            self.layer.shots.lens[shot.row], self.lattices[w.key], self.layer.place.grid.gsd_m, small, factor,
-            shot.field, WEIGHTS,
-        )  # fmt: skip
+
+class _Placed:
+    """Pixels of a tile and where they lie in a picture, see pixel_sampling.place; its size and factor of reduction.
+
+    Attributes:
+        needs: what must be known of the picture to draw them.
+    """
+
+    def __init__(
+        self,
+        tile: Tile,
+        index: Ints,
+        spots: Ints,
+        sights: NDArray[np.float32],
+        box: Ints,
+        *,
+        size: Ints,
+        factor: int,
+        field: NDArray[np.float32],
+    ) -> None:
+        self._tile, self._index, self._spots, self._sights = tile, index, spots, sights
+        self._box, self._size, self._factor, self._field = box, size, factor, field
+        left, right, top, bottom = box.tolist()
+        width, height = size.tolist()
+        self.needs = Box(
+            left=max(left - BEFORE, 0) * factor,
+            right=min(right + AFTER + 1, width) * factor - 1,
+            top=max(top - BEFORE, 0) * factor,
+            bottom=min(bottom + AFTER + 1, height) * factor - 1,
+        )
+
+    def draw(self, part: Part, scratch: "_Scratch") -> None:
+        """Colour the pixels from a part of the picture that has what it needs."""
+        pixels, corner = part.pixels, np.array(part.corner, np.int32)
+        if self._factor > 1:
+            pixels = reduced_exactly(part.cut(self.needs), self._factor)
+            corner = np.array([self.needs.left, self.needs.top], np.int32) // np.int32(self._factor)
+        left, right, top, bottom = self._box.tolist()
+        around = BEFORE + AFTER + 1
+        lanes = scratch.words(bottom - top + around, right - left + around)
+        widen(pixels, corner, self._box, self._size, lanes)
+        blend(self._tile.packed, self._index, self._spots, self._sights, lanes, self._box, self._field, WEIGHTS)
+
+
+class _Scratch:
+    """Memory that is used again and again: fresh memory costs more than what is done with it."""
+
+    def __init__(self) -> None:
+        self._words = np.empty(0, np.int64)
+
+    def words(self, rows: int, columns: int) -> NDArray[np.int64]:
+        """Of int64, not set."""
+        if self._words.size < rows * columns:
+            self._words = np.empty(rows * columns, np.int64)
+        return self._words[: rows * columns].reshape(rows, columns)
 
 
 def sample_pass(task: SampleTask) -> list[Sampled]:
-    """Colour the pixels of some frames in the tiles' files, each picture read once for all layers."""
-    grounds = [_Ground(layer) for layer in task.layers]
+    """Colour the pixels of some frames in the tiles' files, each picture read at most once for all layers."""
+    grounds, scratch = [_Ground(layer) for layer in task.layers], _Scratch()
     copy_ahead(path for path, _ in task.pictures)
     results = []
     for path, shots in task.pictures:
-        try:
-            picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
-        except RunInterruptedError:
-            raise
-        except OrthoSwarmError as error:
-            results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
-            continue
-        for to in {shot.preview for shot in shots if shot.preview is not None}:
-            write_preview(*to, picture)
-        sizes = {shot.factor: reduced(picture, shot.factor) for shot in shots}
-        for shot in shots:
-            grounds[shot.layer].draw(shot, *sizes[shot.factor])
-        small = thumbnail(sizes[shots[0].factor][0])
+        placed = [p for shot in shots for p in grounds[shot.layer].place(shot)]
+        needs = Box.around([p.needs for p in placed])
+        part = None
+        if task.parts is not None and all(shot.preview is None for shot in shots):
+            part = task.parts.get(path, needs)
+        small = None
+        if part is None:
+            try:
+                picture = _read(task.read, path, grounds[shots[0].layer].layer.shots.size[shots[0].row])
+            except RunInterruptedError:
+                raise
+            except OrthoSwarmError as error:
+                results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
+                continue
+            for to in {shot.preview for shot in shots if shot.preview is not None}:
+                write_preview(*to, picture)
+            if task.parts is not None:
+                task.parts.keep(path, picture, needs)
+            small = thumbnail(reduced(picture, shots[0].factor)[0])
+            part = Part(picture, (0, 0))
+        for window in placed:
+            window.draw(part, scratch)
         results += [Sampled(shot.layer, shot.index, small) for shot in shots]
     return results
 

@@ -55,6 +55,7 @@ from orthoswarm.mosaic.seams.previews import PreviewFile, unwritten
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, cell_size_px
 from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
+from orthoswarm.raster.picture_parts import PictureParts
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
@@ -146,6 +147,7 @@ def render(
     seams: Seams | None = None,
     previews: PreviewFile | None = None,
     read: Read = read_rgb,
+    parts: PictureParts | None = None,
     run: Run = serial,
     progress: Progress | None = None,
 ) -> RenderStats:
@@ -153,11 +155,16 @@ def render(
     layer = Layer(
         frames=frames, terrain=terrain, canvas=canvas, gains=gains or {}, bounds=bounds, seams=seams, previews=previews
     )
-    return render_layers([layer], read=read, run=run, progress=progress)[0]
+    return render_layers([layer], read=read, parts=parts, run=run, progress=progress)[0]
 
 
 def render_layers(
-    layers: Sequence[Layer], *, read: Read = read_rgb, run: Run = serial, progress: Progress | None = None
+    layers: Sequence[Layer],
+    *,
+    read: Read = read_rgb,
+    parts: PictureParts | None = None,
+    run: Run = serial,
+    progress: Progress | None = None,
 ) -> list[RenderStats]:
     """Render frames onto canvases, each picture read once for all of them.
 
@@ -169,6 +176,7 @@ def render_layers(
     Args:
         layers: what to draw.
         read: reads a picture, uint8 (H, W, 3); must be picklable for `run` in other processes.
+        parts: what is drawn of a picture is kept there, and taken from there if it is enough; None reads all pictures.
         run: where the work runs; other processes need the canvases' folders and the pictures under the same paths.
         progress: called with the number of pictures done and of pictures to do.
 
@@ -187,7 +195,7 @@ def render_layers(
         shutil.rmtree(folder, ignore_errors=True)
     try:
         jobs = [_Job(layer, folder, run) for layer, folder in zip(layers, staging, strict=True)]
-        _draw(jobs, read, run, progress)
+        _draw(jobs, read, parts, run, progress)
         for job in jobs:
             job.finish()
             job.adopt()
@@ -197,7 +205,7 @@ def render_layers(
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _draw(jobs: Sequence["_Job"], read: Read, run: Run, progress: Progress | None) -> None:
+def _draw(jobs: Sequence["_Job"], read: Read, parts: PictureParts | None, run: Run, progress: Progress | None) -> None:
     """Label and sample, and again for the pixels of pictures that turned out to be unreadable."""
     for job in jobs:
         job.make_previews(read)
@@ -207,7 +215,7 @@ def _draw(jobs: Sequence["_Job"], read: Read, run: Run, progress: Progress | Non
         failed = False
         pictures = sum(1 for _ in _by_picture(jobs))
         done = 0
-        for result in run(sample_pass, _sample_tasks(jobs, read)):
+        for result in run(sample_pass, _sample_tasks(jobs, read, parts)):
             for sampled in result:
                 jobs[sampled.layer].take(sampled)
                 failed |= sampled.reason is not None
@@ -230,7 +238,7 @@ def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, 
     yield from shares.items()
 
 
-def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
+def _sample_tasks(jobs: Sequence["_Job"], read: Read, parts: PictureParts | None) -> Iterator[SampleTask]:
     """The pictures in groups, with what is needed to draw them."""
     pictures = list(_by_picture(jobs))
     size = active().compute.pictures_per_task
@@ -241,7 +249,7 @@ def _sample_tasks(jobs: Sequence["_Job"], read: Read) -> Iterator[SampleTask]:
         ]
         row = {(number, i): r for number, indices in enumerate(own) for r, i in enumerate(indices)}
         shots = [(path, [jobs[n].shot(i, n, row[n, i]) for n, i in shares]) for path, shares in some]
-        yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read)
+        yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read, parts)
 
 
 def _by_frame(results: Iterable[Iterable[tuple[int, Window]]]) -> dict[int, list[Window]]:

@@ -17,6 +17,7 @@ from orthoswarm.mosaic.radiometry import uniform
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.mosaic.visible_ground import coverage
 from orthoswarm.raster.picture_file import PictureError
+from orthoswarm.raster.picture_parts import PictureParts
 from tests.kit import mosaic_scene as scene
 
 FLAT = Terrain.flat(0.0)
@@ -315,3 +316,37 @@ def save(path, rgb):
 
 def fields(frame):
     return {name: getattr(frame, name) for name in frame.__slots__}
+
+
+@pytest.mark.parametrize("gsd_m", [1.0, 2.5], ids=["full size", "reduced"])
+def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_path, gsd_m):
+    flight = scene.survey(1, scene.hills, scene.small_lens(k1=-0.05))
+    terrain, grid = scene.terrain_of(scene.hills), scene.grid(260.0, gsd_m)
+    parts = PictureParts.create(tmp_path / "parts", len(flight.frames))
+    images, read = [], []
+
+    def counted(path):
+        read.append(path)
+        return flight.read(path)
+
+    for name, store in (("first", parts), ("again", parts), ("whole", None)):
+        read.clear()
+        with Canvas.create(tmp_path / name, grid, plane="frame", tile_px=128) as canvas:
+            render(flight.frames, terrain, canvas, read=counted, parts=store)
+            images.append(whole(canvas))
+        assert (len(read) == 0) == (name == "again")
+    assert images[0][..., 3].any()
+    assert np.array_equal(images[0], images[1])
+    assert np.array_equal(images[0], images[2])
+
+
+def test_a_picture_of_which_more_is_wanted_than_was_kept_is_read(tmp_path):
+    flight = scene.survey(1)
+    few, parts = flight.frames[::2], PictureParts.create(tmp_path / "parts", len(flight.frames))
+    images = []
+    for name, frames, store in (("all", flight.frames, parts), ("few", few, parts), ("whole", few, None)):
+        with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=128) as canvas:
+            render(frames, FLAT, canvas, read=flight.read, parts=store)
+            images.append(whole(canvas))
+    assert np.array_equal(images[1], images[2])
+    assert not np.array_equal(images[0], images[1])

@@ -21,15 +21,26 @@ def reduced(picture: Bytes, factor: int) -> tuple[Bytes, int]:
 
     Column u of the picture becomes (u + 0.5) / factor - 0.5.
     """
+    factor = bearable(factor, min(picture.shape[:2]))
+    height, width = picture.shape[0] // factor, picture.shape[1] // factor
+    return reduced_exactly(picture[: height * factor, : width * factor], factor), factor
+
+
+def bearable(factor: int, side: int) -> int:
+    """A factor by which a picture is to be reduced, or less where its shorter side is too short for it."""
+    while factor > 1 and side // factor < 8:
+        factor //= 2
+    return max(factor, 1)
+
+
+def reduced_exactly(pixels: Bytes, factor: int) -> Bytes:
+    """Pixels (H, W, C) averaged over blocks of factor x factor, which divides H and W."""
     import cv2
 
-    while factor > 1 and min(picture.shape[:2]) // factor < 8:
-        factor //= 2
-    if factor <= 1:
-        return picture, 1
-    height, width = picture.shape[0] // factor, picture.shape[1] // factor
-    cropped = picture[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA)), factor
+    if factor == 1:
+        return pixels
+    size = (pixels.shape[1] // factor, pixels.shape[0] // factor)
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
 
 
 def pack(picture: Bytes, factor: int = 1) -> tuple[NDArray[np.uint32], int]:

@@ -1,5 +1,8 @@
 """The compiled sampling of the renderer: colours of one picture into the pixels of a tile that it owns.
 
+Two steps, so that it is known which part of a picture is wanted before any of it is read: `place` finds the pixels of
+a tile that a picture owns and where they lie in it, `blend` colours them.
+
 Bicubic interpolation (cubic convolution, Keys 1981, a = -1/2) in fixed point, all three channels at once in 16-bit
 lanes of one word: a sum of products of lanes is right in every lane as soon as every lane's result, with BIAS added
 for the negative weights, lies within 0 to 65,535; what is carried between lanes meanwhile cancels.
@@ -14,6 +17,8 @@ from orthoswarm.mosaic.kernels.render_arrays import STEP
 
 UNIT = 128
 """Sum of the weights, and number of steps of a fraction of a pixel."""
+BEFORE, AFTER = 1, 2
+"""Pixels that interpolation takes before and after that which holds the place, across and down."""
 _LOW = 32  # a row's least value (-32) becomes 0
 _BIAS = np.int64((_LOW * UNIT + UNIT // 2) * (1 + (1 << 16) + (1 << 32)))
 _BIAS2 = np.int64((2 * _LOW * UNIT) * (1 + (1 << 16) + (1 << 32)))
@@ -42,48 +47,100 @@ WEIGHTS = cubic_weights()
 
 
 @kernel
-def _texel(flat, at):  # type: ignore[no-untyped-def]
-    """Three bytes in lanes; at is unsigned, which spares the test for negative indices."""
-    return np.int64(flat[at]) | (np.int64(flat[at + np.uint64(1)]) << 16) | (np.int64(flat[at + np.uint64(2)]) << 32)
+def _owned(label, mark, window, lattice, index, at):  # type: ignore[no-untyped-def]
+    """The pixels of a tile that have a label: their number in the tile, column, row and height; gives how many.
+
+    The height is that of render_arrays.height_at, its sums over a row taken out of the loop.
+    """
+    r0, r1, c0, c1 = np.int64(window[0]), np.int64(window[1]), np.int64(window[2]), np.int64(window[3])
+    level = np.float64(lattice[0, 0])
+    flat = True
+    for row in range(r0 // STEP, (r1 - 1) // STEP + 2):
+        for k in range(c0 // STEP, (c1 - 1) // STEP + 2):
+            flat &= np.float64(lattice[row, k]) == level
+    columns, rows, heights = at[0], at[1], at[2]
+    count, side = np.uint64(0), label.shape[1]
+    one = np.uint64(1)
+    for r in range(r0, r1):
+        labels = label[r]
+        node, fy = r // STEP, (r % STEP + 0.5) / STEP
+        before = count
+        for c in range(c0, c1):
+            if labels[np.uint64(c)] == mark:  # unsigned: not tested for being negative
+                columns[count], index[count] = np.float64(c), np.int32(r * side + c)
+                count += one
+        for n in range(before, count):
+            rows[n], heights[n] = np.float64(r), level
+        if not flat:
+            for n in range(before, count):
+                column = np.int64(columns[n])
+                at_left, fx = np.uint64(column // STEP), (column % STEP + 0.5) / STEP
+                at_right = at_left + one
+                left = lattice[node, at_left] * (1.0 - fy) + lattice[node + 1, at_left] * fy
+                right = lattice[node, at_right] * (1.0 - fy) + lattice[node + 1, at_right] * fy
+                heights[n] = left * (1.0 - fx) + right * fx
+    return count
 
 
 @kernel
-def _row(flat, row, x0, x1, x2, x3, w0, w1, w2, w3):  # type: ignore[no-untyped-def]
-    """Three channels of a row, interpolated, each plus _LOW, 9 bits in 16-bit lanes."""
-    total = (
-        _texel(flat, np.uint64(row + x0)) * w0
-        + _texel(flat, np.uint64(row + x1)) * w1
-        + _texel(flat, np.uint64(row + x2)) * w2
-        + _texel(flat, np.uint64(row + x3)) * w3
-        + _BIAS
-    )
-    return (total >> 7) & _LANES
+def _project(count, at, position, m, lens, gsd, size, shrink, spots, sights):  # type: ignore[no-untyped-def]
+    """Where some pixels (column, row, height) lie in the picture, see `place`; gives how many the picture shows."""
+    offset = 0.5 * shrink - 0.5 + 0.5 / UNIT  # of reduced pixels, and to round to the nearest fraction
+    zero, right, bottom = np.float64(0.0), np.float64(size[0] - 1), np.float64(size[1] - 1)
+    per_px, tall = 2.0 / size[0], (size[1] - 1.0) / size[0]
+    focal, k1, k2, k3, pu, pv = lens[F], lens[K1], lens[K2], lens[K3], lens[U], lens[V]
+    m00, m01, m02, m10, m11, m12 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
+    m20, m21, m22 = m[2, 0], m[2, 1], m[2, 2]
+    dx, top, height = 0.5 * gsd - position[0], position[1], position[2]
+    columns, rows, heights = at[0], at[1], at[2]
+    us, vs, xs, ys, shown = spots[0], spots[1], sights[0], sights[1], sights[2]
+    none, all_ = np.float32(0.0), np.float32(1.0)
+    for n in range(count):
+        x, dz = columns[n] * gsd, heights[n] - height
+        dy = (rows[n] + 0.5) * gsd - top
+        near = np.divide(
+            1.0, (m20 * dx + m21 * dy) + m20 * x + m22 * dz
+        )  # not tested for zero, which keeps vector code
+        px, py = (
+            ((m00 * dx + m01 * dy) + m00 * x + m02 * dz) * near,
+            ((m10 * dx + m11 * dy) + m10 * x + m12 * dz) * near,
+        )
+        r2 = px * px + py * py
+        scale = focal * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+        u, v = (px * scale + pu) * shrink + offset, (py * scale + pv) * shrink + offset
+        inside = (u >= -1.0) & (v >= -1.0) & (u <= right + 1.5) & (v <= bottom + 1.5)
+        us[n], vs[n] = np.int32(min(max(u, zero), right) * UNIT), np.int32(min(max(v, zero), bottom) * UNIT)
+        xs[n], ys[n] = np.float32(u * per_px - 1.0), np.float32(v * per_px - tall)
+        shown[n] = all_ if inside else none
+    seen = np.uint64(0)
+    for n in range(count):
+        seen += np.uint64(shown[n] > none)
+    return seen
 
 
 @kernel
-def _level(lanes):  # type: ignore[no-untyped-def]
-    """One channel, 0 to 255, of a sum of rows: both biases taken off, rounded."""
-    value = ((lanes & 0xFFFF) - (3 * _LOW * UNIT - UNIT // 2)) >> 7
-    return min(max(value, 0), 255)
+def _range(values):  # type: ignore[no-untyped-def]
+    low = high = values[0]
+    for value in values:
+        low, high = min(low, value), max(high, value)
+    return low // np.int32(UNIT), high // np.int32(UNIT)
 
 
 @kernel
-def _scaled(level, field, x, y):  # type: ignore[no-untyped-def]
-    """A level under a factor that varies over the picture, rounded, 0 to 255."""
-    half = np.float32(0.5)
-    factor = field[0] + x * (field[1] + field[3] * x + field[4] * y) + y * (field[2] + field[5] * y)
-    return np.int64(min(max(np.float32(level) * factor + half, np.float32(0.0)), np.float32(255.0)))
+def _taken(rows, kept):  # type: ignore[no-untyped-def]
+    taken = np.empty((rows.shape[0], kept.sum()), rows.dtype)
+    for k in range(rows.shape[0]):
+        taken[k] = rows[k][kept]
+    return taken
 
 
 @kernel
-def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, picture, factor, field, weights):  # type: ignore[no-untyped-def]
-    """Colour a tile's pixels of one label from a picture by bicubic interpolation; gives their number.
+def place(label, mark, window, position, rotation, lens, lattice, gsd, size, factor):  # type: ignore[no-untyped-def]
+    """Find a tile's pixels of one label in a picture.
 
-    The projection is render_arrays.project and the height its height_at, their sums over a row taken out of the loop.
-    What the picture does not show stays.
+    The projection is render_arrays.project.
 
     Args:
-        rgba: uint8 (T, T, 4), changed in place.
         label: int32 (T, T).
         mark: the label.
         window: int32 (4,), row0, row1, col0, col1 that hold the label.
@@ -92,75 +149,124 @@ def sample(rgba, label, mark, window, position, rotation, lens, lattice, gsd, pi
         lens: float64 (18,), see lattice.
         lattice: float32, the tile's heights.
         gsd: ground pixel, metres.
-        picture: uint8 (H, W, 3).
-        factor: by which the picture was reduced.
+        size: int32 (2,), columns and rows of the reduced picture.
+        factor: by which the picture is reduced.
+
+    Returns:
+        For N pixels that the picture shows: int32 (N,), their numbers in the tile; int32 (2, N), their columns and rows
+        in the reduced picture, in 1 / UNIT pixels; float32 (3, N), the same as radiometry.Field wants it (the third row
+        means nothing); and int32 (4,), the least and greatest column, least and greatest row that they lie in.
+    """
+    owned = np.uint64(0)
+    for r in range(window[0], window[1]):
+        labels = label[r, window[2] : window[3]]
+        for c in range(labels.shape[0]):
+            owned += np.uint64(labels[c] == mark)
+    index, spots, sights = np.empty(owned, np.int32), np.empty((2, owned), np.int32), np.empty((3, owned), np.float32)
+    at = np.empty((3, owned))
+    _owned(label, mark, window, lattice, index, at)
+    shown = _project(owned, at, position, rotation, lens, gsd, size, 1.0 / factor, spots, sights)
+    if shown < owned:  # beside a seam, at the picture's very border
+        kept = sights[2] > 0.0
+        index, spots, sights = index[kept], _taken(spots, kept), _taken(sights, kept)
+    box = np.zeros(4, np.int32)
+    if shown > 0:
+        box[0], box[1] = _range(spots[0])
+        box[2], box[3] = _range(spots[1])
+    return index, spots, sights, box
+
+
+@kernel
+def widen(part, corner, box, size, lanes):  # type: ignore[no-untyped-def]
+    """The colours in a box of a picture and around it as one word each; at the picture's border they repeat.
+
+    Args:
+        part: uint8 (H, W, 3), a part of the picture.
+        corner: int32 (2,), column and row of its corner.
+        box: int32 (4,), see `place`; `part` holds it, with BEFORE and AFTER as far as the picture goes.
+        size: int32 (2,), columns and rows of the whole picture.
+        lanes: int64 (rows, columns) of the box with BEFORE and AFTER added, set.
+    """
+    rows, columns = lanes.shape
+    left, top = box[0] - BEFORE, box[2] - BEFORE
+    first, last = max(-left, 0), min(size[0] - left, columns)  # of the lanes, those that lie in the picture
+    for i in range(rows):
+        r = min(max(top + i, 0), size[1] - 1) - corner[1]
+        source, target = part[r].ravel(), lanes[i]
+        start = 3 * (left + first - corner[0])
+        flat, inner = source[start : start + 3 * (last - first)], target[first:last]
+        for j in range(inner.shape[0]):
+            inner[j] = np.int64(flat[3 * j]) | (np.int64(flat[3 * j + 1]) << 16) | (np.int64(flat[3 * j + 2]) << 32)
+        for j in range(first):
+            target[j] = target[first]
+        for j in range(last, columns):
+            target[j] = target[last - 1]
+
+
+@kernel
+def _row(flat, at, w0, w1, w2, w3):  # type: ignore[no-untyped-def]
+    """Three channels of a row, interpolated, each plus _LOW, 9 bits in 16-bit lanes."""
+    one = np.uint64(1)
+    total = flat[at] * w0 + flat[at + one] * w1 + flat[at + one + one] * w2 + flat[at + one + one + one] * w3 + _BIAS
+    return (total >> 7) & _LANES
+
+
+@kernel
+def _totals(index, spots, flat, stride, left, top, weights, totals):  # type: ignore[no-untyped-def]
+    """Sums of the rows, all channels."""
+    us, vs = spots[0], spots[1]
+    for n in range(index.shape[0]):
+        fu, fv = np.int64(us[n]), np.int64(vs[n])
+        at = np.uint64((fv >> 7) - top) * stride + np.uint64((fu >> 7) - left)
+        wx, wy = weights[np.uint64(fu & (UNIT - 1))], weights[np.uint64(fv & (UNIT - 1))]
+        w0, w1, w2, w3 = wx[0], wx[1], wx[2], wx[3]
+        totals[n] = (
+            _row(flat, at, w0, w1, w2, w3) * wy[0]
+            + _row(flat, at + stride, w0, w1, w2, w3) * wy[1]
+            + _row(flat, at + stride + stride, w0, w1, w2, w3) * wy[2]
+            + _row(flat, at + stride + stride + stride, w0, w1, w2, w3) * wy[3]
+            + _BIAS2
+        )
+
+
+@kernel
+def _level(lanes):  # type: ignore[no-untyped-def]
+    """One channel, 0 to 255, of a sum of rows: both biases taken off, rounded."""
+    value = (np.int32(lanes & 0xFFFF) - np.int32(3 * _LOW * UNIT - UNIT // 2)) >> 7
+    return np.int32(min(max(value, np.int32(0)), np.int32(255)))
+
+
+@kernel
+def _colors(totals, sights, field, colors):  # type: ignore[no-untyped-def]
+    """Sums of rows as colours, one word each, under factors that vary over the picture."""
+    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(255.0)
+    xs, ys = sights[0], sights[1]
+    for channel in range(3):
+        f0, f1, f2 = field[channel, 0], field[channel, 1], field[channel, 2]
+        f3, f4, f5 = field[channel, 3], field[channel, 4], field[channel, 5]
+        shift, empty = np.int64(16 * channel), channel == 0
+        for n in range(totals.shape[0]):
+            x, y = xs[n], ys[n]
+            factor = f0 + x * (f1 + f3 * x + f4 * y) + y * (f2 + f5 * y)
+            level = np.float32(_level(totals[n] >> shift)) * factor + half
+            word = np.uint32(np.int32(min(max(level, low), high))) << np.uint32(8 * channel)
+            colors[n] = np.uint32(0xFF000000 | word) if empty else np.uint32(colors[n] | word)
+
+
+@kernel
+def blend(packed, index, spots, sights, lanes, box, field, weights):  # type: ignore[no-untyped-def]
+    """Colour pixels of a tile from a picture by bicubic interpolation.
+
+    Args:
+        packed: uint32 (T, T), the tile's colours, changed in place.
+        index: int32 (N,), the pixels, see `place`. spots: int32 (2, N). sights: float32 (3, N).
+        lanes: see `widen`. box: int32 (4,), as given there.
         field: float32 (3, 6), factors of red, green and blue over the picture, see radiometry.Field.
         weights: WEIGHTS.
     """
-    height, width = picture.shape[0], picture.shape[1]
-    flat, stride = picture.ravel(), 3 * width
-    shrink = 1.0 / factor
-    offset = 0.5 * shrink - 0.5 + 0.5 / UNIT  # of reduced pixels, and to round to the nearest fraction
-    zero, right, bottom = np.float64(0.0), np.float64(width - 1), np.float64(height - 1)
-    none, end_x, end_y = np.int64(0), np.int64(width - 1), np.int64(height - 1)
-    flat_ground, z = True, np.float64(lattice[0, 0])
-    for node in lattice.flat:
-        flat_ground = flat_ground and node == lattice[0, 0]
-    focal, k1, k2, k3 = lens[F], lens[K1], lens[K2], lens[K3]
-    distorted = k1 != 0.0 or k2 != 0.0 or k3 != 0.0
-    plain = True
-    for channel in range(3):
-        plain = plain and field[channel, 0] == 1.0 and not field[channel, 1:].any()
-    per_px, tall = 2.0 / width, (height - 1.0) / width
-    m = rotation
-    count = 0
-    nodes = np.empty(lattice.shape[1])  # heights along a row, at the lattice's columns
-    first, last = window[2] // STEP, min((window[3] - 1) // STEP + 2, lattice.shape[1])
-    for r in range(window[0], window[1]):
-        labels, colors = label[r], rgba[r]
-        if not flat_ground:
-            node, fy = r // STEP, (r % STEP + 0.5) / STEP
-            for k in range(first, last):
-                nodes[k] = lattice[node, k] * (1.0 - fy) + lattice[node + 1, k] * fy
-        dx, dy = 0.5 * gsd - position[0], (r + 0.5) * gsd - position[1]
-        row_x, row_y = m[0, 0] * dx + m[0, 1] * dy, m[1, 0] * dx + m[1, 1] * dy
-        row_d = m[2, 0] * dx + m[2, 1] * dy
-        for c in range(np.uint32(window[2]), np.uint32(window[3])):  # unsigned: not tested for being negative
-            if labels[c] != mark:
-                continue
-            if not flat_ground:
-                at, fx = np.uint64(c // STEP), (c % STEP + 0.5) / STEP
-                z = nodes[at] * (1.0 - fx) + nodes[at + np.uint64(1)] * fx
-            x, dz = c * gsd, z - position[2]
-            near = 1.0 / (row_d + m[2, 0] * x + m[2, 2] * dz)
-            px, py = (row_x + m[0, 0] * x + m[0, 2] * dz) * near, (row_y + m[1, 0] * x + m[1, 2] * dz) * near
-            scale = focal
-            if distorted:
-                r2 = px * px + py * py
-                scale = focal * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
-            u, v = (px * scale + lens[U]) * shrink + offset, (py * scale + lens[V]) * shrink + offset
-            if u < -1.0 or v < -1.0 or u > right + 1.5 or v > bottom + 1.5:
-                continue  # beside a seam at the picture's very border
-            fu, fv = np.int64(min(max(u, zero), right) * UNIT), np.int64(min(max(v, zero), bottom) * UNIT)
-            j, i = fu >> 7, fv >> 7
-            wx, wy = weights[fu & (UNIT - 1)], weights[fv & (UNIT - 1)]
-            w0, w1, w2, w3 = wx[0], wx[1], wx[2], wx[3]
-            x0, x1, x2, x3 = 3 * max(j - 1, none), 3 * j, 3 * min(j + 1, end_x), 3 * min(j + 2, end_x)
-            y0, y1 = stride * max(i - 1, none), stride * i
-            y2, y3 = stride * min(i + 1, end_y), stride * min(i + 2, end_y)
-            total = (
-                _row(flat, y0, x0, x1, x2, x3, w0, w1, w2, w3) * wy[0]
-                + _row(flat, y1, x0, x1, x2, x3, w0, w1, w2, w3) * wy[1]
-                + _row(flat, y2, x0, x1, x2, x3, w0, w1, w2, w3) * wy[2]
-                + _row(flat, y3, x0, x1, x2, x3, w0, w1, w2, w3) * wy[3]
-                + _BIAS2
-            )
-            red, green, blue = _level(total), _level(total >> 16), _level(total >> 32)
-            if not plain:
-                x, y = np.float32(u * per_px - 1.0), np.float32(v * per_px - tall)
-                red = _scaled(red, field[0], x, y)
-                green = _scaled(green, field[1], x, y)
-                blue = _scaled(blue, field[2], x, y)
-            colors[c, 0], colors[c, 1], colors[c, 2], colors[c, 3] = red, green, blue, 255
-            count += 1
-    return count
+    count = len(index)
+    totals, colors, target = np.empty(count, np.int64), np.empty(count, np.uint32), packed.ravel()
+    _totals(index, spots, lanes.ravel(), np.uint64(lanes.shape[1]), np.int64(box[0]), np.int64(box[2]), weights, totals)
+    _colors(totals, sights, field, colors)
+    for n in range(count):
+        target[np.uint64(index[n])] = colors[n]

@@ -15,6 +15,7 @@ from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.render_arrays import Shots, height_at, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
+from orthoswarm.mosaic.seams.previews import Previews
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -60,24 +61,24 @@ class Region:
     lattice: Floats
 
 
-def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArray[np.void]) -> Cells:
+def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previews) -> Cells:
     """The candidates of a region's cells.
 
     Args:
         region: the cells.
         shots: N pictures that may see it.
         tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
-        previews: (N,) of previews.RECORD; a picture without one is not a candidate.
+        previews: of the N pictures; one that has none is not a candidate.
     """
     config = active().mosaic
     position, rotation = shots.about(region.west, region.north)
     height = float(np.median(position[:, 2] - float(np.median(region.lattice)))) if len(position) else 1.0
     unit = region.cell_px * region.gsd_m / max(height, 1.0)  # of an area cost against the cost of a cell's side
-    sharpness = previews["sharpness"]
+    sharpness = previews.sharpness
     blur = np.log(np.maximum(np.median(sharpness), 1e-3) / np.maximum(sharpness, 1e-3)) - config.blur_ignored_log
     penalty = unit * config.blur_cost * np.maximum(blur, 0.0) + config.weak_cost * shots.weak
-    usable = np.nonzero(previews["written"] > 0)[0]
-    local = previews["contrast"] * np.maximum(tone[:, :1, None], 0.1)
+    usable = np.nonzero(previews.written)[0]
+    local = previews.contrast * np.maximum(tone[:, :1, None], 0.1)
     contrast = np.log(np.maximum(_smoothed(local), 0.5)).astype(np.float32)
     shape = (region.side, region.side, SLOTS)
     cells = Cells(
@@ -101,7 +102,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: NDArra
     )
     haze *= np.float32(unit * config.haze_cost)
     _candidates(
-        *arrays, usable, penalty, haze, np.ascontiguousarray(previews["gray"]), tone, region.lattice, region.gsd_m,
+        *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
         region.cell_px, unit * config.obliqueness_cost, cells.candidate, cells.cost, cells.level,
         np.ascontiguousarray(local, np.float32), cells.texture, unit * config.glare_cost,
         config.glare_level, config.candidate_tan2, tan_limit() ** 2,
@@ -162,6 +163,7 @@ def _candidates(  # type: ignore[no-untyped-def]
     penalty,
     haze,
     gray,
+    record,
     tone,
     lattice,
     gsd,
@@ -225,7 +227,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                                     and v <= lens[k, V_HIGH] - border
                                 )
                                 if inside:
-                                    g = _gray(gray[k], tone[k], u, v, size[k, 0], size[k, 1])
+                                    g = _gray(gray[record[k]], tone[k], u, v, size[k, 0], size[k, 1])
                                     if g >= glare_level:
                                         here += glare
                                 if inside and here < limit:

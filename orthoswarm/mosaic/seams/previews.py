@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
@@ -67,9 +68,9 @@ def write_preview(path: Path, row: int, picture: Bytes) -> None:
     """
     record = make_preview(picture)
     try:
-        with path.open("r+b") as file:
+        with path.open("r+b", buffering=0) as file:
             file.seek(row * RECORD.itemsize)
-            file.write(record.tobytes())
+            record.tofile(file)
     except OSError as error:
         raise StorageError(f"{path} cannot be written ({error.strerror}); free some disk space") from None
 
@@ -81,27 +82,60 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     config = active().mosaic
     record = np.zeros(1, RECORD)
     gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
-    blocks = (COLUMNS // BLOCK_PX, ROWS // BLOCK_PX)
-    level = gray.astype(np.float32)
-    mean = cv2.resize(level, blocks, interpolation=cv2.INTER_AREA)
-    square = cv2.resize(level * level, blocks, interpolation=cv2.INTER_AREA)
-    glare = cv2.resize((gray >= config.glare_level).astype(np.float32), blocks, interpolation=cv2.INTER_AREA)
     record["gray"][0] = gray
-    record["contrast"][0] = np.sqrt(np.maximum(square - mean * mean, 0.25)) * (glare <= config.glare_share)
+    _contrasts(record["gray"][0], config.glare_level, config.glare_share, record["contrast"][0])
     sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= LEAST_SIDE_PX else 0.0
     record["sharpness"] = max(sharp, 1e-3)
     record["written"] = 1
     return record
 
 
-def read_previews(path: Path, rows: NDArray[np.integer]) -> NDArray[np.void]:
-    """Some records (N,) of dtype RECORD."""
-    records = np.zeros(len(rows), RECORD)
-    with path.open("rb", buffering=0) as file:
-        for i, row in enumerate(rows.tolist()):
-            file.seek(row * RECORD.itemsize)
-            file.readinto(records[i : i + 1].view(np.uint8).data)
-    return records
+@kernel
+def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-untyped-def]
+    """Standard deviation of each block of a preview, at least half a level; 0 where too much of it is glare."""
+    pixels = np.int64(BLOCK_PX * BLOCK_PX)
+    for i in range(contrast.shape[0]):
+        for j in range(contrast.shape[1]):
+            total, square, glare = np.int64(0), np.int64(0), np.int64(0)
+            for r in range(i * BLOCK_PX, (i + 1) * BLOCK_PX):
+                row = gray[r, j * BLOCK_PX : (j + 1) * BLOCK_PX]
+                for c in range(BLOCK_PX):
+                    level = np.int64(row[c])
+                    total += level
+                    square += level * level
+                    glare += np.int64(level >= glare_level)
+            variance = (pixels * square - total * total) / (pixels * pixels)
+            contrast[i, j] = np.sqrt(max(variance, 0.25)) if glare <= glare_share * pixels else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Previews:
+    """Previews of N pictures.
+
+    Attributes:
+        gray: uint8 (M, ROWS, COLUMNS), grey copies of all pictures of the file, mapped and not read.
+        rows: int32 (N,), which of them are meant.
+        contrast: float32 (N, ROWS / BLOCK_PX, COLUMNS / BLOCK_PX), of the parts of the pictures, levels.
+        sharpness: float32 (N,), see picture_quality.
+        written: bool (N,), whether there is a preview.
+    """
+
+    gray: Bytes
+    rows: NDArray[np.int32]
+    contrast: NDArray[np.float32]
+    sharpness: NDArray[np.float32]
+    written: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, records: NDArray[np.void], rows: NDArray[np.integer]) -> "Previews":
+        """Some of the records (M,) of dtype RECORD."""
+        contrast, sharpness, written = (records[name][rows] for name in ("contrast", "sharpness", "written"))
+        return cls(records["gray"], rows.astype(np.int32), contrast, sharpness, written > 0)
+
+
+def read_previews(path: Path, rows: NDArray[np.integer]) -> Previews:
+    """Some previews of a file."""
+    return Previews.of(np.asarray(np.memmap(path, RECORD, mode="r")), rows)
 
 
 def unwritten(path: Path, rows: NDArray[np.integer]) -> NDArray[np.bool_]:
