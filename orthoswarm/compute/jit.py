@@ -16,5 +16,7 @@ def kernel(function: Kernel) -> Kernel:
 
     `fastmath` excludes reassociation: with it a kernel just compiled and the same one from the cache differ in their
     last digits, so that the first run on a machine gives another map than the next (measured: no slower without).
+    Division by zero gives infinity or NaN, as in numpy: a test for it would keep loops from being vectorised.
     """
-    return cast(Kernel, numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})(function))
+    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+    return cast(Kernel, compiled(function))

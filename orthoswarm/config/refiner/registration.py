@@ -227,6 +227,8 @@ class RegistrationConfig:
     """Least correlation of a link (chosen; not measured)."""
     link_ratio: float = 0.8
     """Largest ratio of the second peak to the first (chosen; not measured)."""
+    links_at_once: int = 2_000
+    """Points whose patches are held at once, 9 kB each (chosen for memory)."""
     link_sigma_px: float = 0.7
     """Sigma of a link to another leg, working pixels (chosen; not measured)."""
     neighbour_sigma_px: float = 1.5

@@ -1,6 +1,5 @@
 """Absolute orientation of one vehicle: tie points on the map, links between legs, and the adjustment with both."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
-from orthoswarm.refine.features.patch_matching import gradient_field, texture_field
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.coarse_registration import shift_cameras
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -22,7 +20,6 @@ from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 
 @dataclass(slots=True)
@@ -82,7 +79,7 @@ def tie_matches(
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     return _ground_matches(
-        flight, surface, ground, chosen=chosen, camera=seen.camera, reach_m=reach_m, half_m=half_m, field=texture_field
+        flight, surface, ground, chosen=chosen, camera=seen.camera, reach_m=reach_m, half_m=half_m, texture=True
     )
 
 
@@ -95,7 +92,7 @@ def _ground_matches(
     camera: NDArray[np.int32],
     reach_m: float,
     half_m: float,
-    field: Callable[[Floats], Floats],
+    texture: bool,
 ) -> MapMatches:
     config = active().registration
     adj = flight.adjustment
@@ -112,7 +109,7 @@ def _ground_matches(
         half=half,
         reach=reach,
         level=level,
-        field=field,
+        texture=texture,
     )
 
 
@@ -140,7 +137,7 @@ def edge_displacement(
             camera=camera,
             reach_m=reach_m,
             half_m=half_m,
-            field=gradient_field,
+            texture=False,
         )
     )
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)

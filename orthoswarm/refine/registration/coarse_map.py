@@ -135,7 +135,7 @@ def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[G
 
 
 def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
-    """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.texture_field`."""
+    """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.gradients`."""
     config, side = active().registration, active().registration.strip_border_px
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
     inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock
-from orthoswarm.refine.features.patch_matching import texture_field
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.absolute_orientation import clear_matches
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -62,7 +61,7 @@ def map_heights(
             half=half,
             reach=reach,
             level=level,
-            field=texture_field,
+            texture=True,
         )
     )
     sight = points[found.point] - cameras.position[found.camera]

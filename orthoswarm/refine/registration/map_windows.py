@@ -36,20 +36,9 @@ class LoadedMap:
         grid = GroundGrid.around(basemap.epsg, world, gsd_m)
         return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)
 
-    def pixel_centre(self, x: float, y: float) -> tuple[int, int, float, float]:
-        """Row and column of the pixel that holds a point, and the local coordinates of its centre."""
-        c, r = int((x - self.west) // self.gsd_m), int((self.north - y) // self.gsd_m)
-        return r, c, self.west + (c + 0.5) * self.gsd_m, self.north - (r + 0.5) * self.gsd_m
-
-    def window(self, row: int, column: int, half: int) -> tuple[NDArray[np.float32], float] | None:
-        """Grey float32 (2 half + 1, 2 half + 1) about a pixel and its valid share; None if it leaves the map."""
-        rows, cols = self.gray.shape
-        if row < half or column < half or row + half >= rows or column + half >= cols:
-            return None
-        cut = (slice(row - half, row + half + 1), slice(column - half, column + half + 1))
-        valid = self.valid[cut]
-        share = np.count_nonzero(valid) / valid.size
-        gray = self.gray[cut].astype(np.float32)
-        if share < 1.0:
-            gray[~valid] = np.nan
-        return gray, share
+    def pixel_centres(self, xy: Array) -> tuple[NDArray[np.int64], Array]:
+        """Row and column (K, 2) of the pixels that hold points (K, 2), and the coordinates (K, 2) of their middles."""
+        column = ((xy[:, 0] - self.west) // self.gsd_m).astype(np.int64)
+        row = ((self.north - xy[:, 1]) // self.gsd_m).astype(np.int64)
+        east, north = self.west + (column + 0.5) * self.gsd_m, self.north - (row + 0.5) * self.gsd_m
+        return np.column_stack([row, column]), np.column_stack([east, north])

@@ -1,20 +1,21 @@
 """Tie points on the map, roofs that show how the map leans, and links between legs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.features.patch_matching import gradient_field, match, rectify
+from orthoswarm.refine.features.patch_matching import template_of
 from orthoswarm.refine.registration.map_windows import LoadedMap
+from orthoswarm.refine.registration.patch_search import search_map, search_picture, templates, views_of_other_legs
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Gray = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ def match_points(
     half: int,
     reach: int,
     level: Array | None = None,
-    field: Callable[[Floats], Floats] = gradient_field,
+    texture: bool = False,
 ) -> MapMatches:
     """Find the surroundings of points on the map.
 
@@ -59,35 +60,39 @@ def match_points(
         gray: working-scale picture of a camera (its lens is in these pixels).
         half: half the patch in map pixels; reach: search in map pixels.
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
-        field: what is compared of pictures.
+        texture: compare texture instead of edges, see `patch_matching.gradients`.
     """
-    config = active().registration
-    order = np.argsort(camera[chosen], kind="stable")
-    patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
-    rows: list[tuple[int, int, float, float, float, float]] = []
-    for k in order:
-        p, i = int(chosen[k]), int(camera[chosen[k]])
-        x, y, z = points[p]
-        plane = z if level is None else float(level[p])
-        along = (points[p, :2] - cameras.position[i, :2]) / max(cameras.position[i, 2] - z, 1.0)
-        x, y = x + along[0] * (z - plane), y + along[1] * (z - plane)
-        row, column, cx, cy = ground.pixel_centre(x, y)
-        window = ground.window(row, column, half + reach + 1)
-        if window is None or window[1] < config.map_window_share:
-            continue
-        lens = cameras.lens[cameras.lens_id[i]]
-        seen = rectify(
-            cameras.position[i], cameras.rotation[i], lens, gray(i), cx, cy, plane, ground.gsd_m, half + 1, patch
-        )
-        if seen < config.patch_share:
-            continue
-        dc, dr, peak, second = match(field(patch), field(window[0]))
-        if peak > 0:
-            rows.append((p, i, dc * ground.gsd_m, -dr * ground.gsd_m, peak, second / peak))
-    if not rows:
-        return MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    a = np.array(rows)
-    return MapMatches(a[:, 0].astype(np.int32), a[:, 1].astype(np.int32), a[:, 2:4], a[:, 4], a[:, 5])
+    config, features = active().registration, active().features
+    chosen = chosen[np.argsort(camera[chosen], kind="stable")]
+    by, z = camera[chosen], points[chosen, 2]
+    plane = z if level is None else np.asarray(level, float)[chosen]
+    along = (points[chosen, :2] - cameras.position[by, :2]) / np.maximum(cameras.position[by, 2] - z, 1.0)[:, None]
+    pixel, centre = ground.pixel_centres(points[chosen, :2] + along * (z - plane)[:, None])
+    place = np.column_stack([centre, plane])
+    found = np.zeros((len(chosen), 4))
+    for i, part in _by_picture(by):
+        search_map(
+            cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), place[part],
+            pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture,
+            np.float32(features.gradient_floor), features.peak_exclude_px, config.map_window_share,
+            config.patch_share, found[part],
+        )  # fmt: skip
+    good = found[:, 2] > 0
+    found = found[good]
+    return MapMatches(
+        chosen[good].astype(np.int32),
+        by[good].astype(np.int32),
+        found[:, :2] * [ground.gsd_m, -ground.gsd_m],
+        found[:, 2],
+        found[:, 3] / found[:, 2],
+    )
+
+
+def _by_picture(ascending: NDArray[np.integer]) -> Iterator[tuple[int, slice]]:
+    """Each picture of an ascending list, with where it stands in that."""
+    edges = np.flatnonzero(np.diff(ascending, prepend=-1)).tolist()
+    for a, b in pairwise([*edges, len(ascending)]):
+        yield int(ascending[a]), slice(a, b)
 
 
 def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float, float] | None:
@@ -149,45 +154,45 @@ def link_legs(
     Returns:
         Camera (K,), point (K,), pixel (K, 2) of new observations, and how many were tried.
     """
-    config = active().registration
+    config, features = active().registration, active().features
     most = config.link_pictures if most is None else most
     half, reach = config.link_half_px, config.link_reach_px if reach is None else reach
-    cams, pts, uvs, tried = [], [], [], 0
-    size = 2 * (half + reach) + 3
-    template, window = np.empty((2 * half + 3, 2 * half + 3), np.float32), np.empty((size, size), np.float32)
-    nadir = cameras.position[candidates, :2]
-    for p in chosen:
-        i = int(camera[p])
-        x, y, z = points[p]
-        distance = np.hypot(nadir[:, 0] - x, nadir[:, 1] - y)
-        uv = cameras.project(candidates, np.broadcast_to(points[p], (len(candidates), 3)))
-        lens = cameras.lens[cameras.lens_id[candidates]]
-        margin = config.link_margin_px
-        sees = (uv[:, 0] > margin) & (uv[:, 1] > margin)
-        sees &= (uv[:, 0] < lens[:, 6] - margin) & (uv[:, 1] < lens[:, 7] - margin)
-        sees &= leg[candidates] != leg[i]
-        near = np.flatnonzero(sees)[np.argsort(distance[sees], kind="stable")]
-        _, first = np.unique(leg[candidates[near]], return_index=True)
-        picks = candidates[near[np.sort(first)[:most]]]
-        if not len(picks):
-            continue
-        li = cameras.lens[cameras.lens_id[i]]
-        shown = rectify(cameras.position[i], cameras.rotation[i], li, gray(i), x, y, z, gsd_m, half + 1, template)
-        if shown < config.link_template_share:
-            continue
-        field = gradient_field(template)
-        for j in picks:
-            lj = cameras.lens[cameras.lens_id[j]]
-            tried += 1
-            seen = rectify(
-                cameras.position[j], cameras.rotation[j], lj, gray(int(j)), x, y, z, gsd_m, half + reach + 1, window
-            )
-            if seen < config.link_window_share:
-                continue
-            dc, dr, peak, second = match(field, gradient_field(window), exclude=config.link_apart_px)
-            if peak >= config.link_peak and second <= config.link_ratio * peak:
-                moved = np.array([[x + dc * gsd_m, y - dr * gsd_m, z]])
-                cams.append(int(j))
-                pts.append(int(p))
-                uvs.append(cameras.project(np.array([j]), moved)[0])
-    return np.array(cams, np.int32), np.array(pts, np.int32), np.array(uvs, float).reshape(-1, 2), tried
+    floor = np.float32(features.gradient_floor)
+    chosen = chosen[np.argsort(camera[chosen], kind="stable")]
+    _, number = np.unique(leg, return_inverse=True)
+    views = np.empty((len(chosen), most), np.int64)
+    views_of_other_legs(
+        cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, points[chosen], number[camera[chosen]],
+        number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), config.link_margin_px, views,
+    )  # fmt: skip
+    chosen, views = chosen[views[:, 0] >= 0], views[views[:, 0] >= 0]
+    found, tried = np.zeros((*views.shape, 4)), 0
+    for start in range(0, len(chosen), config.links_at_once):
+        some = slice(start, start + config.links_at_once)
+        own = points[chosen[some]]
+        fields = np.zeros((len(own), *template_of(half).shape), np.float32)
+        for i, part in _by_picture(camera[chosen[some]]):
+            templates(
+                cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), own[part],
+                gsd_m, half, floor, config.link_template_share, fields[part],
+            )  # fmt: skip
+        shown = np.isfinite(fields[:, 0, 0, 0])
+        point, view = np.nonzero((views[some] >= 0) & shown[:, None])
+        by = views[some][point, view]
+        order = np.argsort(by, kind="stable")
+        point, view, by = point[order], view[order], by[order]
+        tried += len(by)
+        result = np.zeros((len(by), 4))
+        for i, part in _by_picture(by):
+            search_picture(
+                cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i),
+                own[point[part]], fields, point[part], gsd_m, half, reach, floor, config.link_apart_px,
+                config.link_window_share, result[part],
+            )  # fmt: skip
+        found[start + point, view] = result
+    peak, second = found[..., 2], found[..., 3]
+    point, view = np.nonzero((peak > 0) & (peak >= config.link_peak) & (second <= config.link_ratio * peak))
+    moved = points[chosen[point]]
+    moved[:, :2] += found[point, view, :2] * [gsd_m, -gsd_m]
+    by_camera = views[point, view].astype(np.int32)
+    return by_camera, chosen[point].astype(np.int32), cameras.project(by_camera, moved), tried

@@ -12,7 +12,7 @@ from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
-from orthoswarm.refine.features.patch_matching import gradient_field, match, texture_field
+from orthoswarm.refine.features.patch_matching import gradients, locate, template_of, window_of
 from orthoswarm.refine.registration.absolute_orientation import clear_matches, edge_displacement, mode_shift
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -288,11 +288,13 @@ def in_light(ground, things, east, north):
     return out
 
 
-def common_shift(field, pictures, maps):
+def common_shift(pictures, maps, by_texture):
     shifts = []
     for picture, other in zip(pictures, maps, strict=True):
-        template = np.ascontiguousarray(field(picture)[11:52, 11:52])
-        shifts.append(match(template, field(other))[:2])
+        template, window = template_of(20), window_of(20, 11)
+        gradients(np.ascontiguousarray(picture[11:54, 11:54]), by_texture, np.float32(1e-3), template, 3)
+        gradients(np.ascontiguousarray(other), by_texture, np.float32(1e-3), window, 0)
+        shifts.append(locate(template, window, 11, 4)[:2])
     return float(np.hypot(*np.mean(shifts, axis=0)))
 
 
@@ -305,7 +307,7 @@ def test_shadows_of_another_hour_pull_less_where_texture_is_compared():
         things = rng.integers(8, 54, (14, 2))
         pictures.append(in_light(ground, things, 3.0, 0.0))
         maps.append(in_light(ground, things, 0.0, 3.0))
-    edges, texture = (common_shift(field, pictures, maps) for field in (gradient_field, texture_field))
+    edges, texture = (common_shift(pictures, maps, by_texture) for by_texture in (False, True))
     assert edges > 0.03
     assert texture < 0.6 * edges
 
@@ -337,7 +339,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
             half=20,
             reach=10,
             level=np.zeros(len(points)),
-            field=texture_field,
+            texture=True,
         )
     )
     off = found.shift.mean(0)

@@ -1,0 +1,132 @@
+"""Sums of products of two fields at many shifts, the inner part of a correlation, in vector registers.
+
+A loop that numba compiles keeps its sums in memory, since it cannot know that arrays do not overlap, and takes four
+times as long (measured; a Fourier transform for each window takes two to five times as long). So this part is written
+in LLVM's own terms: a block of four rows by up to four vectors of shifts stays in registers while the template passes.
+The order of the sums is fixed, so that the result is the same on each run.
+"""
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from orthoswarm.compute.jit import kernel
+
+LANES = 8
+"""Shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts."""
+ROWS = 4
+"""Rows of shifts of one block: with three vectors each they fill the sixteen registers of AVX2."""
+
+_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+_FUSED = ("contract",)
+
+
+def _block(vectors: int) -> Any:
+    """A function for compiled code that adds the products of one block of ROWS x (LANES vectors) shifts.
+
+    Arguments (arrays are float32 and contiguous; places are indices into their memory):
+        window, its place and step: first line below the first row of shifts, and values from line to line.
+        template, its place and step: first line; ROWS - 1 lines of zeros precede and follow it.
+        lines: of the template, with the zeros that follow. count: its columns.
+        score, its place and step: where the sums are added.
+    """
+
+    @intrinsic
+    def block(typing, window, window_at, window_step, template, template_at, template_step, lines, count, score, score_at, score_step):  # type: ignore[no-untyped-def]  # fmt: skip # noqa: E501
+        number = types.intp
+        signature = types.void(
+            window, number, number, template, number, number, number, number, score, number, number
+        )  # fmt: skip
+        return signature, _generate
+
+    def _generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        window_at, window_step, template_at, template_step = (arguments[k] for k in (1, 2, 4, 5))
+        lines, count, score_at, score_step = (arguments[k] for k in (6, 7, 9, 10))
+        window, template, score = (
+            context.make_array(signature.args[k])(context, builder, arguments[k]).data for k in (0, 3, 8)
+        )
+        sums = [
+            [cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, None)) for _ in range(vectors)]
+            for _ in range(ROWS)
+        ]
+
+        def number(value: int) -> Any:
+            return ir.Constant(count.type, value)
+
+        def vector_at(base: Any, at: Any) -> Any:
+            return builder.bitcast(builder.gep(base, [at]), _VECTOR.as_pointer())
+
+        with cgutils.for_range(builder, lines) as line:
+            seen = builder.gep(window, [builder.add(window_at, builder.mul(line.index, window_step))])
+            own = builder.gep(template, [builder.add(template_at, builder.mul(line.index, template_step))])
+            with cgutils.for_range(builder, count) as column:
+                values = [
+                    builder.load(vector_at(seen, builder.add(column.index, number(LANES * k))), align=4)
+                    for k in range(vectors)
+                ]
+                for row in range(ROWS):
+                    at = builder.sub(column.index, builder.mul(number(row), template_step))
+                    factor = _everywhere(builder, builder.load(builder.gep(own, [at])))
+                    for value, total in zip(values, sums[row], strict=True):
+                        product = builder.fmul(factor, value, flags=_FUSED)
+                        builder.store(builder.fadd(product, builder.load(total), flags=_FUSED), total)
+        for row in range(ROWS):
+            for k, total in enumerate(sums[row]):
+                at = builder.add(score_at, builder.add(builder.mul(number(row), score_step), number(LANES * k)))
+                place = vector_at(score, at)
+                builder.store(builder.fadd(builder.load(place, align=4), builder.load(total)), place, align=4)
+        return context.get_dummy_value()
+
+    return block
+
+
+def _everywhere(builder: Any, value: Any) -> Any:
+    """A vector of one value."""
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+
+
+_one, _two, _three, _four = _block(1), _block(2), _block(3), _block(4)
+
+
+@kernel
+def padded(count, step):  # type: ignore[no-untyped-def]
+    """The next multiple of a step."""
+    return -(-count // step) * step
+
+
+@kernel
+def add_products(template, window, score):  # type: ignore[no-untyped-def]
+    """Add to `score` the products of a template and a window at each shift, over all their channels.
+
+    Args:
+        template: float32 (channels, n + 2 (ROWS - 1), n), with ROWS - 1 lines of zeros before and after.
+        window: float32 (channels, rows + n + ROWS - 1, columns + n) at least, zeros beyond what is known.
+        score: float32 (rows, columns), multiples of ROWS and of LANES; [i, j] is the sum for the template's first
+            pixel at [i, j] of the window.
+    """
+    channels, lines, n = template.shape
+    rows, columns = score.shape
+    step = window.shape[2]
+    for channel in range(channels):
+        own = (channel * lines + ROWS - 1) * n
+        for i in range(0, rows, ROWS):
+            seen, out, j = (channel * window.shape[1] + i) * step, i * columns, 0
+            while j < columns:
+                left = (columns - j) // LANES
+                if left == 1:
+                    _one(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    j += LANES
+                elif left == 2:
+                    _two(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    j += 2 * LANES
+                elif left == 3 or left == 5:
+                    _three(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    j += 3 * LANES
+                else:
+                    _four(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    j += 4 * LANES
