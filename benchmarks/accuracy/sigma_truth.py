@@ -1,11 +1,12 @@
 """Is the stated error true? Shares of pictures within one and two `sigma_m`, on maps that are right and distorted ones.
 
-    python -m benchmarks.accuracy.sigma_truth SET... [--kinds plain season 2x150 ...] [--out FILE.jsonl]
+    python -m benchmarks.accuracy.sigma_truth SET... [--kinds plain season 2x150 ...] [--fields N] [--out FILE.jsonl]
 
 SET is a folder of `orthoswarm twin make`. A kind `AxL` is the set's basemap warped by a smooth random field: its
 displacements have a root mean square length of A metres and a Gaussian correlation of length L metres. The truth stays,
-so that `sigma_m` has to cover what the map is wrong by. A line a run: the error of the pictures' middles on the stated
-plane, and the shares of it within one and two sigma, of each axis and of its length.
+so that `sigma_m` has to cover what the map is wrong by. A set of a few hundred metres shows a handful of independent
+places of such a field only, so that shares are counted over `--fields` of them. A line a set and kind: the error of the
+pictures' middles on the stated plane, and the shares of it within one and two sigma, of each axis and of its length.
 """
 
 import argparse
@@ -50,17 +51,17 @@ def warped(picture, gsd_m, rms_m, length_m, seed=1):
     return np.stack(moved)
 
 
-def write_map(source, target, kind):
-    """The set's basemap, or a changed one, as a file."""
+def write_map(source, target, kind, field=1):
+    """The set's basemap, or a changed one, as a file; field: which random field it is warped by."""
     if kind in ("plain", "season"):
         altered(source, target, season if kind == "season" else lambda picture, _: picture)
         return
     rms_m, length_m = (float(v) for v in kind.split("x"))
-    altered(source, target, lambda picture, gsd_m: warped(picture, gsd_m, rms_m, length_m))
+    altered(source, target, lambda picture, gsd_m: warped(picture, gsd_m, rms_m, length_m, field))
 
 
-def measure(folder, basemap_file):
-    """Errors and stated errors of a set with a map."""
+def refined(folder, basemap_file):
+    """Errors (n, 2) and stated errors (n,) of a set's pictures with a map, stages, states of its legs, CPU seconds."""
     frames = telemetry.load([folder / "photos"]).frames
     grid = area_grid(frames)
     vehicles = {}
@@ -78,15 +79,28 @@ def measure(folder, basemap_file):
         true = truth[p.frame.image][2]
         middle = np.array(true.lens.principal_point)
         error.append(p.camera.to_ground(middle, level) - true.to_ground(middle, level))
-    error, sigma = np.array(error), np.array([p.sigma_m for p in placed])
-    length = np.hypot(*error.T)
     states = [leg.state for solution in refinement.fine for leg in solution.legs]
+    return np.array(error), np.array([p.sigma_m for p in placed]), [p.stage for p in placed], states, seconds
+
+
+def measure(folder, kind, fields):
+    """Errors and stated errors of a set with a kind of map, over its random fields together."""
+    runs = []
+    for field in range(1, fields + 1) if "x" in kind else (1,):
+        with tempfile.TemporaryDirectory() as scratch:
+            target = Path(scratch) / "map.tif"
+            write_map(folder / "basemap.tif", target, kind, field)
+            runs.append(refined(folder, target))
+    error, sigma = (np.concatenate([run[k] for run in runs]) for k in (0, 1))
+    stages, states = ([value for run in runs for value in run[k]] for k in (2, 3))
+    length = np.hypot(*error.T)
     return {
-        "pictures": len(placed), "fine": sum(p.stage == "fine" for p in placed), "matched": states.count("matched"),
+        "pictures": len(error), "fine": stages.count("fine"), "matched": states.count("matched"),
         "legs": len(states), "median_m": round(float(np.median(length)), 3),
         "p95_m": round(float(np.percentile(length, 95)), 3), "sigma_m": round(float(np.median(sigma)), 3),
         "axis_1": share(np.abs(error), sigma[:, None]), "axis_2": share(np.abs(error), 2 * sigma[:, None]),
-        "length_1": share(length, sigma), "length_2": share(length, 2 * sigma), "cpu_s": round(seconds, 1),
+        "length_1": share(length, sigma), "length_2": share(length, 2 * sigma),
+        "cpu_s": round(sum(run[4] for run in runs), 1),
     }  # fmt: skip
 
 
@@ -99,14 +113,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--kinds", nargs="+", default=KINDS)
+    parser.add_argument("--fields", type=int, default=1, metavar="N", help="random fields of each kind AxL (1)")
     parser.add_argument("--out", type=Path, help="lines are added to this file")
     args = parser.parse_args()
     for folder in args.sets:
         for kind in args.kinds:
-            with tempfile.TemporaryDirectory() as scratch:
-                target = Path(scratch) / "map.tif"
-                write_map(folder / "basemap.tif", target, kind)
-                row = {"set": folder.name, "map": kind, **measure(folder, target)}
+            row = {"set": folder.name, "map": kind, **measure(folder, kind, args.fields)}
             print(json.dumps(row), flush=True)
             if args.out:
                 with args.out.open("a", encoding="utf-8") as file:

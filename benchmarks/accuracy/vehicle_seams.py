@@ -1,8 +1,9 @@
 """Vehicles without a basemap: python -m benchmarks.accuracy.vehicle_seams SET...
 
 SET is a folder of `orthoswarm twin make` with several vehicles. They are refined without a basemap. A line a set: how
-far ground in pictures of two neighbouring vehicles lies apart (median and largest of the pairs, metres), and the error
-of the ground below the pictures (median, 95 %), most of it the receivers' own.
+far ground in pictures of two neighbouring vehicles lies apart (median and largest of the pairs, metres), the error of
+the ground below the pictures (median, 95 %), most of it the receivers' own, and the shares of its axes within one and
+two stated sigmas.
 """
 
 import argparse
@@ -48,12 +49,16 @@ def measure(folder: Path) -> dict[str, object]:
         for i, j in near[np.linspace(0, len(near) - 1, min(len(near), PAIRS)).astype(int)]:
             ground = 0.5 * (a[i] + b[j])
             jumps.append(np.hypot(*(error(one, one.placed[i], ground) - error(two, two.placed[j], ground))))
-    errors = [np.hypot(*error(s, p, truth[p.frame.image].nadir)) for s in fine for p in s.placed]
+    axes = np.array([error(s, p, truth[p.frame.image].nadir) for s in fine for p in s.placed])
+    sigma = np.array([p.sigma_m for s in fine for p in s.placed])
+    errors = np.hypot(*axes.T)
     return {
         "set": folder.name, "vehicles": len(fine), "pictures": len(errors), "pairs": len(jumps),
         "jump_median_m": round(float(np.median(jumps)), 2), "jump_most_m": round(float(np.max(jumps)), 2),
         "median_m": round(float(np.median(errors)), 2), "p95_m": round(float(np.percentile(errors, 95)), 2),
-        "cpu_s": round(seconds, 1),
+        "sigma_m": round(float(np.median(sigma)), 2),
+        "axis_1": round(100 * float((np.abs(axes) <= sigma[:, None]).mean())),
+        "axis_2": round(100 * float((np.abs(axes) <= 2 * sigma[:, None]).mean())), "cpu_s": round(seconds, 1),
     }  # fmt: skip
 
 

@@ -33,6 +33,9 @@ class BundleConfig:
     """Sigma of a sortie's common offset of recorded heights, metres (chosen; not measured)."""
     drift_sigma_m: float = 15.0
     """Sigma of the drift of a receiver without corrections, metres (chosen; made-up flights drift by up to 10 m)."""
+    drift_mean_share: float = 3.0
+    """Mean square of a drift for its variance about its mean, in the stated error without a map: a drift that grows
+    evenly from 0 to d has a mean of d / 2 and a variance of d^2 / 12."""
     drift_bend_sigma_m: float = 0.5
     """Sigma of the second difference of the drift's knots, metres: it changes slowly (chosen; not measured)."""
     drift_knot_photos: int = 60
@@ -70,18 +73,26 @@ class BundleConfig:
     """With fewer ties about a photo a systematic offset of the map there is not estimated (chosen; not measured)."""
     systematic_reach_photos: int = 4
     """... which uses the ties of so many photos before and after, of the same leg (chosen; not measured)."""
-    variogram_near_heights: tuple[float, float] = (0.4, 0.6)
-    """Distance of ties within a photo, flying heights, least and most: half a photo (of a square's points 0.52 of its
-    side on average; photos of 640 x 480 with 90 degrees are 2 by 1.5 heights, those ties that hold it nearer)."""
-    variogram_far_heights: float = 1.0
-    """Ties farther apart than so many flying heights show the distortion's full variance (chosen: past a photo)."""
-    distortion_followed: float = 1.5
-    """Variance of the map's distortion that the adjustment followed, for one that it left (three simulated sets of 120
-    photos on maps distorted by 1 to 3 m over 150 and 300 m: 1.0 to 1.9)."""
-    variogram_least_pairs: int = 30
-    """With fewer pairs of ties at either distance the map's distortion is not estimated (chosen; not measured)."""
-    variogram_most_ties: int = 500
+    variogram_most_ties: int = 200
     """Of more ties every so many-th is used: pairs grow with their square (chosen for its cost)."""
+    variogram_classes: int = 9
+    """Classes of distance between ties; the first ends at ... (chosen; not measured)."""
+    variogram_near_heights: float = 0.1
+    """... so many flying heights (chosen; not measured) ..."""
+    variogram_far_share: float = 0.85
+    """... the last at this share of the largest distance: few pairs are farther apart (chosen; not measured)."""
+    variogram_least_pairs: int = 30
+    """A class with fewer pairs is left out (chosen; not measured)."""
+    variogram_least_classes: int = 3
+    """With fewer classes the map's distortion is not estimated: two variances and a length are fitted."""
+    variogram_flat_share: float = 0.1
+    """Classes weigh by their value, those below this share of the largest alike (chosen; not measured)."""
+    correlation_lengths: int = 8
+    """Correlation lengths that are tried, from ... (chosen for its cost)."""
+    correlation_heights: float = 0.2
+    """... so many flying heights to ... (chosen; not measured)"""
+    correlation_radii: float = 1.5
+    """... so many radii (root mean square) of the vehicle's ties: ties do not tell longer ones from a shift."""
     systematic_sigmas: float = 2.0
     """So many sigmas of the ties' median are taken off before it counts as a systematic offset (chosen)."""
     oblique_axis_down: float = 0.2

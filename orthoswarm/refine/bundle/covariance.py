@@ -1,6 +1,6 @@
 """Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from orthoswarm.model.camera import fov_rad, ground_jacobian
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
+from orthoswarm.refine.bundle.priors import Priors
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,8 @@ def stated_errors(
     """
     config = active().bundle
     n = len(adjustment.cameras)
+    if ties is None:
+        adjustment = replace(adjustment, priors=with_seen_drift(adjustment))
     free = np.flatnonzero(adjustment.free)
     chosen = np.unique(np.r_[free[:: config.covariance_every_photos], free[-1]])
     covariance, common = adjustment.covariance(chosen, c, heights, ties, tie_c)
@@ -60,6 +63,28 @@ def stated_errors(
     return StatedErrors(config.stated_sigma_factor * sigma, float(np.degrees(fov_sigma)), pose.astype(np.float32))
 
 
+def with_seen_drift(adjustment: Adjustment) -> Priors:
+    """Priors whose receivers drift as much as this flight shows, instead of as much as any may.
+
+    Pictures show how a drift changes, not what it has in common over the flight. That is the receiver's bias, its own
+    and what all have in common, and the mean of what it drifted by since it was right: of a drift that grows evenly the
+    mean square is three times the variance about its mean.
+
+    Args:
+        adjustment: without a map, after its last step.
+    """
+    p, layout, config = adjustment.priors, adjustment.layout, active()
+    bias2 = config.registration.receiver_bias_sigma_m**2 + config.registration.receiver_common_sigma_m**2
+    drift = layout.drift(adjustment.common, p.group)
+    models = list(p.models)
+    for g, (model, knots) in enumerate(zip(p.models, layout.knots, strict=True)):
+        if knots:
+            seen = float(drift[p.group == g].var(axis=0).mean())
+            size = min(float(np.sqrt(bias2 + config.bundle.drift_mean_share * seen)), model.drift_sigma)
+            models[g] = replace(model, drift_sigma=size * float(np.sqrt(knots)))  # the knots' mean has that sigma
+    return replace(p, models=tuple(models))
+
+
 def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
     """Covariances (n, 6, 6) of all pictures, interpolated between those of the chosen ones (ascending)."""
     after = np.searchsorted(chosen, np.arange(n)).clip(1, max(len(chosen) - 1, 1))
@@ -67,6 +92,22 @@ def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
         return np.repeat(covariance, n, axis=0)
     share = ((np.arange(n) - chosen[after - 1]) / (chosen[after] - chosen[after - 1])).clip(0.0, 1.0)[:, None, None]
     return np.asarray((1.0 - share) * covariance[after - 1] + share * covariance[after])
+
+
+def with_distance_errors(pose: NDArray[np.float32], rotation: Array, distance_sigma_m: Array) -> NDArray[np.float32]:
+    """Covariances of cameras whose distance from the ground is wrong by what their focal length makes up for.
+
+    Over level ground pictures show the ratio of both only. A camera with a wrong focal length then lies on its optical
+    axis, so that the ground in its middle stays where it is.
+
+    Args:
+        pose: float32 (N, 6, 6) as in StatedErrors. rotation: float64 (N, 3, 3), camera to ground.
+        distance_sigma_m: float64 (N,), one sigma along the axis.
+    """
+    out = pose.copy()
+    axis = rotation[:, :, 2] * distance_sigma_m[:, None]
+    out[:, :3, :3] += axis[:, :, None] * axis[:, None, :]
+    return out
 
 
 def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
@@ -121,38 +162,6 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
             0.0, float(np.hypot(*middle)) - config.systematic_sigmas * _MEDIAN_SIGMA * spread / np.sqrt(len(mine))
         )
     return out
-
-
-def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
-    """Variance per axis of the map's displacement under one picture, from place to place, metres squared.
-
-    Matching noise is independent from tie to tie, a distortion of the map is similar for neighbours: so the
-    semivariogram of the residuals rises with distance by the distortion's variance. The part that varies within a
-    picture averages out over its ties: the variance of a picture's mean is the semivariogram at large distance minus
-    that at the usual distance within it (Cressie 1993, Statistics for Spatial Data, chapter 2). Medians instead of
-    means of the squared differences are used, as ties may be wrong (for two Gaussian axes the median is ln 2 of the
-    mean). The residuals lack the share that the adjustment absorbed (`distortion_followed`).
-
-    Args:
-        place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), their residuals, metres.
-        height_m: flying height.
-
-    Returns:
-        The variance; 0 where there are too few close or distant pairs of ties to estimate it.
-    """
-    config = active().bundle
-    step = max(1, -(-len(place) // config.variogram_most_ties))
-    place, residual = place[::step], residual[::step]
-    i, j = np.triu_indices(len(place), 1)
-    apart = np.hypot(*(place[i] - place[j]).T)
-    half = ((residual[i] - residual[j]) ** 2).sum(1) / 4.0
-    inner, outer = config.variogram_near_heights
-    near = half[(apart > inner * height_m) & (apart < outer * height_m)]
-    far = half[apart > config.variogram_far_heights * height_m]
-    if min(len(near), len(far)) < config.variogram_least_pairs:
-        return 0.0
-    left = float(np.median(far) - np.median(near)) / float(np.log(2.0))
-    return max(0.0, config.distortion_followed * left)
 
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:

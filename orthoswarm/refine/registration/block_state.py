@@ -45,6 +45,7 @@ class VehicleState:
         on_map: True if it was found on the map; had_map: if there was one; carried: if it was not, but neighbours that
             were carry it. joined: if no map holds it, but it was registered to neighbours that none holds either.
         coarse_shift: how its block was shifted onto a map of far coarser pixels, None if it was not.
+        datum_sigma_m: float64 (N,) of the place of a block that no map holds, by all its receivers; None for one alone.
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
@@ -72,6 +73,7 @@ class VehicleState:
     carried: bool = False
     joined: bool = False
     coarse_shift: CoarseMapShift | None = None
+    datum_sigma_m: Array | None = None
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
     coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))

@@ -8,13 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
-    map_distortion_variance,
     stated_errors,
     systematic_tie_offset,
+    with_distance_errors,
 )
+from orthoswarm.refine.bundle.map_distortion import map_distortion_variance
+from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, reorient_on_map, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
@@ -83,11 +87,14 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
     track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
     stated = stated_errors(adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor)
-    state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_sigma_deg(flight, state.surface)))
-    state.sigma_m, state.pose_covariance = stated.sigma_m[: len(flight.frames)], stated.pose[: len(flight.frames)]
-    if state.coarse_shift is not None:  # it replaces the receivers' error, which all pictures have in common
+    level_deg = level_sigma_deg(flight, state.surface)
+    state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_deg))
+    state.sigma_m = stated.sigma_m[: len(flight.frames)]
+    state.pose_covariance = _with_focal_error(flight, stated.pose[: len(flight.frames)], level_deg)
+    placed = state.datum_sigma_m if state.coarse_shift is None else state.coarse_shift.sigma_m
+    if placed is not None:  # it replaces the receiver's error, which all pictures have in common
         own = state.coarse_sigma_m
-        state.sigma_m = np.hypot(np.sqrt(np.maximum(own**2 - own.min() ** 2, 0.0)), state.coarse_shift.sigma_m)
+        state.sigma_m = np.hypot(np.sqrt(np.maximum(own**2 - own.min() ** 2, 0.0)), placed)
     elif not lies_on_map(state):
         state.sigma_m = np.maximum(state.sigma_m, state.coarse_sigma_m)  # neighbours off the map add no accuracy
     elif not state.on_map:
@@ -102,6 +109,21 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         off = systematic_tie_offset(flight.leg, state.matches.camera, adj.tie_residual)
         off[off < active().strategy.coherent_sigmas * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)
+
+
+def _with_focal_error(flight: Flight, pose: NDArray[np.float32], fov_sigma_deg: float) -> NDArray[np.float32]:
+    """Covariances of the frames' cameras with what a wrong field of view means for their distance from the ground.
+
+    Recorded heights that the adjustment uses bound it.
+    """
+    cameras = flight.cameras()
+    fov = fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
+    share = float(np.radians(fov_sigma_deg)) / float(np.sin(fov))
+    down = np.maximum(-cameras.rotation[:, 2, 2], active().bundle.oblique_axis_down)
+    height_sigma_m = share * cameras.position[:, 2]
+    if flight.calibration.trusted_height:
+        height_sigma_m = np.minimum(height_sigma_m, active().bundle.height_offset_sigma_m)
+    return with_distance_errors(pose, cameras.rotation, height_sigma_m / down)
 
 
 def _denser_ground(

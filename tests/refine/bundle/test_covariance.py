@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from orthoswarm.config import active
+from orthoswarm.model.camera import ground_jacobian, rotation_from_angles
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
-    map_distortion_variance,
     systematic_tie_offset,
+    with_distance_errors,
 )
 
 BUNDLE = active().bundle
@@ -53,18 +54,16 @@ def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not()
     assert off[32:].min() > 0.8
 
 
-def test_a_distorted_map_is_told_from_one_whose_ties_only_scatter():
-    """What neighbouring ties have in common is the map's distortion; what differs from tie to tie is not."""
-    rng = np.random.default_rng(3)
-    place = rng.uniform(0.0, 600.0, (400, 2))
-    noise = rng.normal(0.0, 0.2, (400, 2))
-    waves = 1.5 * np.sin(place[:, ::-1] / 100.0)
-    assert map_distortion_variance(place, noise, 150.0) < 0.15**2
-    found = map_distortion_variance(place, noise + waves, 150.0)
-    assert 0.5 * waves.var() < found / BUNDLE.distortion_followed < 1.5 * waves.var()
-    ripples = 1.5 * np.sin(place[:, ::-1] / 5.0)
-    assert map_distortion_variance(place, noise + ripples, 150.0) < 0.2 * ripples.var(), "averages out in a picture"
-    wrong = noise + waves
-    wrong[::10] += 8.0
-    assert map_distortion_variance(place, wrong, 150.0) == pytest.approx(found, rel=0.5)
-    assert map_distortion_variance(place[:5], noise[:5], 150.0) == 0.0
+def test_what_the_focal_length_makes_up_for_moves_a_camera_along_its_axis():
+    """The ground in the middle of the picture stays where it is, and the distance has the error that was added."""
+    angles = np.radians([[30.0, -90.0, 0.0], [30.0, -60.0, 2.0]])
+    rotation = rotation_from_angles(*angles.T)
+    own = np.repeat(np.diag([0.01, 0.02, 0.04, 1e-6, 1e-6, 1e-7]).astype(np.float32)[None], 2, axis=0)
+    more = with_distance_errors(own, rotation, np.array([2.0, 3.0]))
+    for before, after, r, sigma in zip(own, more, rotation, (2.0, 3.0), strict=True):
+        axis = r[:, 2]
+        added = (after - before)[:3, :3]
+        assert axis @ added @ axis == pytest.approx(sigma**2, rel=1e-5)
+        j = ground_jacobian(r, 80.0, 0.2)
+        np.testing.assert_allclose(j @ after @ j.T, j @ before @ j.T, atol=1e-5)
+        np.testing.assert_array_equal(after[3:], before[3:])

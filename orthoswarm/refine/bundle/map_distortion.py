@@ -1,0 +1,100 @@
+"""A map that is displaced from place to place, as its ties' residuals show it.
+
+Matching noise is independent from tie to tie, a displacement of the map is alike for neighbours: so the semivariogram
+of the residuals rises with distance (Cressie 1993, Statistics for Spatial Data, chapter 2). A block of pictures is
+nearly rigid: it follows a displaced map as a whole, by a shift, a turn and a scale, and leaves the rest in the
+residuals. What it followed is its error.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+
+Array = NDArray[np.float64]
+
+_LN2 = float(np.log(2.0))
+"""Median of the squared length of a Gaussian vector of two axes, for one of its mean."""
+
+
+def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
+    """Variance per axis of what a block is displaced by on a map displaced from place to place, metres squared.
+
+    Noise and a displacement with a Gaussian correlation are fitted to the semivariogram of the residuals: their
+    variances by least squares, the correlation's length by trial. For each length it is known what a similarity fitted
+    to the ties follows of such a displacement, and what semivariogram the rest has. Medians instead of means of the
+    squared differences are used, as ties may be wrong.
+
+    Args:
+        place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), their residuals, metres.
+        height_m: flying height.
+
+    Returns:
+        The variance; 0 where there are too few pairs of ties to estimate it.
+    """
+    config = active().bundle
+    step = max(1, -(-len(place) // config.variogram_most_ties))
+    place, residual = place[::step], residual[::step]
+    i, j = np.triu_indices(len(place), 1)
+    apart = np.hypot(*(place[i] - place[j]).T)
+    if len(i) < config.variogram_least_pairs or not apart.max() > 0.0:
+        return 0.0
+    half = ((residual[i] - residual[j]) ** 2).sum(1) / 4.0
+    near, far = config.variogram_near_heights * height_m, config.variogram_far_share * float(apart.max())
+    edges = np.r_[0.0, np.geomspace(min(near, far), far, config.variogram_classes)]
+    number = np.digitize(apart, edges) - 1
+    classes = [np.flatnonzero(number == k) for k in range(config.variogram_classes)]
+    classes = [pairs for pairs in classes if len(pairs) >= config.variogram_least_pairs]
+    if len(classes) < config.variogram_least_classes:
+        return 0.0
+    found = np.array([np.median(half[pairs]) / _LN2 for pairs in classes])
+    radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    shortest, longest = config.correlation_heights * height_m, config.correlation_radii * radius
+    best = (np.inf, 0.0)
+    for length_m in np.geomspace(min(shortest, longest), longest, config.correlation_lengths):
+        left, followed = _followed(place, length_m)
+        level = np.diag(left)
+        expected = 0.5 * (level[i] + level[j]) - left[i, j]
+        variance, misfit = _fit(found, np.array([expected[pairs].mean() for pairs in classes]))
+        best = min(best, (misfit, variance * followed))
+    return best[1]
+
+
+def _followed(place: Array, length_m: float) -> tuple[Array, float]:
+    """What a similarity, fitted to ties on a map displaced by unit variance, leaves and follows.
+
+    Returns:
+        Covariance (Q, Q) of the residuals of an axis, mean of both; variance of an axis of the fitted values, mean over
+        the ties.
+    """
+    n = len(place)
+    apart2 = ((place[:, None] - place[None]) ** 2).sum(axis=2)
+    covariance = np.exp(-0.5 * apart2 / length_m**2)
+    x, y = (place - place.mean(axis=0)).T
+    radius = max(float(np.sqrt((x**2 + y**2).sum())), 1e-9)
+    one, zero = np.full(n, 1.0 / np.sqrt(n)), np.zeros(n)
+    east = np.column_stack([one, zero, x / radius, -y / radius])  # orthonormal together with north
+    north = np.column_stack([zero, one, y / radius, x / radius])
+    inner = east.T @ covariance @ east + north.T @ covariance @ north
+    left = covariance.copy()
+    for axis in (east, north):
+        cross = (covariance @ axis) @ axis.T
+        left += 0.5 * (axis @ inner @ axis.T - cross - cross.T)
+    return left, float(np.trace(inner)) / (2 * n)
+
+
+def _fit(found: Array, expected: Array) -> tuple[float, float]:
+    """Variance of the displacement and misfit of found = noise + variance x expected, both at least 0."""
+    weight = 1.0 / np.maximum(found, active().bundle.variogram_flat_share * found.max() + 1e-12)
+    one, shape, value = weight, weight * expected, weight * found
+    a, b, c = one @ one, one @ shape, shape @ shape
+    p, q = one @ value, shape @ value
+    determinant = a * c - b * b
+    noise, variance = (
+        ((c * p - b * q) / determinant, (a * q - b * p) / determinant) if determinant > 0 else (p / a, 0.0)
+    )
+    if variance < 0.0:
+        noise, variance = p / a, 0.0
+    elif noise < 0.0:
+        noise, variance = 0.0, q / c
+    return float(variance), float(np.sum((value - noise * one - variance * shape) ** 2))
