@@ -7,7 +7,7 @@ later, they are far enough from each other or at another height (orthoswarm.plan
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -150,6 +150,7 @@ class Airspace:
     """
 
     tracks: dict[int, Track]
+    _: KW_ONLY
     distance_m: float = 10.0
     height_m: float = 5.0
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
@@ -163,7 +164,7 @@ class Airspace:
         origin = next((home for mission in missions.values() if (home := _home_of(mission))), (0.0, 0.0))
         tracks = {s: track_of(mission, origin) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
-        return cls(tracks, distance_m, height_m, slack_s)
+        return cls(tracks, distance_m=distance_m, height_m=height_m, slack_s=slack_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.

@@ -12,7 +12,6 @@ from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.coverage import CoverageConfig
 from orthoswarm.config.evaluation import EvaluationConfig
-from orthoswarm.config.export import ExportConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.paper import PaperConfig
@@ -62,7 +61,6 @@ class Config:
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
-    export: ExportConfig = field(default_factory=ExportConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)

@@ -1,11 +1,11 @@
-"""Maps, pictures and height models that are read."""
+"""Maps, pictures and height models that are read, and maps that are written in tiles."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RasterConfig:
-    """Maps, pictures and height models that are read."""
+    """Maps, pictures and height models that are read, and maps that are written in tiles."""
 
     # Maps
     collar_px: int = 15
@@ -43,3 +43,10 @@ class RasterConfig:
     """Share of the cameras that a height model may bury: a few recorded heights can be wrong (chosen)."""
     dem_least_cover: float = 0.02
     """A height model with heights on a smaller share of the area than this is of another place (chosen)."""
+
+    # Maps that are written
+    one_file_px: float = 4e9
+    """A map of more pixels is written in tiles where the user does not say how, pixels (chosen: 40 square kilometres at
+    0.1 m; as one file it has some 10 GB, which web servers, object storage and copying by radio handle badly)."""
+    tile_px: int = 8192
+    """Side of such a tile, pixels, a multiple of 512 (chosen: some 100 MB a file)."""

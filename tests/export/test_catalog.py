@@ -25,7 +25,7 @@ def maps(tmp_path_factory):
     for vehicle in ("a", "b c"):
         scene.fly(top / "photos" / vehicle, legs(count=2, photos=5))
     basemap = scene.basemap(top / "before.tif")
-    (top / "small.toml").write_text("[export]\ntile_px = 512\n")
+    (top / "small.toml").write_text("[raster]\ntile_px = 512\n")
     for name, how in (("one", "no"), ("tiled", "yes")):
         asked = ["--gsd", "0.15", "--workers", "1", "--config", str(top / "small.toml"), "--tiles", how]
         assert main(["mosaic", str(top / "photos"), "--basemap", str(basemap), "--out", str(top / name), *asked]) == 0
@@ -127,5 +127,5 @@ def test_a_run_in_the_other_form_replaces_the_rasters(maps, tmp_path):
 
 def test_large_rasters_come_in_tiles_where_nothing_is_said(configure):
     assert not in_tiles("auto", (0, 60_000, 512, 60_512)) and in_tiles("auto", (0, 65_000, 0, 65_000))
-    configure({"export": {"one_file_px": 1e6}})
+    configure({"raster": {"one_file_px": 1e6}})
     assert in_tiles("auto", (0, 2000, 0, 2000)) and not in_tiles("no", (0, 2000, 0, 2000))

@@ -40,7 +40,7 @@ class RasterTile:
 def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:
     """Whether rows and columns (row0, row1, col0, col1) of a raster are to be written in tiles."""
     row0, row1, col0, col1 = window
-    return wanted == "yes" or (wanted == "auto" and (row1 - row0) * (col1 - col0) > active().export.one_file_px)
+    return wanted == "yes" or (wanted == "auto" and (row1 - row0) * (col1 - col0) > active().raster.one_file_px)
 
 
 def product_file(folder: Path, name: str) -> Path | None:
@@ -93,7 +93,7 @@ def write_tiled(
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    side, grid = active().export.tile_px, source.grid
+    side, grid = active().raster.tile_px, source.grid
     row0, row1, col0, col1 = window
     filled = {
         (r, c)
@@ -170,7 +170,7 @@ def _touched(
 
 def _in_whole(folder: Path, name: str, whole: GroundGrid) -> Iterator[RasterTile]:
     """The tiles in a raster's folder, placed on its grid."""
-    side = active().export.tile_px
+    side = active().raster.tile_px
     for path in sorted(_tiles(folder, name).glob("*.tif")):
         found = _NAME.fullmatch(path.name)
         if found is None:
@@ -187,7 +187,7 @@ def _in_whole(folder: Path, name: str, whole: GroundGrid) -> Iterator[RasterTile
 
 def _document(whole: GroundGrid, tiles: Iterable[RasterTile], beside: Path) -> str:
     """The virtual raster: see https://gdal.org/en/stable/drivers/raster/vrt.html."""
-    side = active().export.tile_px
+    side = active().raster.tile_px
     placed = list(tiles)
     sources = []
     for tile in placed:

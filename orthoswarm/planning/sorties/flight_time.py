@@ -1,7 +1,7 @@
 """How long a multirotor takes along a path, and where it is when."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class Motion:
     """
 
     speed_m_s: float = 10.0
+    _: KW_ONLY
     climb_m_s: float = 2.5
     descent_m_s: float = 1.5
     wind_m_s: tuple[float, float] = (0.0, 0.0)
