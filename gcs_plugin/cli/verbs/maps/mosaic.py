@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "A folder of photos is read with its sub-folders; each sub-folder with photos is one vehicle.\n"
         "INPUT, MAP, the DEM and DIR may be addresses: s3://, gs:// or, to read, https:// (docs/cluster.md).\n\n"
-        "examples:\n  orthoswarm mosaic photos --basemap before.tif --out map\n"
+        "example:\n  orthoswarm mosaic photos --basemap before.tif --out map\n"
         "  orthoswarm mosaic s3://flood/photos --basemap s3://flood/before.tif --out s3://flood/map"
     )
     add = parser.add_argument
