@@ -190,5 +190,5 @@ def test_a_vehicle_in_the_air_gets_another_mission_only_if_that_was_confirmed_fo
 def test_a_vehicle_whose_takeoff_is_due_gets_no_other_mission(tmp_path: Path) -> None:
     links = _Links([_landed("v1")])
     flights = GapFlights(_Coverage(None), Plans(tmp_path / "p"), links, lambda: {"v1": {"in_s": 4.0}})  # type: ignore[arg-type]
-    with pytest.raises(OrthoSwarmError, match="takeoff is due"):
+    with pytest.raises(OrthoSwarmError, match="about to take off"):
         flights.plan({"vehicles": {"v1": 9.0}, "altitude_m": 60.0})
