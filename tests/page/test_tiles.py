@@ -116,7 +116,7 @@ def test_silence_is_shown_with_its_age_and_a_banner(browser):
         assert page.locator(".banner").is_hidden()
         page.evaluate("station.beats = false")
         page.wait_for_selector(".tile[data-level=stale]")
-        assert "old:" in page.inner_text(".tile .why")
+        assert "not heard for" in page.inner_text(".tile .why")
         page.wait_for_selector(".banner")
         assert "commands may not arrive" in page.inner_text(".banner")
         assert page.inner_text(".link") == "No link"
