@@ -80,6 +80,7 @@ def run_measured(
             with contextlib.suppress(ProcessLookupError, PermissionError):  # remaining child processes, or Ctrl-C
                 os.killpg(process.pid, signal.SIGKILL)
     used = max(used, usage.ru_utime + usage.ru_stime)
+    memory = max(memory, usage.ru_maxrss / 1024.0)  # of one that ended before the first look
     return Measured(None if stopped else process.returncode, time.monotonic() - start, used, memory)
 
 
